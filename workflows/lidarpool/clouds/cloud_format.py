@@ -1,4 +1,4 @@
-"""What all cloud formats have in common: what a format can store, how it is written and read."""
+"""Base class of the cloud formats, which states what a format can store and how it is accessed."""
 
 from __future__ import annotations
 
@@ -25,65 +25,60 @@ if TYPE_CHECKING:
     from .writing import ExportSpec
 
 # Frame in which a format stores points:
-# - cloud: the frame of the cloud
-# - world: the frame of the cloud, and readers expect all points in a single coordinate system
-# - sweep: the sensor frame at the start of the sweep, with motion compensated
-# - firing: the sensor frame at the firing of each point, or as sweep with the option `compensated`
-# - none: the format stores measurements, such as ranges, instead of positions
+# - cloud: frame of the cloud
+# - world: frame of the cloud, although readers expect all points in a single coordinate system
+# - sweep: sensor frame at the start of the sweep, with motion compensation
+# - firing: sensor frame at the firing of each point, or like sweep with the option `compensated`
+# - none: the format stores measurements such as ranges instead of positions
 Frame = Literal["cloud", "world", "sweep", "firing", "none"]
-# Points, float32 (n, 3), meters in the sensor's axes, and {column: (n,)}, as the format holds them.
+# Points in the sensor frame in meters, of shape (n, 3), and {column: array of shape (n,)}, as they
+# are stored in the format.
 PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A job in a data set.
-
-    Number and name distinguish its files from files of further jobs.
-
-    `values` are the varied values, by name.
-    """
+    """A job in a data set, whose number and name identify its files."""
 
     number: int
     name: str
     split: str = ""
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Any] = field(default_factory=dict)  # varied values by name
 
 
 class CloudFormat(ABC):
-    """A point cloud in a format. Each format is a subclass.
+    """A point cloud that can be written in a format, which is defined by the subclass.
 
-    Class attributes state what the format can store. They can be read without the packages of the
-    format, which are imported when they are used.
+    Class attributes and class methods state what the format can store, and read its files. The
+    attributes are available even if the packages that the format requires are not installed.
 
     Parameters
     ----------
     cloud
         Points to write.
     sweeps
-        Sweeps of the points.
+        Sweeps to which the points belong.
     entry
-        The job of the points in a data set. By default, the cloud is not part of a data set.
+        Job of a data set to which the points belong. None if they are not part of a data set.
     """
 
-    row: ClassVar[FormatRow] = FormatRow("")  # files of the format, if it is a plug-in
-    title: ClassVar[str] = ""  # proper name in sentences; by default, the name of the format
+    row: ClassVar[FormatRow] = FormatRow("")  # files and packages of the format, in plug-ins
+    title: ClassVar[str] = ""  # proper name for messages (default: name of the format)
     by_sweep: ClassVar[bool] = False  # whether the points of each sweep are stored separately
     frame: ClassVar[Frame] = "cloud"  # frame in which points are stored
-    # Columns that a cloud must have, in addition to `scan` of formats by sweep.
+    # Columns that a cloud must have. If `by_sweep` is true, `scan` is required, too.
     required: ClassVar[tuple[str, ...]] = ()
     stored: ClassVar[tuple[str, ...] | None] = None  # columns that can be stored; None for all
-    named: ClassVar[tuple[str, ...]] = ()  # columns that are also stored if classes have names
-    options: ClassVar[tuple[str, ...]] = ()  # options of `ExportSpec` that few formats support
-    actor_boxes: ClassVar[bool] = False  # whether the boxes of actors are stored
-    for_scenes: ClassVar[bool] = False  # whether scenes can be made of its files
-    file_pattern: ClassVar[str] = ""  # pattern of the names of the files in the format's folder
-    # In data sets: path of a job's file or folder, with fields of `Entry`; whether a sweep is read
-    # without opening a file of the whole job; and whether each sweep has files of rows of numbers.
-    job_path: ClassVar[str] = ""
-    separate_sweeps: ClassVar[bool] = False
-    raw_sweeps: ClassVar[bool] = False
-    # Returns scene and planned path, for formats that store these.
+    named: ClassVar[tuple[str, ...]] = ()  # columns that are only stored if classes have names
+    options: ClassVar[tuple[str, ...]] = ()  # supported options of `ExportSpec`
+    actor_boxes: ClassVar[bool] = False  # whether bounding boxes of actors are stored
+    for_scenes: ClassVar[bool] = False  # whether scenes can be created from files of the format
+    file_pattern: ClassVar[str] = ""  # regular expression for the files in the format's folder
+    # The following attributes only apply to data sets.
+    job_path: ClassVar[str] = ""  # path of a job's file or folder, with fields of `Entry`
+    separate_sweeps: ClassVar[bool] = False  # whether sweeps are read without opening a whole job
+    raw_sweeps: ClassVar[bool] = False  # whether each sweep has its own files of binary rows
+    # Function that returns the scene and the planned path, for formats that store them.
     content: Callable[[], PictureContent | None] = staticmethod(lambda: None)
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
@@ -95,17 +90,22 @@ class CloudFormat(ABC):
     def write(self, path: Path, spec: ExportSpec) -> float | None:
         """Write the cloud to a new file or folder.
 
-        LidarError if the format cannot store the cloud; OSError if the file cannot be written.
-
         Returns
         -------
-        The intensity that is stored as the highest integer, or None if the format has real numbers
-        or the cloud has no intensities.
+        The intensity that is stored as the largest integer, or None if intensities are stored as
+        floats or the cloud has no intensities.
+
+        Raises
+        ------
+        LidarError
+            If the format cannot store the cloud.
+        OSError
+            If the file cannot be written.
         """
 
     @classmethod
     def supports(cls, option: str) -> bool:
-        """Return True if the format supports an option of `ExportSpec`."""
+        """Return whether the format supports an option of `ExportSpec`."""
         if option == "compensated_actors":
             return cls.by_sweep and cls.frame != "none"
         return option in cls.options
@@ -117,7 +117,7 @@ class CloudFormat(ABC):
 
     @classmethod
     def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the columns that the options require and store in addition."""
+        """Return the additional columns that the options require and store."""
         return ()
 
     @classmethod
@@ -135,17 +135,23 @@ class CloudFormat(ABC):
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
-        """Return the columns that the survey's sensors require, or raise LidarError."""
+        """Return the columns that the sensors of a survey require in this format.
+
+        Raises LidarError if the format does not support a sensor.
+        """
         return ()
 
     @classmethod
     def survey_notes(cls, survey: Survey) -> list[str]:
-        """Return notes for the user on what cannot be stored of a survey."""
+        """Return notes for the user on data of a survey that the format cannot store."""
         return []
 
     @classmethod
     def renamed(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if sensors of these names, "" without one, have others in the format."""
+        """Return a note if the format stores sensors under other names.
+
+        The name of an unnamed sensor is an empty string.
+        """
         return []
 
     @classmethod
@@ -155,32 +161,35 @@ class CloudFormat(ABC):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the names of the files of a sweep in a data set, the file of its points first."""
+        """Return the names of the files of a sweep in a data set, starting with its points."""
         return [cls.path_of_job(job.entry)]
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return the points of a sweep in a data set.
+        """Read the points of a sweep in a data set.
 
-        Raises any exception if the points cannot be read.
+        Exceptions of any type are reported as unreadable files.
         """
         raise NotImplementedError
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> Mapping[str, bytes]:
-        """Return the files of a data set that contain the names of the classes of all jobs."""
+        """Return files of a data set that contain the class names of all jobs, {name: content}."""
         return {}
 
     @classmethod
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write further files that the jobs of a data set share, from the manifests of the jobs.
+        """Write files that the jobs of a data set share, from the manifests of the jobs.
+
+        Implementations must iterate over all manifests, because the iteration writes the index of
+        the data set.
 
         Returns
         -------
-        Class list to which the labels of a job must be renumbered (`renumbered`), by the name of
-        the job. Jobs can have different classes.
+        {name of a job: classes that its labels must number}, for jobs whose labels must be
+        renumbered (`renumbered`). Jobs can have different classes.
         """
         deque(manifests, maxlen=0)
         return {}
@@ -189,9 +198,10 @@ class CloudFormat(ABC):
     def renumbered(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Return the content of a file with labels for other classes, or None for other files.
+        """Return the content of a label file with renumbered labels, or None for other files.
 
-        `before` and `after` are the classes that the labels number.
+        Labels refer to positions in a list of classes, which is `before` in the file and `after` in
+        the returned content.
         """
         return None
 
@@ -199,6 +209,6 @@ class CloudFormat(ABC):
     def open(cls, source: RecordingSource) -> Recording:
         """Open a file or folder as a recording.
 
-        Raises LidarError if it is damaged, or if a choice is missing, for example of the sensor.
+        Raises LidarError if it is damaged, or if the user must choose, for example, a sensor.
         """
-        raise LidarError(f"{cls.title} files can be written, but not read.")
+        raise LidarError(f"{source.name} is in a format that can be written, but not read.")

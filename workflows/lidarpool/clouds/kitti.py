@@ -37,7 +37,7 @@ from .recording import Recording, RecordingSource, sweep_from_columns
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 CALIBRATION_FILE = "calib.txt"
-# From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
+# Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 _FILE_PATTERN = (
     r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
@@ -46,21 +46,27 @@ _FILE_PATTERN = (
 
 
 class KITTI(MultiFileFormat):
-    """A sequence for each sensor: `sequences/00`, `01`, ...
+    """A KITTI folder with one sequence per sensor.
 
-    In a data set the first sensor of job 7 has `sequences/07`, further sensors `07_NAME`.
+    Sequences are named `sequences/00`, `sequences/01` and so on. In a data set, the first sensor of
+    job 7 is `sequences/07`, and the other sensors are `sequences/07_NAME`. A sequence contains:
 
-    In each are `velodyne/000000.bin` (float32 x, y, z in the sensor frame at the start of the
-    sweep, and reflectivity by 255, 0 to 1), `labels/000000.label` (uint32: instance << 16 | class;
-    the instance is the object's number + 1), where there are actors `label_2/000000.txt` (boxes of
-    the actors that have points), `poses.txt` (3 x 4, from the first), `times.txt` in seconds and
-    `calib.txt`. `label_02/00.txt` has the boxes of all sweeps in the layout of KITTI tracking; a
-    track has the number of the instance.
+    - `velodyne/000000.bin`: float32 x, y and z in the sensor frame at the start of the sweep, and
+      the reflectivity divided by 255, which ranges from 0 to 1.
+    - `labels/000000.label`: uint32 with the instance (object number + 1) in the upper 16 bits and
+      the class in the lower 16 bits.
+    - `label_2/000000.txt`: boxes of the actors that have points, in surveys with actors.
+    - `poses.txt`: 3 x 4 matrices relative to the first pose.
+    - `times.txt`: times in seconds.
+    - `calib.txt`: calibration.
 
-    Poses and boxes are in the frame of a camera as KITTI's, at the position of the sensor; `Tr`
-    leads to this frame. The camera is level where the sensor is tilted, in the mean over its
-    sweeps, because KITTI turns boxes about its vertical axis alone. KITTI's own tools look for the
-    poses in `poses/00.txt`.
+    `label_02/00.txt` contains the boxes of all sweeps in the layout of KITTI tracking, in which the
+    number of a track is that of the instance.
+
+    Poses and boxes are in the frame of a KITTI camera at the position of the sensor, to which `Tr`
+    transforms. The camera is level on average, even if the sensor is tilted, because KITTI rotates
+    boxes only about the vertical axis of the camera. KITTI's own tools expect the poses in
+    `poses/00.txt`.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
@@ -89,7 +95,7 @@ class KITTI(MultiFileFormat):
         self.cameras = [_camera(sweeps, sensor) for sensor in range(len(sweeps.sensors))]
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
-        """Return the files of a sweep, and its boxes where there are actors."""
+        """Return the files of a sweep, and its boxes if there are actors."""
         sweeps = self.sweeps
         folder = self.sequences[sweeps.sensor[number]]
         name = f"{sweeps.numbers[number]:06}"
@@ -133,12 +139,12 @@ class KITTI(MultiFileFormat):
             if sweeps.actors:
                 tracks = self._tracks(np.flatnonzero(sweep_mask).tolist(), boxes)
                 files[f"label_02/{self.names[sensor]}.txt"] = tracks
-        if sweeps.classes and self.entry is None:  # else all jobs share a file
+        if sweeps.classes and self.entry is None:  # otherwise, all jobs share a file
             files |= self.class_files(sweeps.classes)
         return files
 
     def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
-        """Return the boxes of the sweeps of a sensor in the layout of KITTI tracking."""
+        """Return the boxes of a sensor's sweeps in the layout of KITTI tracking."""
         sweeps = self.sweeps
         lines = []
         for frame, number in enumerate(numbers):
@@ -152,7 +158,7 @@ class KITTI(MultiFileFormat):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the names of the files of points and labels."""
+        """Return the names of the point file and the label file."""
         names = job.cached("sequences", lambda: _names(job.sweeps, job.entry))
         folder = f"sequences/{names[job.sweeps.sensor[sweep]]}"
         number = f"{job.sweeps.numbers[sweep]:06}"
@@ -160,7 +166,7 @@ class KITTI(MultiFileFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return points with intensity (reflectivity, 0 to 1), class and object."""
+        """Read points with intensity (reflectivity from 0 to 1), class and object."""
         file, labels_file = cls.sweep_files(job, sweep)
         rows = job.read_rows(file, np.dtype("<f4")).reshape(-1, 4)
         labels = job.read_rows(labels_file, np.dtype("<u4"), len(rows))
@@ -172,7 +178,13 @@ class KITTI(MultiFileFormat):
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
         """Open a .bin file of KITTI or nuScenes, or a sequence of KITTI or SemanticKITTI."""
-        return _open_sequence(source) if source.path.is_dir() else _open_sweep(source)
+        path = source.path
+        if not path.is_dir():
+            labels = path.parent.parent / "labels" / f"{path.stem}.label"
+            return source.recording(1, lambda _: _read_sweep(path, labels))
+        with reading(source.name):
+            sequences = _sequences(source)
+        return source.of_sensors(sequences)
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> dict[str, bytes]:
@@ -184,7 +196,7 @@ class KITTI(MultiFileFormat):
 
 
 def intensity_of(points: Cloud) -> Floats32:
-    """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""
+    """Return the reflectivity of points (n,) from 0 to 1, which KITTI stores as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
@@ -204,7 +216,7 @@ def _table(matrix: Floats) -> bytes:
 
 
 def _row(rotation: Floats) -> str:
-    """Return a rotation (3, 3) as a 3 x 4 matrix in words."""
+    """Return a rotation (3, 3) as the text of a 3 x 4 matrix."""
     return " ".join(f"{value:.9e}" for value in np.column_stack([rotation, np.zeros(3)]).ravel())
 
 
@@ -221,21 +233,22 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
 def _labels(
     sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats
 ) -> Iterator[tuple[int, str, str]]:
-    """Yield number and type of each actor with points, and values of its label after truncation.
+    """Yield the number, the type and the label values of each actor that has points.
 
-    There is no picture: occlusion is 3, which is unknown, and the box in the picture is zero. The
-    position is the middle of the underside; boxes are turned about the camera's y alone.
+    The values are those that follow the truncation. There are no images, so the occlusion is 3
+    (unknown) and the image box is zero. The position is the center of the bottom face, and boxes
+    are only rotated about the y axis of the camera.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
-    forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # directions of the actors
+    forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
     positions = sweeps.pose.inward(sweep, boxes.centers) @ camera.T
     positions[:, 1] += boxes.sizes[:, 2] / 2
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])
     alpha = np.angle(np.exp(1j * alpha))  # between -pi and pi
-    picture = np.zeros((len(alpha), 4))
+    image_boxes = np.zeros((len(alpha), 4))
     sizes = boxes.sizes[:, ::-1]  # height, width and length
-    rows = np.column_stack([alpha, picture, sizes, positions, rotation_y])
+    rows = np.column_stack([alpha, image_boxes, sizes, positions, rotation_y])
     for actor in np.flatnonzero(boxes.present & (boxes.points > 0)).tolist():
         values = " ".join(f"{value:.4f}" for value in rows[actor])
         yield actor, sweeps.actor_types[actor], f"3 {values}"
@@ -244,21 +257,8 @@ def _labels(
 # -- reading ---------------------------------------------------------------------------------
 
 
-def _open_sweep(source: RecordingSource) -> Recording:
-    """Open a .bin of KITTI or nuScenes, a sweep, with its labels."""
-    labels = source.path.parent.parent / "labels" / f"{source.path.stem}.label"
-    return source.recording(1, lambda _: _read_sweep(source.path, labels))
-
-
-def _open_sequence(source: RecordingSource) -> Recording:
-    """Open a sequence of KITTI odometry or SemanticKITTI."""
-    with reading(source.name):
-        sequences = _sequences(source)
-    return source.of_sensors(sequences)
-
-
 def _sequences(source: RecordingSource) -> dict[str, Recording]:
-    """Open the sequences of KITTI odometry or SemanticKITTI, a sequence, or its .bin files."""
+    """Open all sequences in a folder, a single sequence, or a folder of .bin files."""
     folder = source.path
     sequences = sort_by_number(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
     if sequences:
@@ -273,13 +273,13 @@ def _sequences(source: RecordingSource) -> dict[str, Recording]:
 
 
 def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "") -> Recording:
-    """Open the sweeps of a folder, with its labels, poses and times if it has these."""
+    """Open the sweeps in a folder, with labels, poses and times if they exist."""
     files = sort_by_number((folder / inner).glob("*.bin"))
     calibration = folder / CALIBRATION_FILE
     notes = []
 
     def of_frames(rows: Floats, table: str) -> Floats:
-        """Return the rows that belong to the files, and note those that belong to none."""
+        """Return the rows that belong to the files, and add a note on any other rows."""
         indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
             notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
@@ -317,19 +317,19 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:
-    """Return the poses (n, 4, 4) of the lidar, given rows (n, 3, 4) of `poses.txt`.
+    """Return the poses (n, 4, 4) of the lidar, given the rows (n, 3, 4) of `poses.txt`.
 
-    The rows are poses of the camera whose place `calibration` states, or, if there is no such file,
-    of the lidar.
+    The rows are poses of a camera, whose position relative to the lidar is in the file
+    `calibration`. If this file does not exist, they are poses of the lidar.
     """
     camera = _calibration(calibration)
     return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
 
 
 def _matrices(path: Path) -> Floats:
-    """Return the matrices (n, 3, 4) of a file, one in each line.
+    """Read the matrices (n, 3, 4) in a file, one per line.
 
-    Raises ValueError that names a wrong line.
+    Raises ValueError with the line number if a line is invalid.
     """
     reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
     try:
@@ -339,7 +339,10 @@ def _matrices(path: Path) -> Floats:
 
 
 def _calibration(path: Path) -> Floats:
-    """Return the matrix (4, 4) from the lidar to the camera, or the identity without a file."""
+    """Read the transformation (4, 4) from the lidar to the camera.
+
+    If the file does not exist, this is the identity.
+    """
     if not path.exists():
         return np.eye(4)
     for number, line in enumerate(read_input_text(path).splitlines(), 1):
@@ -362,7 +365,7 @@ def _square(matrix_rows: Floats) -> Floats:
 
 
 def _read_sweep(path: Path, labels: Path, **fields: Any) -> Sweep:
-    """Read a sweep, with its classes and objects if there is a file of labels."""
+    """Read a sweep, with classes and objects if the label file exists."""
     sweep = sweep_from_columns(read_float_columns(path, columns_by_name(path)), **fields)
     columns = dict(sweep.columns)
     if labels.exists():

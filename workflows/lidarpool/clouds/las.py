@@ -37,36 +37,36 @@ from .writing import ExportSpec
 if TYPE_CHECKING:
     import laspy
 
-# A sample consists of this many runs of points, which begin where chunks of a .laz begin: 50,000
-# points each, unless a program chooses otherwise.
+# A sample consists of several runs of points, which start at chunks of the .laz file. Most programs
+# write chunks of 50,000 points.
 _SAMPLE_RUNS = 40
 _LAZ_CHUNK = 50_000
-_SYSTEM_POINTS = 5  # whose places say where a file is
+_SYSTEM_POINTS = 5  # points at which the lengths in a coordinate system are checked
 ANGLE_DEG = 0.006  # step of the format's scan angle
-_HIGHEST_INTENSITY = 65_535
-_FULL_SCALE = 2  # number of lidarpool's record with the intensity that is stored as the highest
-_FORMAT_FIELDS = ("return_number", "returns")  # columns stored only in fields of the format
-# Names of columns in the extra bytes: a field of the format is called intensity, and normals have
-# the names of PDAL's dimensions.
+_MAX_INTENSITY = 65_535
+_FULL_SCALE = 2  # ID of lidarpool's record with the intensity that is stored as the maximum
+_FORMAT_FIELDS = ("return_number", "returns")  # columns that are not stored in extra bytes
+# Names of columns in the extra bytes. The format already has a field `intensity`, and normals are
+# named like dimensions of PDAL.
 _NAMES = {
     "intensity": "energy",
     **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
 }
 _ADJUSTED_S = 1e9  # GPS time minus adjusted standard GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
-# Fields of the header: offsets of the waveform packets and of the first such record, their number.
+# Header fields: offset of the waveform packets, and offset and number of extended records.
 _WAVES_OFFSET = 227
 _WAVES = Struct("<QQI")
 _MAX_VLR_BYTES = 65_535  # limit for a variable length record
-_TEXT_AREA = 3  # number of the record with a description in words
+_TEXT_AREA = 3  # ID of the record with a description
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
-_ON_GRID = 0.1  # share of the precision that single precision may lie beside the grid
-_STEPS = ("X", "Y", "Z")  # dimensions with the integers of the coordinates
-_MAX_STEPS = 2**31 - 1  # steps of precision from the offset to the farthest point
+_ON_GRID = 0.1  # tolerated distance from the grid as a fraction of the precision
+_STEPS = ("X", "Y", "Z")  # dimensions that contain the coordinates as integers
+_MAX_STEPS = 2**31 - 1  # maximum distance from the offset in steps of the precision
 
 
 def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
-    """Return the extra bytes of a column, with its unit and meaning in 32 letters."""
+    """Return the extra bytes of a column, with its unit and meaning in 32 characters."""
     import laspy
 
     description = shorten(f"{column.unit} {column.meaning}", 32, placeholder="")
@@ -74,18 +74,25 @@ def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
 
 
 class LAS(CloudFormat):
-    """A .las file: columns in fields of the format, and further columns in extra bytes.
+    """A .las file, which stores columns in fields of the format and in extra bytes.
 
-    `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
-    start. A coordinate system is stored as WKT. `return_number` and `returns` are unchanged. Scan
-    angle (steps of 0.006 degrees), scan direction, edge of flight line and point source are from
-    `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colors are 257 times
-    these, 16 bits. Intensity is the column `intensity`, where `intensity_full_scale` and above
-    are 65,535; a record of lidarpool states this number as JSON. Classification is `class` if it is
-    below 256. Because of these limits, both columns are in the extra bytes as well. The lookup has
-    the names of these classes, ASCII, at most 15 letters. Names of materials are a record of
-    lidarpool, a list as JSON. Return numbers are 15 at most. A text area record names the frame of
-    the points. Recorded waveforms make the point format 9, or 10 with colors (`_Packets`).
+    The point format is 6, 7 with colors, 9 with waveforms (`_Packets`), or 10 with both. Its fields
+    contain:
+
+    - GPS time: `time` as adjusted standard GPS time, or in seconds since the start of the survey if
+      the date of the survey is unknown.
+    - Return number and number of returns: `return_number` and `returns`, at most 15.
+    - Scan angle (in steps of 0.006 degrees), scan direction, edge of flight line and point source:
+      see `FlightLines`.
+    - Red, green and blue: the columns of these names, multiplied by 257.
+    - Intensity: `intensity`, scaled so that `intensity_full_scale` is stored as 65,535. Greater
+      intensities are clipped. A record of lidarpool contains the scale as JSON.
+    - Classification: `class` if it is below 256. The class lookup contains the names of these
+      classes, which are truncated to 15 ASCII characters.
+
+    All columns except return numbers, numbers of returns and colors are also stored in the extra
+    bytes, without these limits. The coordinate system is stored as WKT, the names of materials as
+    JSON in a record of lidarpool, and the frame of the points in a text area record.
     """
 
     title = "LAS"
@@ -151,22 +158,22 @@ class LAZ(LAS):
 
 
 def _start_s(sweeps: Sweeps) -> float:
-    """Return the start of a survey in adjusted standard GPS time, seconds, or 0 without a start."""
+    """Return the start of a survey in adjusted standard GPS time in seconds, or 0 if unknown."""
     if sweeps.start_ns is None:
         return 0.0
     return gps_start_s(sweeps) - _ADJUSTED_S
 
 
 def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]:
-    """Return the format's intensities (n,)."""
-    shares = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
-    return np.round(shares * _HIGHEST_INTENSITY).astype(np.uint16)
+    """Return intensities (n,) as the integers that are stored in the format."""
+    fractions = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
+    return np.round(fractions * _MAX_INTENSITY).astype(np.uint16)
 
 
 def _header(
     columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
 ) -> laspy.LasHeader:
-    """Return the header of a file with its records, without grid and extra bytes."""
+    """Return the header of a file and its records, without the grid and the extra bytes."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -179,12 +186,12 @@ def _header(
         header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     if sweeps.epsg is not None:
         header.vlrs.append(WktCoordinateSystemVlr(wkt(sweeps.epsg)))
-    # LAS 1.4 requires this flag in formats 6 and above, with or without a coordinate system; PDAL
-    # before 2.7.2, and programs that use it, open no other files (PDAL's issue 4412).
+    # LAS 1.4 requires this flag in formats 6 and above, even without a coordinate system. PDAL
+    # before 2.7.2 rejects files without it (PDAL issue 4412).
     header.global_encoding.wkt = True
     if sweeps.classes:
         header.vlrs.append(lookup := laspy.vlrs.known.ClassificationLookupVlr())
-        for number in range(256):  # the record has all classes
+        for number in range(256):  # the record contains all classes
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
     if "material" in columns:
         names_json = json.dumps(sweeps.materials).encode()[:_MAX_VLR_BYTES]
@@ -206,15 +213,16 @@ def _header(
 def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, name: str) -> None:
     """Set the grid of positions in a header.
 
-    Raises LidarError if the cloud is too wide.
+    Raises LidarError if the extent of the cloud is too large.
     """
     lower, upper = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, precision_m)
     header.offsets = np.floor((lower + upper) / 2)
-    # Steps from whole meters may miss the grid of the points, as of a world origin of millimeters.
+    # Points may lie between the steps from an integer offset, for example if the world origin is
+    # given in millimeters. The offset is then shifted.
     steps = (lower - header.offsets) / precision_m
-    beside = (steps - np.round(steps)) * precision_m
-    header.offsets += np.where(np.abs(beside) > _ON_GRID * precision_m, beside, 0.0)
+    shift = (steps - np.round(steps)) * precision_m
+    header.offsets += np.where(np.abs(shift) > _ON_GRID * precision_m, shift, 0.0)
     if np.abs(np.stack([lower, upper]) - header.offsets).max() / precision_m > _MAX_STEPS:
         raise LidarError(
             f"{name} stores positions in at most 2^32 steps of {precision_m} m per axis, but "
@@ -226,11 +234,11 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
 class _Packets:
     """Waveform packets of a LAS file, which follow its points in the same file.
 
-    Samples have 16 bits. There is a descriptor for each distance of samples and each power of two
-    that samples are multiples of; the digitizer's gain is that power. Returns of a pulse whose
-    windows are the same share a packet. The vector of a point is the path towards the sensor in a
-    picosecond, so that the sample at time t is at the point plus (L - t) times the vector, where L
-    is the return point's location.
+    Samples have 16 bits. There is one descriptor for each sampling interval and digitizer gain, and
+    all samples are multiples of the gain, which is a power of two. Returns of a pulse that have the
+    same window share a packet. The vector of a point is the path towards the sensor per picosecond.
+    The sample at time t is therefore located at the point plus (L - t) times the vector, where L is
+    the location of the return in the waveform.
     """
 
     def __init__(self, samples: int, kinds: list[tuple[int, int]]) -> None:
@@ -238,7 +246,7 @@ class _Packets:
 
         self._bytes = 2 * samples
         self._index = {kind: number for number, kind in enumerate(kinds, 1)}
-        self._end = _EVLR.size  # end of the packets, after the head of their record
+        self._end = _EVLR.size  # end of the packets, which follow the head of their record
         self.descriptors = []
         for number, (step_ps, exponent) in enumerate(kinds, 1):
             gain = 2.0**exponent
@@ -250,10 +258,7 @@ class _Packets:
 
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> _Packets | None:
-        """Return the packets of a cloud, or None without waveforms.
-
-        Reads the cloud once.
-        """
+        """Return the packets of a cloud, which is read once, or None if it has no waveforms."""
         if not getattr(cloud, "has_waveforms", False):  # clouds in files never have any
             return None
         kinds: set[tuple[int, int]] = set()
@@ -266,7 +271,7 @@ class _Packets:
         return cls(samples, sorted(kinds)) if kinds else None
 
     def put(self, points: Any, chunk: Cloud, file: IO[bytes]) -> None:
-        """Write the packets of points to a file, and their offsets into the points."""
+        """Write the packets of points to a file, and store their offsets in the points."""
         rows = records(chunk.columns[WAVEFORM])
         starts_packet = np.ones(len(rows), np.bool_)
         starts_packet[1:] = (rows["samples"][1:] != rows["samples"][:-1]).any(axis=1)
@@ -282,7 +287,7 @@ class _Packets:
         points.x_t, points.y_t, points.z_t = rows["toward"].T
 
     def append(self, file: IO[bytes], packets: IO[bytes]) -> None:
-        """Append the packets to a finished file of points, and store their offset in its header."""
+        """Append the packets to a complete point file, and store their offset in its header."""
         begin = file.seek(0, SEEK_END)
         size = self._end - _EVLR.size
         file.write(_EVLR.pack(0, b"LASF_Spec", 65_535, size, b"lidarpool"))
@@ -317,7 +322,7 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
 
 
 def _name(name: str) -> str:
-    """Return the name in the extra bytes of a column that has a name in files."""
+    """Return the name in the extra bytes of a column, given its name in other files."""
     return _NAMES.get(name, name[:32])
 
 
@@ -325,18 +330,15 @@ def _name(name: str) -> str:
 
 
 def _open_las(source: RecordingSource) -> Recording:
-    """Open the points of a .las or .laz, in parts.
-
-    A sample consists of runs of points, evenly in the file.
-    """
+    """Open the points of a .las or .laz file in parts, with a function that samples them."""
     path = source.path
     with reading(source.name):
         system = las_system(path)
         with open_las(path) as reader:
             count = reader.header.point_count
             classes = noise_classes(reader.header)
-            places = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
-        meters, notes = source.stated_meters(system, places)
+            positions = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
+        meters, notes = source.stated_meters(system, positions)
 
     def read_run(reader: laspy.LasReader, start: int, length: int) -> Sweep:
         reader.seek(start)
@@ -374,7 +376,7 @@ def _open_las(source: RecordingSource) -> Recording:
 
 
 def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
-    """Return the positions (k, 3) of a few points, evenly in a file."""
+    """Return the positions (k, 3) of a few points that are evenly distributed in a file."""
     positions = []
     for number in np.unique(np.linspace(0, count - 1, _SYSTEM_POINTS).astype(int)).tolist():
         if 0 <= number < count:

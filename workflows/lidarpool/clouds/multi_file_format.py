@@ -1,4 +1,4 @@
-"""Multi-file formats: ranges of their files are written by threads or by workers of a cluster."""
+"""Formats with many files, which threads or the workers of a cluster write in parallel."""
 
 from __future__ import annotations
 
@@ -23,66 +23,68 @@ from .format_table import format_named, row_of
 if TYPE_CHECKING:
     from .writing import ExportSpec
 
-# NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
+# NumPy, pyarrow and disk I/O hold the GIL for at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
-# Largest range, which a killed worker loses.
+# Limits of a range, which is lost if its worker is killed.
 RANGE_POINTS = 1_000_000
 RANGE_PIECES = 100
-_MARK = ".writing"  # file in the folder while ranges are written
+_MARK = ".writing"  # file that exists while ranges are written
 
 
 Data = bytes | memoryview
-PieceRange = tuple[int, int]  # a range of pieces
-# Number of points of a range, and the details of its pieces.
+PieceRange = tuple[int, int]  # first piece, and the end of the range (exclusive)
+# Number of points in a range, and the details of its pieces.
 WrittenRange = tuple[int, list[Any]]
 
 
 class MultiFileFormat(CloudFormat):
-    """A cloud in a format with many files: files of each piece, often a sweep, and shared files.
+    """A cloud in a format with many files.
 
-    `folders` are the folders of the files of the pieces.
+    The cloud is divided into pieces, which are usually sweeps. Each piece has its own files, and
+    further files are shared by all pieces.
     """
 
-    folders: Sequence[str] = ()
-    compensated = False  # the option of `ExportSpec`
+    folders: Sequence[str] = ()  # folders that contain the files of the pieces
+    compensated = False  # option of `ExportSpec`
 
     def __len__(self) -> int:
         return len(self.sweeps)
 
     def read(self, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield the points of pieces from `first` to `stop`."""
+        """Yield the points of the pieces from `first` to `stop` (exclusive)."""
         return self.sweeps.points(self.cloud, first, stop)
 
     def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
-        """Return the files of a piece, and its details for `shared_files`."""
+        """Return the files of a piece as {name: content}, and its details for `shared_files`."""
         raise NotImplementedError
 
     def shared_files(self, details: Sequence[Any]) -> Mapping[str, bytes]:
-        """Return the files that all pieces share, from the details of the pieces."""
+        """Return the files that all pieces share as {name: content}, given all details."""
         return {}
 
     def summary(self, details: Sequence[Any]) -> dict[str, Any]:
-        """Return a summary of this job for the data set's own files, as plain data for JSON."""
+        """Return a summary of this job for the manifest of a data set, which must support JSON."""
         return {}
 
     def write(
         self, path: Path, spec: ExportSpec, workers: RangeWorkers | None = None
     ) -> float | None:
-        """Write all files to a new folder, as `write_to`."""
+        """Write all files to a new folder; see `write_to`."""
         self.write_to(Storage(str(path), durable=False), spec, workers)
         return None
 
     def write_to(
         self, storage: Storage, spec: ExportSpec, workers: RangeWorkers | None = None
     ) -> None:
-        """Write all files, in threads the ranges that workers have not written.
-
-        Raises OSError on failure.
+        """Write all files. Ranges that workers do not write are written by threads.
 
         Raises
         ------
         LidarError
-            If the cloud is not of these sweeps, or not in order; or as `workers`.
+            If the points are not in order or do not belong to the sweeps, or if raised by
+            `workers`.
+        OSError
+            If a file cannot be written.
         """
         writer = RangeWriter(spec.format, self.cloud, self.sweeps, storage, spec.compensated)
         for folder in ("", *self.folders):
@@ -99,9 +101,9 @@ class MultiFileFormat(CloudFormat):
         storage.tidy()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the files of pieces, a piece in memory at a time.
+        """Write the files of a range of pieces, with one piece in memory at a time.
 
-        Raises OSError on failure.
+        Raises OSError if a file cannot be written.
         """
         count = 0
         details = []
@@ -114,7 +116,7 @@ class MultiFileFormat(CloudFormat):
         return count, details
 
     def spans(self, min_spans: int = 1) -> list[PieceRange]:
-        """Divide all pieces into ranges, at least `min_spans` if there are as many pieces."""
+        """Divide the pieces into ranges, at least `min_spans` if there are enough pieces."""
         count = len(self)
         by_points = RANGE_POINTS * count // max(1, len(self.cloud))
         size = max(1, min(RANGE_PIECES, by_points, count // min_spans))
@@ -123,7 +125,8 @@ class MultiFileFormat(CloudFormat):
     def finish(self, storage: Storage, written: Iterable[WrittenRange]) -> list[Any]:
         """Write the shared files, and return the details of all pieces.
 
-        LidarError if the cloud is not of these sweeps, or not in order; OSError.
+        Raises LidarError if the points are not in order or do not belong to the sweeps, and OSError
+        if a file cannot be written.
         """
         counts, ranges = zip(*written, strict=True) if self else ((), ())
         if sum(counts) != len(self.cloud):
@@ -137,7 +140,7 @@ class MultiFileFormat(CloudFormat):
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writes ranges of a cloud in a multi-file format, in any process that sees `storage`."""
+    """Writes ranges of a cloud in a multi-file format, in any process with access to `storage`."""
 
     format: str
     cloud: CloudLike
@@ -149,11 +152,8 @@ class RangeWriter:
     def __call__(self, span: PieceRange) -> WrittenRange | None:
         """Write the files of a range.
 
-        Raises OSError on failure.
-
-        Returns
-        -------
-        None if this process does not see the folder, lacks the format's package, or after `stop`.
+        Returns None without writing if this process cannot access the folder, if a package that the
+        format requires is missing, or after `stop`. Raises OSError if a file cannot be written.
         """
         try:
             output = format_named(self.format)(self.cloud, self.sweeps)
@@ -167,7 +167,7 @@ class RangeWriter:
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
-        """The plug-in of the format, which processes that write ranges need, or an empty tuple."""
+        """Plug-in that provides the format, which workers require, or an empty tuple."""
         plugin = row_of(self.format).plugin
         return () if plugin is None else (plugin,)
 
@@ -185,5 +185,5 @@ def as_data(array: AnyArray) -> Data:
     return array.data.cast("B") if array.size else b""
 
 
-# Writes ranges on workers; returns the results of ranges whose workers see the folder.
+# Function that writes ranges on workers, and returns the results for those that were written.
 RangeWorkers = Callable[[RangeWriter, Sequence[PieceRange]], dict[PieceRange, WrittenRange]]

@@ -1,8 +1,8 @@
-"""Rings of a recording: from a column, from the order of the points, or from their elevations.
+"""Rings of a recording, from a column or from the order or the elevation angles of the points.
 
-A KITTI `.bin` and many PCD files have no column of rings. Where points are stored ring by ring, a
-new ring begins where the azimuth falls back to 0°. In any order, the points of a sensor whose beams
-sweep cones have few distinct elevation angles, unless motion compensation has changed these.
+KITTI `.bin` files and many PCD files have no ring column. If points are stored ring by ring, a new
+ring starts where the azimuth jumps back. In any order, the points of a sensor whose beams sweep
+cones have few distinct elevation angles, unless motion compensation has changed them.
 """
 
 from __future__ import annotations
@@ -18,29 +18,46 @@ from lidarsim.columns.sweep import Sweep
 
 MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
 _MAX_RINGS = 512
-_BACKWARD_DEG = 15.0  # a step of the azimuth backward that begins a ring
-_SHORT_RING = 0.02  # a run of points that is shorter than this share of the median is not a ring
-_MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are not cones
-_MIN_IN_ORDER = 0.95  # share of runs whose elevations continue in one direction
-_MAX_CLUSTERS = 128  # of elevations
-_MIN_GAP_RATIO = 3.0  # of the smallest gap between clusters, over the largest gap within one
-_MIN_CLUSTER = 1e-3  # share of the points in a cluster; fewer are stray points
+_BACKWARD_DEG = 15.0  # a backward step in azimuth by more than this starts a new ring
+_SHORT_RING = 0.02  # a run shorter than this fraction of the median run is not a ring
+# Spread of the elevations in a ring as a fraction of their total range. The lines of a Livox have a
+# larger spread, because they are not cones.
+_MAX_CONE_SPREAD = 0.25
+_MIN_IN_ORDER = 0.95  # fraction of runs whose elevations continue in the same direction
+_MAX_CLUSTERS = 128  # maximum number of elevation clusters
+_MIN_GAP_RATIO = 3.0  # smallest gap between clusters relative to the largest gap within a cluster
+_MIN_CLUSTER = 1e-3  # fraction of points in a cluster; smaller clusters are stray points
 
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """The rings of a recording, the highest first."""
+    """The rings of a recording, starting with the highest ring.
 
-    name: str  # of the recording
-    # (r,): median elevations; empty without rings
+    Attributes
+    ----------
+    name
+        Name of the recording.
+    elevation_rad
+        Median elevation angles of the rings in radians, of shape (r,). Empty if the rings are
+        unknown.
+    numbers
+        Numbers of the rings in the column `channel`, of shape (r,), or None if there is no such
+        column.
+    are_cones
+        Whether the rings were determined from elevation angles.
+    note
+        How the rings were determined, or why they are unknown.
+    """
+
+    name: str
     elevation_rad: Floats = field(default_factory=lambda: np.empty(0))
-    numbers: Ints | None = None  # (r,): in the column `channel`; None without this column
-    are_cones: bool = False  # whether elevations rather than the order of points show the rings
-    note: str = ""  # how the rings were found, or why they are unknown
+    numbers: Ints | None = None
+    are_cones: bool = False
+    note: str = ""
 
     @classmethod
     def from_sweeps(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
-        """Find the rings in the returns of some sweeps, as fired if possible."""
+        """Find the rings in the returns of some sweeps, which should not be motion-compensated."""
         if not sweeps:
             return cls(name)
         if all("channel" in sweep.columns for sweep in sweeps):
@@ -86,7 +103,7 @@ class Rings:
         return len(self.elevation_rad)
 
     def rows(self, sweep: Sweep) -> Ints:
-        """Return the rows (n,) of the rings of points, the highest ring first, or -1 if unknown.
+        """Return the index of each point's ring in `elevation_rad`, or -1 if it is unknown.
 
         Raises LidarError if the sweep lacks the ring column that other sweeps have.
         """
@@ -117,10 +134,11 @@ class Rings:
         return np.where(self.numbers[row] == numbers, row, -1)
 
     def _rows_of_runs(self, medians: Floats, is_ring: Bools) -> Ints:
-        """Return the rows (k,) of runs with median elevations (k,), -1 for a run without a ring.
+        """Return the rows (k,) of runs with median elevations (k,), or -1 for a run without a ring.
 
-        Each ring is assigned to one run. The median elevation of a ring depends on what the ring
-        hits, and may change by more than the angle between neighboring rings.
+        Each ring is assigned to at most one run. Nearest elevations would be ambiguous, because the
+        median elevation of a ring depends on the surfaces that it hits, and may change by more than
+        the angle between neighboring rings.
         """
         from scipy.optimize import linear_sum_assignment
 
@@ -139,8 +157,8 @@ def elevations(points: Floats) -> Floats:
 def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
     """Return the numbers and median elevations (r,) of rings, and their deviation from cones.
 
-    The highest ring is first. The deviation is the median interquartile range of the elevations
-    within a ring, in radians.
+    The rings are sorted from the highest to the lowest. The deviation is the interquartile range of
+    the elevations in a ring in radians, as a median over all rings.
     """
     numbers, index = np.unique(rings, return_inverse=True)
     parts = [elevation[index == row] for row in range(len(numbers))]
@@ -152,8 +170,8 @@ def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
 def _clusters(points: Floats) -> Floats | None:
     """Return the elevations (r,) of the cones that contain points (n, 3), the highest first.
 
-    The gaps between clusters of elevations must be larger than the widest cluster. Otherwise,
-    return None.
+    Returns None unless the gaps between the clusters of elevations are larger than the widest
+    cluster.
     """
     elevation = np.sort(elevations(points))
     gaps = np.diff(elevation)
@@ -162,7 +180,7 @@ def _clusters(points: Floats) -> Floats | None:
         return None
     ratios = largest[:-1] / np.maximum(largest[1:], 1e-9)
     ratios[: MIN_RINGS - 2] = 0
-    last = int(ratios.argmax())  # of the gaps between clusters
+    last = int(ratios.argmax())  # index of the smallest gap between clusters
     starts = np.append(0, np.flatnonzero(gaps >= largest[last]) + 1)
     stops = np.append(starts[1:], len(elevation)) - 1
     widest = float((elevation[stops] - elevation[starts]).max())
@@ -175,7 +193,7 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return the starts (k,) of runs of increasing or decreasing azimuths, and which are rings."""
+    """Return the starts (k,) of runs with monotonic azimuths, and a mask of runs that are rings."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     steps = np.diff(azimuth)
     direction = np.sign(np.sum(np.sign(steps)))
@@ -190,7 +208,7 @@ def _medians(values: Floats, starts: Ints) -> Floats:
 
 
 def _runs_in_order(points: Floats) -> Floats | None:
-    """Return the median elevations (k,) of runs in radians, or None if the runs are not rings."""
+    """Return the median elevations (k,) of runs in radians, or None if they are not rings."""
     if len(points) < _MAX_RINGS:
         return None
     starts, is_ring = _runs(points)

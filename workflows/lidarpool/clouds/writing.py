@@ -1,4 +1,4 @@
-"""Writes clouds in the formats of the table, completely or not at all."""
+"""Writes clouds in any format. A file or folder is either written completely or not at all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .multi_file_format import MultiFileFormat, RangeWorkers
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
-# Columns of every cloud that users miss, and columns that store the strength of a return.
+# Columns of every cloud whose omission is noted, and columns with the strength of a return.
 _ALWAYS = ("channel", "object")
 _STRENGTHS = {"intensity", "reflectivity", "signal"}
 # Options that only some formats support.
@@ -45,7 +45,7 @@ _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  
 class ExportSpec:
     """A format to which a cloud is exported, with its options.
 
-    In YAML, the format alone is sufficient.
+    In YAML, the name of the format is sufficient.
     """
 
     format: Annotated[
@@ -117,7 +117,7 @@ class ExportSpec:
 
     @classmethod
     def from_entry(cls, entry: str | Mapping[str, Any]) -> ExportSpec:
-        """Return the format of an entry of a scenario's `output.write`."""
+        """Return the format in an entry of a scenario's `output.write`."""
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
@@ -128,22 +128,22 @@ class ExportSpec:
 
     @property
     def row(self) -> FormatRow:
-        """The row of the table, or of a plug-in."""
+        """Row of the format in the table or in a plug-in."""
         return row_of(self.format)
 
     @property
     def cloud_format(self) -> type[CloudFormat]:
-        """The class of the format."""
+        """Class of the format."""
         return format_named(self.format)
 
     @property
     def has_many_files(self) -> bool:
-        """True if the format has many files, which workers can write."""
+        """Whether the format has many files, which workers can write."""
         return issubclass(self.cloud_format, MultiFileFormat)
 
     @property
     def title(self) -> str:
-        """Proper name of the format in sentences."""
+        """Proper name of the format for messages."""
         return self.cloud_format.title or self.format
 
     @property
@@ -152,11 +152,11 @@ class ExportSpec:
         return self.cloud_format.required_columns(self)
 
     def prepared(self, sweeps: Sweeps) -> Sweeps:
-        """Return sweeps that yield points as the options of the format state."""
+        """Return sweeps whose points are positioned according to the options of the format."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
-        """Return the names of the cloud's columns that the format cannot hold."""
+        """Return the names of the cloud's columns that the format cannot store."""
         stored = self.cloud_format.stored
         names = (column.name for column in cloud.table)
         if stored is None:
@@ -167,10 +167,10 @@ class ExportSpec:
     def notes(
         self, cloud: CloudLike, sweeps: Sweeps, requested: Collection[str] | None = None
     ) -> list[str]:
-        """Return notes for the user on the cloud in this format.
+        """Return notes for the user on differences between the cloud and the file.
 
-        `requested` are the columns that the user asked for, if they are known. Columns that are
-        there for other formats are not missed.
+        `requested` are the columns that the user requested, if this is known. The omission of
+        columns that only exist because another format requires them is not noted.
         """
         left_out = [
             name for name in self.left_out(cloud, sweeps) if self._is_missed(name, requested)
@@ -178,8 +178,8 @@ class ExportSpec:
         unnamed = [name for name in left_out if name in self.cloud_format.named]
         strengths = [name for name in self.needs if name in _STRENGTHS]
         replaced = [name for name in left_out if strengths and name in _STRENGTHS]
-        never_held = ", ".join(name for name in left_out if name not in unnamed + replaced)
-        notes = [f"{self.title} cannot store {never_held}"] if never_held else []
+        unsupported = ", ".join(name for name in left_out if name not in unnamed + replaced)
+        notes = [f"{self.title} cannot store {unsupported}"] if unsupported else []
         if replaced:
             notes.append(f"{self.title} stores {joined(strengths)} instead of {joined(replaced)}")
         notes += [
@@ -193,7 +193,7 @@ class ExportSpec:
         return notes + self.cloud_format.renamed(sweeps.sensors)
 
     def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
-        """Return whether a user misses a column that the format cannot hold."""
+        """Return whether the omission of a column should be noted."""
         if name in ("scan", "sensor"):  # sweeps and sensors are separate files, scans or topics
             return False
         if requested is not None:
@@ -201,7 +201,7 @@ class ExportSpec:
         return name != "ray" and name not in _STRENGTHS
 
     def contradictions(self, coordinates: str) -> list[str]:
-        """Return a note if readers of the format expect different coordinates than the cloud's."""
+        """Return a note if readers of the format expect coordinates in a different frame."""
         if coordinates != "sensor":
             return []
         frame = self.cloud_format.frame
@@ -225,18 +225,18 @@ class ExportSpec:
 
     @property
     def installed(self) -> bool:
-        """True if the packages that write the format are installed in this environment."""
+        """Whether the packages that the format requires are installed in this environment."""
         return not self.row.missing_packages
 
     def check_installed(self) -> None:
-        """Raise LidarError if a package that writes the format is missing in this environment."""
+        """Raise LidarError if a package that the format requires is not installed."""
         if missing := self.row.missing_packages:
             needs = [f"lidarpool[{self.row.extra}]"] if self.row.extra else missing
             command = install_command(*needs)
             raise LidarError(f"The format {self.format} requires {joined(missing)}. Run {command}.")
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
-        """Raise LidarError unless all requirements of `write` are met, before a file is written."""
+        """Raise LidarError unless `write` can write the cloud to a path."""
         self.check_installed()
         if not path.parent.is_dir():
             raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
@@ -247,7 +247,7 @@ class ExportSpec:
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
-        """Raise LidarError if a cloud lacks columns that the format needs."""
+        """Raise LidarError if a cloud lacks columns that the format requires."""
         cloud_columns = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in cloud_columns]:
             has_layouts = self.cloud_format.supports("layout")
@@ -263,7 +263,7 @@ class ExportSpec:
 
     @property
     def _entry(self) -> str:
-        """The entry of `output.write` with the columns of the format, as YAML."""
+        """Entry of `output.write` that requests the columns of the format, as YAML."""
         has_layouts = self.cloud_format.supports("layout")
         options = {
             "layout": self.layout if has_layouts and self.layout != "velodyne" else "",
@@ -285,20 +285,33 @@ class ExportSpec:
         workers: RangeWorkers | None = None,
         content: Callable[[], PictureContent | None] = lambda: None,
     ) -> float | None:
-        """Write a cloud to a file or folder completely, or not at all.
+        """Write a cloud to a file or folder, completely or not at all.
 
-        Points are read in order, a chunk at a time. Workers write a multi-file format, as far as
-        they see its folder. `content` returns scene and planned path for formats that hold these.
+        Points are read in order, one chunk at a time.
+
+        Parameters
+        ----------
+        path
+            File or folder to write.
+        cloud, sweeps
+            Points to write, and the sweeps to which they belong.
+        overwrite
+            Whether to replace an existing file or folder.
+        workers
+            Function that writes ranges of a multi-file format on workers. Ranges that it does not
+            write are written by this process.
+        content
+            Function that returns the scene and the planned path, for formats that store them.
 
         Returns
         -------
-        The intensity that is stored as the highest integer, or None if the format has real numbers
-        or the cloud has no intensities.
+        The intensity that is stored as the largest integer, or None if intensities are stored as
+        floats or the cloud has no intensities.
 
         Raises
         ------
         LidarError
-            If a package or column is missing, the file exists, or it cannot be written.
+            If a package or column is missing, or if the file exists or cannot be written.
         """
         full_scale: float | None = None
         with explained(f"{path} cannot be written"):
@@ -321,9 +334,9 @@ class ExportSpec:
     def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
-        """Write a multi-file format into a storage through workers.
+        """Write a multi-file format to a storage.
 
-        After a LidarError, no file is left.
+        If this fails, all files that were written are removed.
         """
         file = self.row.file
         folder = Storage(storage.path(file))
@@ -339,9 +352,9 @@ class ExportSpec:
 
 
 def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
-    """Return a survey with the columns that its sensors need in the formats of its cloud.
+    """Return a survey with additional columns that its sensors require in some formats.
 
-    LidarError if a format cannot store the data of a sensor.
+    Raises LidarError if a format does not support a sensor.
     """
     names = dict.fromkeys(
         name for spec in specs for name in spec.cloud_format.survey_columns(survey)
@@ -350,7 +363,7 @@ def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
 
 
 def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:
-    """Raise LidarError if folders of formats, which would be replaced, hold foreign files."""
+    """Raise LidarError if folders that would be replaced contain files of other programs."""
     for format_name in formats:
         file = row_of(format_name).file
         pattern = format_named(format_name).file_pattern

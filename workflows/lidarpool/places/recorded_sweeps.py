@@ -1,7 +1,6 @@
-"""Sweeps of a recording as a reconstruction needs them, which other processes can read, too.
+"""Sweeps of a recording with the columns that a reconstruction requires.
 
-A sweep has the columns `row`, `intensity`, `label`, `time_s` and `start_rad`, as far as they are
-known: see `RecordedSweeps.read`.
+Worker processes read them, too. `RecordedSweeps.read` describes the columns.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from ..clouds.rings import MIN_RINGS, Rings, cones, elevations
 from ..recordings.opening import open_recording
 from .labels import labels_of
 
-_COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # of a file, which are used
-_GAP_RAD = np.radians(0.5)  # between the rays of a sensor without rings, in many sweeps
-_REFERENCE_SWEEPS = 5  # sweeps that determine the rotation
-_MAX_START_RAD = np.radians(12)  # between the first pulses of rings
-_MIN_AGREEMENT = 0.9  # of azimuths with a steady rotation: length of their mean direction
+_COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # columns that are used
+_GAP_RAD = np.radians(0.5)  # angle between rays over many sweeps, for sensors without rings
+_REFERENCE_SWEEPS = 5  # sweeps from which the rotation is determined
+_MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rings
+_MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
 
 RecordingFile = tuple[Path, str | None, str | None]  # path, sensor or topic, intensity column
 
@@ -50,20 +49,20 @@ class Rotation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedSweeps:
-    """The sweeps of a recording, which are read one by one.
+    """The sweeps of a recording, which are read one at a time.
 
-    What was found in the recording is part of this record, so other processes do not repeat the
-    analysis.
+    Rings, times and timestamps are stored here, so that other processes do not have to determine
+    them again.
 
     Attributes
     ----------
     source
-        Path, sensor and intensity column of a recording, which each process opens once; or a
-        recording in memory, which stays in this process.
+        Path, sensor and intensity column of a recording, which each process opens once, or a
+        recording in memory, which cannot be sent to other processes.
     rings
-        Rings of the sensor, without elements for a sensor without rings.
+        Rings of the sensor, which are empty for a sensor without rings.
     point_times
-        Unit and zero of the point times, or None if the recording has none.
+        Unit and clock of the point times, or None if the points have no times.
     stamps_s
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
     """
@@ -84,7 +83,10 @@ class RecordedSweeps:
 
     @classmethod
     def from_recording(cls, recording: Recording) -> RecordedSweeps:
-        """Find rings and times of a recording, or raise LidarError if no sweep can be read."""
+        """Determine the rings and times of a recording.
+
+        Raises LidarError if the recording has no sweeps or no points.
+        """
         if recording.is_cloud or not len(recording):
             raise LidarError(
                 f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
@@ -103,7 +105,7 @@ class RecordedSweeps:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on what the recording lacks."""
+        """Notes for the user on information that the recording lacks."""
         notes = [self.rings.note]
         if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
             notes.append(self.point_times.note(self.recording.name))
@@ -116,12 +118,12 @@ class RecordedSweeps:
 
     @property
     def elevation_rad(self) -> Floats:
-        """Median elevations of the rings, (r,), the highest first; empty without rings."""
+        """Median elevations of the rings from the highest to the lowest, of shape (r,)."""
         return self.rings.elevation_rad
 
     @property
     def ring_count(self) -> int:
-        """Number of rings, 1 for a sensor without rings."""
+        """Number of rings, which is 1 for a sensor without rings."""
         return max(len(self.rings), 1)
 
     @property
@@ -133,23 +135,30 @@ class RecordedSweeps:
 
     @property
     def is_compensated(self) -> bool:
-        """Whether points are known to be compensated for the motion, as in results."""
+        """Whether the points are known to be motion-compensated, as in results of lidarpool."""
         return self.recording.fired is not None
 
     def keeping(self, numbers: Iterable[int]) -> RecordedSweeps:
-        """Read some sweeps, ascending, and keep these: bags are read from their start only."""
+        """Return a copy that holds some sweeps in memory.
+
+        `numbers` are in ascending order, because bags can only be read from their start.
+        """
         return replace(self, _kept={number: _compact(self.read(number)) for number in numbers})
 
     def read(self, number: int) -> Sweep:
         """Read the returns of a sweep whose rings are known.
 
-        Columns are the `row` of the ring in `rings`, 0 for a sensor without rings; `intensity` on
-        the scale of the recording; `label`, as `labels_of` returns it; `time_s`, relative to the
-        timestamp of the sweep, which may be that of its last point; and `start_rad`, the azimuth at
-        which the ring of the point starts. All except `row` are omitted if they are unknown, and
-        `start_rad` is omitted if points are known to be compensated.
-
         Raises LidarError if the recording cannot be read.
+
+        The sweep has the following columns. All except `row` are omitted if they are unknown, and
+        `time_s` and `start_rad` are also omitted if the points are known to be compensated.
+
+        - `row`: index of the ring in `rings`, or 0 for a sensor without rings.
+        - `intensity`: on the scale of the recording.
+        - `label`: see `labels_of`.
+        - `time_s`: time relative to the timestamp of the sweep, which may be that of its last
+          point.
+        - `start_rad`: azimuth at which the ring of the point starts.
         """
         sweep = _wide(self._kept[number]) if number in self._kept else self._read(number)
         if not len(self.rings) or self.is_compensated:
@@ -186,11 +195,11 @@ class RecordedSweeps:
         return self.point_times.of_points(returns.columns, stamp_s)
 
     def rotation(self, period_s: float, first_s: float) -> Rotation | None:
-        """Find the rotation from the times and azimuths of points, or return None.
+        """Determine the rotation from the times and azimuths of points, or return None.
 
-        A revolution takes `period_s`, and starts at `first_s` relative to the timestamp. The
-        azimuth of the start is a mean over rings and sweeps. The motion of the sensor hardly
-        changes it, since compensation shifts azimuths to the left and right alike.
+        A revolution takes `period_s` and starts at `first_s` relative to the timestamp. The start
+        azimuth is a mean over rings and sweeps. Motion compensation hardly affects it, because it
+        shifts azimuths to the left and to the right.
         """
         sums = np.zeros(2, complex)
         count = 0
@@ -200,8 +209,8 @@ class RecordedSweeps:
             if times_s is None or not len(returns):
                 continue
             azimuth = np.arctan2(returns.points[:, 1], returns.points[:, 0])
-            turned = 2 * np.pi * (times_s - first_s) / period_s
-            sums += [np.exp(1j * (azimuth - sign * turned)).sum() for sign in (1, -1)]
+            rotation_rad = 2 * np.pi * (times_s - first_s) / period_s
+            sums += [np.exp(1j * (azimuth - sign * rotation_rad)).sum() for sign in (1, -1)]
             count += len(returns)
         best = int(np.abs(sums).argmax())
         if np.abs(sums[best]) <= _MIN_AGREEMENT * count:
@@ -209,14 +218,14 @@ class RecordedSweeps:
         return Rotation(best == 1, float(np.degrees(np.angle(sums[best])) % 360))
 
     def starts(self, *, is_clockwise: bool) -> Rotation:
-        """Return the rotation of a known direction, by where the rings of sweeps start."""
+        """Determine the rotation from the azimuths at which rings start, given its direction."""
         numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
         starts_rad = [ring_starts(self.read(number), self.ring_count) for number in numbers]
         mean = float(np.angle(np.exp(1j * np.stack(starts_rad)).sum()))
         return Rotation(is_clockwise, float(np.degrees(mean) % 360))
 
     def cone_spread_rad(self, number: int) -> float:
-        """Return how far the rings of a sweep are from cones (`cones`); inf if it is empty."""
+        """Return the deviation of a sweep's rings from cones (`cones`), or inf if it is empty."""
         sweep = self.read(number)
         if not len(sweep):
             return float("inf")
@@ -226,9 +235,9 @@ class RecordedSweeps:
 def ring_starts(sweep: Sweep, ring_count: int) -> Floats:
     """Return the azimuths (r,) in radians at which the rings of a sweep start.
 
-    The points are in the order of the recording, and the first of a ring is its start. The lasers
-    of some sensors point to azimuths that differ by several degrees. A ring whose first pulses are
-    lost, as in the sky, starts where most rings do.
+    The points are in the order of the recording, so a ring starts at its first point. In some
+    sensors, the azimuths of the lasers differ by several degrees. If the first pulses of a ring
+    have no return, for example in the sky, the start of most rings is used.
     """
     if not len(sweep):
         return np.zeros(ring_count)
@@ -247,7 +256,7 @@ def ring_starts(sweep: Sweep, ring_count: int) -> Floats:
 
 
 def _compact(sweep: Sweep) -> Sweep:
-    """Return a sweep in half the memory."""
+    """Return a sweep that uses half as much memory."""
     columns = {name: values for name, values in sweep.columns.items() if name != "start_rad"}
     columns["row"] = columns["row"].astype(np.int16)
     if "intensity" in columns:
@@ -264,13 +273,13 @@ def _wide(sweep: Sweep) -> Sweep:
 
 
 def _exact32(values: AnyArray) -> AnyArray:
-    """Return values in single precision, if it has all of their digits."""
+    """Return values in single precision if they can be represented exactly."""
     single = values.astype(np.float32)
     return single if np.array_equal(single, values, equal_nan=True) else values
 
 
 def _has_points(recording: Recording) -> bool:
-    """Return whether any of the sweeps that determine the rings has points."""
+    """Return whether any of the reference sweeps has points."""
     numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
     return any(len(recording.read_fired(number)) for number in numbers)
 

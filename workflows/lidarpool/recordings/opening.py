@@ -1,4 +1,4 @@
-"""Opens clouds and recordings, of lidarpool and of other programs, to be read sweep by sweep."""
+"""Opens clouds and recordings of lidarpool and other programs, which are read sweep by sweep."""
 
 from __future__ import annotations
 
@@ -25,19 +25,22 @@ KINDS = (
     ".asc, .csv, .pts, .ptx, .npy, .bin (KITTI, nuScenes), .pcap, .pcapng (Velodyne, Ouster) or "
     ".osf file, a ROS 2 bag, or a folder in KITTI, nuScenes, WebDataset or range image format"
 )
-_CONVERSIONS = {  # {suffix of recordings that are not read: advice}
+_CONVERSIONS = {  # {extension of files that are not supported: advice}
     ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
     ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
     ".rrd": "It is a Rerun recording. Open it with the `rerun` command.",
     ".osi": "It is an OSI trace. Use it as the traffic of a scenario.",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
 }
-# Endings of clouds that may have another unit.
+# Extensions of files whose unit can be chosen.
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))
 
 
 class UnknownFormatError(LidarError):
-    """The format of a file or folder is not supported, with `advice`: sentences, or no text."""
+    """The format of a file or folder is not supported.
+
+    `advice` is a remedy in sentences, or an empty string.
+    """
 
     def __init__(self, name: str, advice: str) -> None:
         super().__init__(f"The format of {name} is not supported. {advice or f'Specify {KINDS}.'}")
@@ -45,13 +48,12 @@ class UnknownFormatError(LidarError):
 
 
 def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
-    """Open all sensors, or topics, of a recording, {name: recording}.
+    """Open the recordings of all sensors or topics, {name: recording}.
 
-    A single sensor has the name "".
+    A single sensor has an empty name. If there are several sequences with different world frames,
+    only the first one is opened.
 
-    Of several sequences in different coordinates, the first is opened.
-
-    LidarError as of `open_recording`.
+    Raises LidarError as `open_recording`.
     """
     opened = partial(open_recording, source, keep_noise=keep_noise)
     try:
@@ -79,36 +81,36 @@ def open_recording(
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a recording or cloud, whatever its format, to read it sweep by sweep.
+    """Open a recording or cloud in any format, which is read sweep by sweep.
 
     Parameters
     ----------
     source
-        File or folder of a recording, a result or a data set, or a cloud in memory, which has
-        sweeps if it belongs to a result.
+        File or folder of a recording, a result or a data set, or a cloud in memory. Clouds have
+        sweeps if they belong to a result.
     sensor
-        Name of the sensor, or topic of a bag, in recordings that contain several.
+        Name of the sensor, or topic in a bag. Required if there are several.
     intensity
         Column that contains the intensities. The default is ``intensity``.
     name
-        Name of a cloud in memory in messages.
+        Name for messages, if the source is a cloud in memory.
     unit
-        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file, which replaces the
-        unit that the file states. The default is the unit of the file, otherwise meters.
+        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file, which overrides the
+        unit that the file states. By default, files that state no unit are in meters.
     keep_noise
         Whether to include points that a file withholds or classifies as noise.
 
     Returns
     -------
     Recording
-        A sequence of `Sweep` objects, which are read on access. Clouds without sweeps are divided
-        into parts.
+        A sequence of `Sweep` objects, which are read when they are accessed. Large clouds without
+        sweeps are divided into parts.
 
     Raises
     ------
     LidarError
-        If the source is missing or its format is not supported, if it contains several sensors and
-        none is chosen, or if its coordinate system distorts lengths.
+        If the source does not exist or is not supported, if it contains several sensors and none is
+        chosen, or if its coordinate system distorts lengths.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Names of point columns in other programs' files, and their standard names.
 
-This is the only list of such names. A new alias is one more word in `ALIASES`. Names are compared
-without case and without the prefix `scalar_` that CloudCompare adds.
+This is the only list of such names. To support another name, add it to `ALIASES`. The case of
+names and the prefix `scalar_`, which CloudCompare adds, are ignored.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ AXES = ("x", "y", "z")
 COLORS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
 ORIGINS = ("origin_x", "origin_y", "origin_z")
-# {standard name: other names for the same quantity, the most specific name first}
+# {standard name: other names for the same quantity, in order of preference}
 ALIASES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(AXES, ()),
     "channel": ("ring", "laser_id", "laser_number", "laser", "line", "beam"),
@@ -36,10 +36,10 @@ ALIASES: Mapping[str, tuple[str, ...]] = {
     "rgb": (),
     "rgba": (),
 }
-# Times keep their names, because their unit and zero follow from their values
-# (`lidarpool/clouds/point_times.py`). The first column present is used.
+# Names of point times, in order of preference. They have no standard name, because their unit and
+# clock depend on the values (`lidarpool/clouds/point_times.py`).
 TIMES = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset", "time_stamp")
-# Columns that contain the strength of a return; the first column present is used.
+# Columns that contain the strength of a return, in order of preference.
 STRENGTHS = ("intensity", "reflectivity")
 
 _STANDARD = {name: (name, 0) for name in ALIASES}
@@ -48,18 +48,18 @@ for _name, _aliases in ALIASES.items():
 
 
 def standard_names(names: Iterable[str], among: Collection[str] | None = None) -> list[str]:
-    """Return distinct column names, with the standard name for each known alias.
+    """Replace column names by standard names, and make them distinct.
 
-    A standard name is given to one column: to the column that already has the name, otherwise to
-    the first of its aliases in `ALIASES`. The other columns keep their names, and a repeated name
-    gets a number.
+    Only one column gets a standard name: the column that already has it, or else the column whose
+    name comes first in `ALIASES`. All other columns keep their names. A number is appended to names
+    that occur repeatedly.
 
     Parameters
     ----------
     names
         Names in the order of the file.
     among
-        Standard names that may be assigned. By default, all standard names are assigned.
+        Standard names that may be assigned (default: all).
 
     Examples
     --------
@@ -74,7 +74,7 @@ def standard_names(names: Iterable[str], among: Collection[str] | None = None) -
 @lru_cache(maxsize=256)
 def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tuple[str, ...]:
     present = set(names)
-    best: dict[str, tuple[int, int]] = {}  # {standard name: (rank of the alias, index)}
+    best: dict[str, tuple[int, int]] = {}  # {standard name: (rank of the alias, column index)}
     for index, name in enumerate(names):
         standard, rank = _STANDARD.get(name.lower().removeprefix("scalar_"), ("", 0))
         if not standard or standard in present or (among is not None and standard not in among):
@@ -87,14 +87,11 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
 def with_standard_names(
     columns: Mapping[str, AnyArray], among: Collection[str] | None = None
 ) -> dict[str, AnyArray]:
-    """Return columns under their standard names, as in `standard_names`."""
+    """Rename columns to their standard names; see `standard_names`."""
     return dict(zip(standard_names(columns, among), columns.values(), strict=True))
 
 
 def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArray]:
-    """Return the columns that contain a quantity, the column with its standard name first.
-
-    Several columns are possible because only one of them gets the standard name.
-    """
+    """Return the columns with a standard name or one of its aliases, the standard name first."""
     found = sorted(columns, key=lambda other: other != name)
     return {other: columns[other] for other in found if standard_names([other]) == [name]}

@@ -25,38 +25,39 @@ class Sweep:
         up, unless the mount is rotated. Parts of a cloud are in the frame of the cloud. Pulses
         without a return are NaN or zero in organized sweeps; `returns` removes them.
     columns
-        Further values of each point as {name: array of shape (n,)}, under the names and in the
-        units of lidarpool where these are known. Columns without a standard name keep their names.
+        Further values of each point as {name: array of shape (n,)}. Columns with a known meaning
+        have the standard names of lidarpool, and the others have the names of the file.
     pose
         Transformation from the sensor frame to the world frame, of shape (4, 4), or None if it is
-        unknown. A function is called when the pose is requested.
+        unknown. If it is a function, it is called when the pose is requested.
     time_ns
         Timestamp of the sweep in nanoseconds, or None if it is unknown. For results, this is the
         time since the start of the survey.
     compensated
         Whether the points are compensated for the motion during the sweep, or None if unknown.
     firing_poses
-        Poses of the sensor at the firing of each point
-        (`lidarsim.sweeps.sweep_motion.FiringPoses`), or None if they are unknown. They refer to
-        points as fired.
+        Poses of the sensor when the points were fired
+        (`lidarsim.sweeps.sweep_motion.FiringPoses`), or None if they are unknown. They only apply
+        to points that are not compensated.
     scanner
-        Position of the scanner in the frame of the file, in meters, of shape (3,), or None.
+        Position of the scanner in the frame of the file in meters, of shape (3,), or None.
     units_m
-        Lengths of the units of the points in meters, if the file states them for this sweep.
+        Units of x, y and z in meters, if the file states them for this sweep.
     boxes
-        Bounding boxes of actors in the sensor frame, a function that returns them, or None.
+        Bounding boxes of the actors in the sensor frame, or a function that returns them, or None.
     sensor, number
         Name of the sensor, and index of the sweep among the sweeps of the sensor.
     job, job_number, split, values
-        Job of a data set to which the sweep belongs, and the varied values of this job by path.
+        Name, number and split of the job in a data set to which the sweep belongs, and the varied
+        values of this job as {path: value}.
     object_names
-        Names of the objects that the column `object` numbers.
+        Names of the objects. The column `object` contains indices into this tuple.
     faults
         Faults of the sensor during the sweep.
     notes
-        Clauses about the points that follow the name of the file.
+        Notes on the points, as clauses that follow the name of the file.
     skipped
-        Names of columns in the file that cannot be represented.
+        Names of columns in the file that could not be read.
     recording
         Recording to which the sweep belongs. It determines `rings` and `times_s` where the file
         does not state them.
@@ -158,15 +159,15 @@ class Sweep:
 
     @cached_property
     def boxes(self) -> Any:
-        """Bounding boxes of the actors that are in the scene, in the sensor frame, or None."""
+        """Bounding boxes of the actors in the sensor frame, or None if they are unknown."""
         return self._boxes() if callable(self._boxes) else self._boxes
 
     @cached_property
     def rings(self) -> AnyArray | None:
         """Ring of each point, integers of shape (n,), or None if the rings are unknown.
 
-        Without a column `channel`, the recording determines the rings from the order or the
-        elevation angles of the points. Rings are then counted from the lowest, and points that
+        If there is no column `channel`, the recording determines the rings from the order or the
+        elevation angles of the points. They are then counted from the lowest ring, and points that
         belong to no ring have the value -1.
         """
         if "channel" in self.columns:
@@ -178,7 +179,10 @@ class Sweep:
 
     @cached_property
     def times_s(self) -> Floats | None:
-        """Time of each point relative to the timestamp of the sweep in seconds, (n,), or None."""
+        """Time of each point relative to the timestamp of the sweep, or None if it is unknown.
+
+        The times are in seconds and have the shape (n,).
+        """
         if self._origin is not None:
             sweep, rows = self._origin
             return None if sweep.times_s is None else sweep.times_s[rows]
@@ -186,24 +190,24 @@ class Sweep:
 
     @property
     def intensity(self) -> AnyArray | None:
-        """Intensity of each point, (n,), or None if it is unknown.
+        """Intensity of each point, of shape (n,), or None if it is unknown.
 
-        This is the column `intensity`, which contains received energies in results, or the column
-        `reflectivity`.
+        This is the column `intensity`, which contains the received energies in results of
+        lidarpool, or else the column `reflectivity`.
         """
         return next((self.columns[name] for name in STRENGTHS if name in self.columns), None)
 
     @property
     def classes(self) -> AnyArray | None:
-        """Semantic class of each point, integers of shape (n,), or None.
+        """Semantic class of each point, integers of shape (n,), or None if it is unknown.
 
-        Points without a class have the value 0.
+        In files of lidarpool, points without a class have the value 0.
         """
         return self.columns.get("class")
 
     @property
     def objects(self) -> Ints32 | None:
-        """Indices into `object_names`, int32 of shape (n,), or None without such a column."""
+        """Index of each point's object in `object_names`, of shape (n,), or None."""
         return self.columns.get("object")
 
     @property
@@ -215,14 +219,14 @@ class Sweep:
         return np.asarray(np.isfinite(self.points).all(axis=1) & self.points.any(axis=1))
 
     def returns(self) -> Self:
-        """Return the sweep without pulses that have no return, in double precision."""
+        """Return the points that have a return, in double precision."""
         mask = self.has_return
         sweep = self if mask.all() else self.select(mask)
         points = np.asarray(sweep.points, np.float64)
         return sweep if points is sweep.points else sweep.replace(points=points)
 
     def select(self, rows: Bools | Indices | slice) -> Self:
-        """Return selected points."""
+        """Return some of the points, given a mask, indices or a slice."""
         columns = {name: np.asarray(values)[rows] for name, values in self.columns.items()}
         poses = self.firing_poses
         selected = self.replace(
@@ -245,7 +249,7 @@ class Sweep:
         )
 
     def in_world(self) -> Floats:
-        """Return the points in the world frame, (n, 3), at the pose of the sweep."""
+        """Transform the points to the world frame. The pose must be known."""
         assert self.pose is not None
         return np.asarray(self.points @ self.pose[:3, :3].T + self.pose[:3, 3])
 
@@ -253,7 +257,8 @@ class Sweep:
     def joined(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
         """Concatenate the points of sweeps.
 
-        Columns that only some sweeps have are NaN in the others, or are omitted with `only_shared`.
+        The result has all columns, with NaN for sweeps that lack a column. If `only_shared` is
+        true, it has only the columns that all sweeps have.
         """
         filled = [sweep for sweep in sweeps if len(sweep)] or sweeps[:1]
         if not filled:
