@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import multiprocessing
 import tarfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import LidarError, compare, twin
+from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.places.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.motion import Motion
@@ -387,3 +390,100 @@ def lidar_rows(count):
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = np.arange(count)
     return poses[:, :3].reshape(-1, 12)
+
+
+def read_by_a_fork(recording, expected):
+    """Return the first x of sweeps in any order, read while a forked process reads them, too."""
+    numbers = np.random.default_rng(0).integers(0, len(recording), 60).tolist()
+
+    def count_wrong(queue):
+        queue.put(sum(recording[n].points[0, 0] != expected[n] for n in numbers))
+
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    process = context.Process(target=count_wrong, args=(queue,))
+    process.start()
+    found = [recording[number].points[0, 0] for number in numbers]
+    assert queue.get(timeout=60) == 0
+    process.join()
+    return found, [expected[number] for number in numbers]
+
+
+def write_e57(path):
+    """Write two scans, each with a point at x."""
+    pytest.importorskip("pye57", reason="pye57 is an extra")
+    from tests.e57_files import write_scans
+
+    axes = ("cartesianX", "cartesianY", "cartesianZ")
+    scans = [
+        {"fields": {axis: (np.full(1000, x), "double") for axis in axes}, "name": f"at {x}"}
+        for x in (2.0, 3.0)
+    ]
+    return write_scans(path, scans)
+
+
+@pytest.mark.parametrize("name", ["bag", "e57"])
+def test_sweeps_can_be_read_by_threads_and_forked_processes(tmp_path, name):
+    """Both move the position of the same open file."""
+    if name == "bag":
+        path = write_bag(tmp_path / "drive", drive(relative))
+    else:
+        path = write_e57(tmp_path / "a.e57")
+    recording = open_recording(path)
+    expected = first_x(recording)
+    assert len(set(expected)) == len(recording) > 1
+    recording[0]  # leaves the file open at the second sweep
+    found, wanted = read_by_a_fork(recording, expected)
+    assert found == wanted
+    numbers = np.random.default_rng(1).integers(0, len(recording), 100).tolist()
+    with ThreadPoolExecutor(8) as pool:
+        stamps = pool.submit(lambda: recording.stamps_ns)
+        sweeps = [*pool.map(recording.__getitem__, numbers)]
+    assert [sweep.points[0, 0] for sweep in sweeps] == [expected[number] for number in numbers]
+    assert (stamps.result() is None) == (name == "e57")
+
+
+def test_sweeps_after_a_damaged_sweep_can_be_read(tmp_path):
+    sweeps = drive(relative)
+    sweeps[1] = (sweeps[1][0], {"x": sweeps[1][1]["x"]})
+    recording = open_recording(write_bag(tmp_path / "drive", sweeps))
+    for _ in range(2):
+        with pytest.raises(LidarError, match="coordinates are incomplete"):
+            recording[1]
+        assert len(recording[2]) and len(recording[0])
+
+
+def test_items_are_whole_numbers(tmp_path):
+    write_pcd(tmp_path / "0.pcd", 1)
+    recording = open_recording(tmp_path)
+    assert recording[np.int64(-1)].points[0, 0] == 1
+    for item in (0.0, slice(1)):
+        with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+            recording[item]
+
+
+@pytest.mark.parametrize("intensity", ["intensity", "echo"])
+def test_a_chosen_column_of_intensities_must_exist(tmp_path, intensity):
+    write_pcd(tmp_path / "0.pcd", 1)
+    with pytest.raises(LidarError, match=f"no column '{intensity}' .* as intensity\\.$"):
+        open_recording(tmp_path, intensity=intensity)[0]
+
+
+def test_an_incomplete_bag_is_named_with_a_remedy(tmp_path):
+    bag = write_bag(tmp_path / "drive", drive(relative))
+    (file,) = bag.glob("*.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[:-1000])
+    with pytest.raises(LidarError, match=r"not a complete MCAP file.*`mcap recover`\.$"):
+        open_recording(cut)
+
+
+def test_an_error_of_a_later_sweep_names_the_recording_once(tmp_path):
+    """The rings follow from several sweeps, which are read while the first is put into cells."""
+    pytest.importorskip("scipy", reason="the extra fit is not installed")
+    for number in range(5):
+        write_pcd(tmp_path / f"{number}.pcd", number + 1)
+    (tmp_path / "4.pcd").write_text("VERSION 0.7\n")
+    with pytest.raises(LidarError) as told:
+        SweepStack.read(open_recording(tmp_path))
+    assert str(told.value).count(str(tmp_path)) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
+from ..base.per_process import PerProcess
 from .cloud_format import CloudFormat
 from .gps_time import gps_start_s
 from .recording import Recording, RecordingSource
@@ -174,7 +176,8 @@ def _open_e57(source: RecordingSource) -> Recording:
 
     with reading(source.name):
         size = input_size(source.path)
-        file = pye57.E57(str(source.path))
+        files = PerProcess(partial(pye57.E57, str(source.path)))
+        file = files()
         headers = [file.get_header(number) for number in range(file.scan_count)]
         # A column of equal values takes no bytes, whatever the number of points.
         total = Allowance(size, _THIN, in_parts=True)
@@ -184,7 +187,8 @@ def _open_e57(source: RecordingSource) -> Recording:
 
         def read(number: int) -> Sweep:
             Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
-            return _read_scan(file, headers, number, scale)
+            file = files()
+            return _read_scan(file, file.get_header(number), number, scale)
 
         notes = list(scale.notes)
         for number, header in enumerate(headers):
@@ -210,13 +214,12 @@ def _open_e57(source: RecordingSource) -> Recording:
     )
 
 
-def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) -> Sweep:
+def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
     """Read a scan of an open `pye57.E57` in the axes of its scanner, without invalid points.
 
     Colors and intensities that are marked as invalid are NaN, and columns of these alone are left
     out. Other colors are from 0 to 255.
     """
-    header = headers[number]
     scan_name = _name(header, number)
     pose, _ = _pose(header, scan_name)
     fields = header.point_fields

@@ -7,17 +7,19 @@ file does not state are determined from a few sweeps when they are first request
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
 from lidarsim.base.signatures import ReadableSignature
@@ -31,6 +33,7 @@ from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_mete
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
+from ..base.per_process import PerProcess
 from .point_times import PointTimes
 from .rings import Rings
 
@@ -159,6 +162,7 @@ class Recording:
 
         Raises LidarError if the recording cannot be read, and IndexError if there is no such item.
         """
+        number = operator.index(number)
         if not -self.count <= number < self.count:
             items = plural(self.count, "part" if self.is_cloud else "sweep")
             raise IndexError(f"{self.name} has {items}, so {number} is out of range")
@@ -212,14 +216,15 @@ class Recording:
         Raises ValueError if there is no such column.
         """
         name = self.intensity_column
-        if name is None or name == "intensity":
+        if name is None:
             return standard
         for columns in (stored, standard):
             if name in columns:
                 return {**standard, "intensity": np.asarray(columns[name])}
+        available = f" Available columns: {', '.join(stored)}." if stored else ""
         raise ValueError(
             f"it has no column {name!r} that could be used as intensity."
-            + (did_you_mean(name, stored) or f" Available columns: {', '.join(stored)}.")
+            + (did_you_mean(name, stored) or available)
         )
 
     @property
@@ -402,19 +407,45 @@ class RecordingSource:
         if count is None:
             with reading(self.name):
                 count = sum(1 for _ in sweeps())
-        next_number = 0
-        remaining: Iterator[Any] = iter(())  # sweeps from `next_number`
+        positions = PerProcess(_StreamPosition)
 
         def read(number: int) -> Sweep:
-            nonlocal next_number, remaining
-            if not 0 < next_number <= number:
-                next_number = 0
-                remaining = iter(sweeps())
-            stored = next(islice(remaining, number - next_number, None))
-            next_number = number + 1
-            return convert(stored)
+            position = positions()
+            with position.lock:
+                start = position.next_number
+                position.next_number = 0  # after an error, the next call starts again
+                if not 0 < start <= number:
+                    start = 0
+                    position.remaining = iter(sweeps())
+                stored = next(islice(position.remaining, number - start, None), None)
+                if stored is None:
+                    raise CutShortError(
+                        f"{plural(count, 'sweep')} were expected, but there are fewer"
+                    )
+                position.next_number = number + 1
+                return convert(stored)
 
+        def locked(function: Callable[[], Any]) -> Callable[[], Any]:
+            def call() -> Any:
+                with positions().lock:
+                    found = function()
+                    return [*found] if isinstance(found, Iterator) else found
+
+            return call
+
+        for name in ("read_stamps", "read_poses"):
+            if fields.get(name) is not None:
+                fields[name] = locked(fields[name])
         return self.recording(count, read, **fields)
+
+
+@dataclass
+class _StreamPosition:
+    """Position of a process in a stream, which one thread at a time moves."""
+
+    next_number: int = 0
+    remaining: Iterator[Any] = field(default_factory=lambda: iter(()))  # from `next_number`
+    lock: RLock = field(default_factory=RLock)
 
 
 def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:

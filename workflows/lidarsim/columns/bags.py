@@ -78,6 +78,11 @@ def open_bag(path: Path, name: str) -> Reader:
             bag = ClosingBag(path)
             bag.open()
         except ReaderError as error:
+            if "magic is invalid" in str(error):
+                raise LidarError(
+                    "it is not a complete MCAP file. If the recording was interrupted, repair the "
+                    "file with `mcap recover`."
+                ) from error
             if "Profile is not ros2" not in str(error):
                 raise
             raise LidarError(
@@ -139,6 +144,8 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
         for field in message.fields
         for index in range(field.count)
     ]
+    if not numbers:
+        return {}
     formats = [order + kinds[field.datatype] for _, field, _ in numbers]
     row = np.dtype(
         {

@@ -35,6 +35,7 @@ from lidarsim.motion.trajectory import Track
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, states_compensation
 
+from ...base.per_process import PerProcess
 from .. import laser_scan
 from ..cloud_format import CloudFormat, PointColumns
 from ..frame_names import survey_start_ns
@@ -265,7 +266,8 @@ def _open_bag(source: RecordingSource) -> Recording:
 
     CustomMsg of Livox is read where a bag has no PointCloud2, or its topic is chosen.
     """
-    bag = open_bag(source.path, source.name)
+    bags = PerProcess(partial(open_bag, source.path, source.name))
+    bag = bags()
     clouds = {
         connection.topic: connection
         for connection in bag.connections
@@ -278,8 +280,10 @@ def _open_bag(source: RecordingSource) -> Recording:
     }
     topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
     connection = topics[source.choose("PointCloud2 topics", topics)]
-    messages = partial(bag.messages, [connection])
     columns_of = livox_columns if topics is livox_clouds else point_columns
+
+    def messages() -> Iterator[Any]:
+        return bags().messages([connection])
 
     def convert(message: Any) -> Sweep:
         _, recorded_ns, data = message

@@ -75,7 +75,7 @@ class SweepStack:
         check_sweeps(recording)
         read = read or partial(compared_sweep, recording)
         cells = _CommonCells.read(recording, read)
-        notes = [*recording.notes, *rings_note(recording, cells.reference)]
+        notes = [*recording.notes, *cells.ring_notes]
         if len(cells.numbers) < recording.count:
             notes.append(
                 f"{len(cells.numbers):,} evenly spaced sweeps out of {recording.count:,} are used"
@@ -128,6 +128,7 @@ class _CommonCells:
 
     numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
     reference: Sweep  # the sweep whose rings and steps of azimuth define the cells
+    ring_notes: list[str]  # how its rings were found
     images: RangeImages  # range images of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
@@ -139,13 +140,16 @@ class _CommonCells:
         reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
+        # This determines the rings. Errors of reading a sweep already name the recording.
+        ring_notes = rings_note(recording, reference)
         with prefixed(recording.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
         shape = len(images.rings), round(360 / images.step_deg)
         max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)
         numbers = even_indices(recording.count, max_sweeps)
         values = np.full((4, len(numbers), *shape), np.nan, np.float32)
-        return cls(numbers, reference, images, images.rings, images.elevation_deg, values)
+        elevation_deg = images.elevation_deg
+        return cls(numbers, reference, ring_notes, images, images.rings, elevation_deg, values)
 
     @property
     def step_deg(self) -> float:
