@@ -366,6 +366,27 @@ def test_tables_of_nuscenes_name_files_of_the_data_set_only(nuscenes, name, tabl
             open_recording(root, "LIDAR_TOP")
 
 
+def test_a_sweep_of_nuscenes_has_a_label_for_each_point(nuscenes):
+    root, sample_data = nuscenes
+    first = min(json.loads(sample_data.read_text()), key=lambda row: row["timestamp"])
+    row = {"token": "1", "sample_data_token": first["token"], "filename": "samples/labels.bin"}
+    (sample_data.parent / "lidarseg.json").write_text(json.dumps([row]))
+    (root / "samples" / "labels.bin").write_bytes(bytes(7))
+    with pytest.raises(LidarError, match=r"labels\.bin has 7 labels for \d+ points"):
+        open_recording(root, "LIDAR_TOP")[0]
+
+
+def test_labels_are_classes_if_the_classification_is_zero_throughout(tmp_path):
+    """LAS has a classification for each point, which many programs do not fill in."""
+    kinds = dict.fromkeys("xyz", "f8") | {"classification": "u1", "label": "u1"}
+    rows = np.zeros(20, [*kinds.items()])
+    rows["x"] = np.arange(20)
+    rows["label"] = rows["x"] % 3
+    np.save(tmp_path / "a.npy", rows)
+    view = open_view(tmp_path / "a.npy")
+    np.testing.assert_array_equal(view.points.values("class", slice(None)), np.arange(20) % 3)
+
+
 def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):
     rows = np.array([[1, 2, 3, 0.5, 4], [5, 6, 7, 0.25, 31]], "f4")
     (tmp_path / "sweeps").mkdir()

@@ -414,9 +414,16 @@ def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_fil
     scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
     red, x = reds(scene)
     assert (red[x < 1.9] == 188).all() and (red[x > 2.1] == 255).all()
-    assert scene.material_names == ("class 3",)
+    assert scene.material_names == ("class 2",)
     skipped = f"{path} has data that surfels cannot store, which were skipped: "
-    assert notes == [f"{skipped}scalar_Classification, Ring"]
+    assert notes == [f"{skipped}Label, Ring"]
+
+
+def test_origins_that_are_zero_are_not_named_as_skipped(tmp_path):
+    zeros = dict.fromkeys(["origin_x", "origin_y", "origin_z"], np.zeros(len(GRID)))
+    notes = []
+    scene_of_points(ply_with(tmp_path / "a.ply", **zeros), voxel_m=1e-3, tell=notes.append)
+    assert not notes
 
 
 def test_packed_colors_are_read_in_all_formats(tmp_path):

@@ -42,6 +42,8 @@ def test_all_columns_of_a_quantity_are_found():
     columns = with_standard_names({"classification": np.zeros(2), "label": np.ones(2)})
     assert list(columns) == ["class", "label"]
     assert [*columns_for(columns, "class")] == ["class", "label"]
+    stored = dict.fromkeys(["Label", "scalar_Classification", "Ring"], np.zeros(2))
+    assert [*columns_for(stored, "class")] == ["scalar_Classification", "Label"]
 
 
 def sweep(**fields):

@@ -573,7 +573,10 @@ class _DataSet:
         file, *label_files = [file_below(self._tables.parent, *named) for named in names]
         columns = read_float_columns(file, NUSCENES)
         for label_file in label_files:
-            columns["class"] = self._classes[np.frombuffer(read_input(label_file), "u1")]
+            labels = np.frombuffer(read_input(label_file), "u1")
+            if len(labels) != (count := len(columns["x"])):
+                raise ValueError(f"{label_file.name} has {len(labels)} labels for {count} points")
+            columns["class"] = self._classes[labels]
         calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
         pose = _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
         return sweep_from_columns(columns, pose=pose, time_ns=1e3 * row["timestamp"])

@@ -215,11 +215,11 @@ def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) ->
         for component in names
         for name, values in columns_for(columns, component).items()
     }
-    skipped = [name for name in columns if name in used or _has_values(columns[name])]
     for names in missing_if_zero:
         for group in _groups(used, names):
             if not any(map(_has_values, group.values())):
                 used = {name: values for name, values in used.items() if name not in group}
+    skipped = [name for name in columns if name in used or _has_values(columns[name])]
     return scan.replace(columns=used, skipped=[*skipped, *scan.skipped])
 
 

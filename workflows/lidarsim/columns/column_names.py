@@ -76,7 +76,7 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
     present = set(names)
     best: dict[str, tuple[int, int]] = {}  # {standard name: (rank of the alias, column index)}
     for index, name in enumerate(names):
-        standard, rank = _STANDARD.get(name.lower().removeprefix("scalar_"), ("", 0))
+        standard, rank = _known(name)
         if not standard or standard in present or (among is not None and standard not in among):
             continue
         best[standard] = min(best.get(standard, (rank, index)), (rank, index))
@@ -92,6 +92,16 @@ def with_standard_names(
 
 
 def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArray]:
-    """Return the columns with a standard name or one of its aliases, the standard name first."""
-    found = sorted(columns, key=lambda other: other != name)
-    return {other: columns[other] for other in found if standard_names([other]) == [name]}
+    """Return the columns with a standard name or one of its aliases.
+
+    The standard name is first, and its aliases follow in the order of `ALIASES`.
+    """
+    ranks = {other: _known(other) for other in columns}
+    found = [other for other, (standard, _) in ranks.items() if standard == name]
+    found.sort(key=lambda other: (other != name, ranks[other]))
+    return {other: columns[other] for other in found}
+
+
+def _known(name: str) -> tuple[str, int]:
+    """Return the standard name of a column, or an empty string, and the rank of its alias."""
+    return _STANDARD.get(name.lower().removeprefix("scalar_"), ("", 0))

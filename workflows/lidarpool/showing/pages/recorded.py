@@ -12,7 +12,7 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.column_names import COLORS
+from lidarsim.columns.column_names import COLORS, with_standard_names
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Column, Kind, Scale
 from lidarsim.motion.rotations import quaternions_of
@@ -70,7 +70,8 @@ def joined_cloud(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
         is_new = identifier == name or identifier not in shared
         if is_new and identifier.lower() not in "xyz" and any(part.any() for part in parts):
             columns[identifier] = _plain(name, np.concatenate(parts))
-    columns |= further
+    # A standard name whose column is omitted goes to the next column with an alias.
+    columns = with_standard_names(columns) | further
     custom = tuple(_described(name, array) for name, array in columns.items())
     return Cloud(np.concatenate([sweep.points for sweep in sweeps]), columns, custom)
 
