@@ -33,7 +33,7 @@ from distributed import Client
 
 from lidarpool import Scene, Sensor, Survey
 from lidarpool.columns.parts import pack
-from lidarpool.report.output import CLOUD, SurveyOutput
+from lidarpool.report.output import CLOUD, SurveyOutput, run_survey
 from lidarpool.run.cluster.checks import slots_needed
 from lidarpool.run.cluster.cluster import local_client
 from lidarpool.run.job_source import OneJob
@@ -44,7 +44,6 @@ from lidarpool.run.pipeline.stage_names import GPU, INTERSECT, LIDAR
 from lidarpool.run.pipeline.task_records import Recorder
 from lidarpool.run.progress import Screen
 from lidarpool.run.run_page import RunPage
-from lidarpool.run.runner import Run
 from lidarpool.run.store.run_store import RUN_FOLDER
 from lidarpool.scenario.build import Job
 from lidarpool.scenario.sections import TaskOptions
@@ -157,10 +156,10 @@ class CountedOutput(SurveyOutput):
         super().__post_init__()
         self.part_sizes: list[int] = []  # bytes of each committed part
 
-    def on_parts(self, parts: Sequence[Receipt]) -> None:
+    def add_parts(self, parts: Sequence[Receipt]) -> None:
         """Note the sizes of committed parts, and append the parts to the cloud."""
         self.part_sizes += [part.size for part in parts]
-        super().on_parts(parts)
+        super().add_parts(parts)
 
 
 @dataclass(frozen=True)
@@ -232,7 +231,7 @@ class Cluster:
         )
         jobs = OneJob(Job(HALL, survey, None))
         screen = Screen(lambda _: None)
-        result, _ = Run(jobs, options, output, screen, RunPage()).execute()
+        result, _ = run_survey(jobs, options, output, screen, RunPage())
         return len(result.points), result.survey_seconds, output
 
 

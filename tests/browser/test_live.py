@@ -13,7 +13,7 @@ from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Run, StoredOutput
+from lidarpool.run.runner import Run
 from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -52,7 +52,7 @@ class Driven:
         begun = time.monotonic()
         options = RunOptions(client=client)
         screen = Screen(lambda progress: None)
-        survey_run = Run(job, options, StoredOutput(), screen, live, self.on_frame)
+        survey_run = Run(job, options, screen, live, self.on_frame)
         self.run = survey_run
 
         def on_frame(frame):
@@ -65,7 +65,10 @@ class Driven:
 
         def run():
             try:
-                survey_run.execute()
+                with survey_run:
+                    survey_run.open_store()
+                    survey_run.cast()
+                    survey_run.keep()
             except BaseException as error:
                 self.error = error
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from lidarpool import Campaign, Job, Scene, Sensor, Survey
-from lidarpool.report.campaign_output import DataSetOutput
+from lidarpool.report.campaign_output import run_campaign
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Run
 from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -40,7 +39,6 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
         local_client({"LIDAR": 5}, gpu_workers=1) as client,
         live_page(COUNT, campaign.names, "Heights", port=0, browser=False) as live,
     ):
-        output = DataSetOutput(tmp_path / "set", campaign)
         options = RunOptions(
             client=client, startup_timeout_s=120.0, folder=tmp_path / "set" / "run"
         )
@@ -51,7 +49,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
                 looked.wait(300)
 
         def drive():
-            ended.append(Run(campaign, options, output, Screen(hold), live).execute())
+            ended.append(run_campaign(tmp_path / "set", campaign, options, Screen(hold), live))
 
         tab = new_tab(live.page.url)
         tab.wait_for(lambda text: "Heights" in text and "starting" in text)

@@ -34,7 +34,7 @@ from lidarpool.report.growing_cloud import GrowingCloud
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.run_result import RunResult
-from lidarpool.run.runner import Run, StoredOutput
+from lidarpool.run.runner import Run
 
 from .arena import Arena
 from .checker import Verdict, judge
@@ -78,51 +78,35 @@ def digest(result: Result) -> str:
     return sha.hexdigest()
 
 
-class GrowingOutput(StoredOutput):
-    """Points that stay in the run's store, and a cloud.ply in `folder` that grows by them.
-
-    `ply` are the bytes of the file; None if it failed, as it may where a part is damaged.
-    """
-
-    ply: bytes | None
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__()
-        self._set(_folder=folder, ply=None)
-
-    def _set(self, **fields: Any) -> None:
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)  # the class is frozen
-
-    def look(self, run: Run[RunResult]) -> None:
-        """Begin the file, with the points of an earlier run."""
-        job = run.store.only_job
-        assert job is not None
-        growing = GrowingCloud(self._folder / "growing.ply", job)
-        self._set(_growing=run.stack.enter_context(growing))
-
-    def on_parts(self, parts: Sequence[Receipt]) -> None:
-        """Append parts to the file."""
-        self._growing.add(parts)
-
-    def finish(self, run: Run[RunResult]) -> RunResult:
-        """Complete the file, and return the result."""
-        path = self._folder / "cloud.ply"
-        points = run.store.only_job.points()
-        if self._growing.finish(path, points) is not None:
-            self._set(ply=path.read_bytes())
-        return super().finish(run)
-
-
 def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
-    """Run `simulate`, and grow a cloud.ply meanwhile; return its bytes too, None if it failed."""
+    """Run `simulate`, and grow a cloud.ply meanwhile.
+
+    Returns the bytes of the file, too; None if it failed, as it may where a part is damaged.
+    """
+    clouds: list[GrowingCloud] = []
+    written: list[bytes] = []
+
+    def add_parts(parts: Sequence[Receipt]) -> None:
+        clouds[0].add(parts)
+
+    def cast(jobs: Any, run_options: Any, screen: Any, page: Any, on_frame: Any) -> RunResult:
+        with Run(jobs, run_options, screen, page, on_frame, on_parts=add_parts) as run:
+            run.open_store()
+            job = run.store.only_job
+            assert job is not None
+            clouds.append(run.enter(GrowingCloud(Path(folder, "growing.ply"), job)))
+            run.cast()
+            path = Path(folder, "cloud.ply")
+            if clouds[0].finish(path, job.points()) is not None:
+                written.append(path.read_bytes())
+            return run.keep()
+
     with tempfile.TemporaryDirectory(prefix="chaos-ply-") as folder:
-        output = GrowingOutput(Path(folder))
-        with patch("lidarpool.api.simulation.StoredOutput", lambda: output):
+        with patch("lidarpool.api.simulation.cast_to_store", cast):
             result = simulate(*arguments, **options)
         left = {path.name for path in Path(folder).iterdir()}
-    assert left == ({"cloud.ply"} if output.ply else set()), left
-    return result, output.ply
+    assert left == ({"cloud.ply"} if written else set()), left
+    return result, written[0] if written else None
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,13 @@ from tests.shapes import box
 
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
-from lidarpool.report.campaign_output import DataSetOutput
+from lidarpool.report.campaign_output import run_campaign
 from lidarpool.run import pace
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.progress import Progress, Screen
-from lidarpool.run.runner import Run, StoredOutput
+from lidarpool.run.runner import Run, cast_to_store
 from lidarpool.run.store.job_under_way import JobUnderWay
 from lidarpool.run.store.run_store import RunStore
 from lidarpool.showing.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
@@ -86,8 +86,7 @@ def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
         on_frame=lambda frame: shown.append((round(clock.now, 9), frame.scan)),
         on_parts=lambda parts: shown.append((round(clock.now, 9), *[part.name for part in parts])),
     )
-    output = SimpleNamespace(on_parts=lambda parts: None)
-    run = Run(make_job(8), RunOptions(pace=0.1), output, Screen(), page)
+    run = Run(make_job(8), RunOptions(pace=0.1), Screen(), page)
     parts = [SimpleNamespace(name=name, first=first) for name, first in (("b", 2), ("a", 0))]
     run._on_parts(parts)
     assert shown == []
@@ -160,8 +159,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
 
         options = RunOptions(client=client, backend="numpy")
         on_frame = scans.append
-        run = Run(job, options, StoredOutput(), Screen(show), live, lambda f: on_frame(f.scan))
-        result = run.execute()
+        result = cast_to_store(job, options, Screen(show), live, lambda f: on_frame(f.scan))
         assert scans == [*range(survey.scan_count)]
         told = news(live)
         assert (told["over"], told["points"]) == (True, len(result.points))
@@ -341,9 +339,8 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
             assert told["done"] + told["failed"] <= 6
 
         campaign = Campaign(make, 6, keep="folder", title="Walls")
-        output = DataSetOutput(tmp_path / "set", campaign)
         options = RunOptions(client=client, backend="numpy", folder=tmp_path / "set" / "run")
-        run = Run(campaign, options, output, Screen(look), live).execute()
+        run = run_campaign(tmp_path / "set", campaign, options, Screen(look), live)
         assert (run.done, len(run.failed)) == (5, 1)
         told = ask(live.page.url, "jobs")
         assert (told["done"], told["failed"], told["over"]) == (5, 1, True)

@@ -80,7 +80,7 @@ class Result(RunResult):
         further_formats = [ExportSpec.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
-        with output.held():
+        with output.lock():
             fields = partial(fields_of, self.scene, self.survey, self.planning)
             output.refuse(lambda: self.identity, fields, overwrite=overwrite)
             output.write(self)

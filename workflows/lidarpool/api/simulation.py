@@ -20,13 +20,13 @@ from lidarsim.survey.survey import Survey
 from ..base.shard import Shard
 from ..clouds.folder import output_place
 from ..plan import Planning
-from ..report.campaign_output import DataSetOutput
+from ..report.campaign_output import run_campaign
 from ..run.job_source import OneJob
 from ..run.options import RunKeywords, RunOptions, options_of_call
 from ..run.pipeline.stage_messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
-from ..run.runner import Run, StoredOutput
+from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
@@ -151,9 +151,7 @@ def simulate(
     if run_options.starts_workers:  # before the folder is changed
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
-        result = Run(
-            jobs, run_options, StoredOutput(), Screen(on_progress), page, on_frame
-        ).execute()
+        result = cast_to_store(jobs, run_options, Screen(on_progress), page, on_frame)
     return Result(**declared(result, RunResult))
 
 
@@ -232,8 +230,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         run_options = RunOptions(out=target, folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
-            output = DataSetOutput(target, jobs)
-            return Run(jobs, run_options, output, Screen(on_progress), page).execute()
+            return run_campaign(target, jobs, run_options, Screen(on_progress), page)
 
     @checked
     def stream(

@@ -23,13 +23,14 @@ from ..base.shard import Shard, shard_in_words
 from ..clouds.folder import local_result, output_place, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
-from ..report.campaign_output import CAMPAIGN_FILE, DataSetOutput, check_same, failures, verify
-from ..report.output import CLOUD, SurveyOutput
+from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
+from ..report.campaign_output import run_campaign as cast_campaign
+from ..report.output import CLOUD, SurveyOutput, run_survey
 from ..report.report import summary
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
-from ..run.runner import Run, StoredOutput
+from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
@@ -73,9 +74,8 @@ def run_scenario(
     assert options.out is not None, "commands write"
     run_notes = {"extent": extent or "page", "scans": job.survey.scan_count}
     jobs = OneJob(job, shard, title=built.scenario.title)
-    output = StoredOutput({**made_of, **run_notes})
     with result_folder(options.out), page_of(jobs, options.live) as page:
-        result = Run(jobs, options, output, terminal, page).execute()
+        result = cast_to_store(jobs, options, terminal, page, made_of={**made_of, **run_notes})
     points = len(result.points)
     lines = [*terminal.notes(result.notes)]
     words = shard_in_words(str(shard))
@@ -106,7 +106,7 @@ def _run_survey(
     extent = extent or "page"
     output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, note_on)
     with page_of(jobs, options.live) as page:
-        result, report = Run(jobs, options, output, terminal, page).execute()
+        result, report = run_survey(jobs, options, output, terminal, page)
         lines = _result_lines(options.out, result, job, report, terminal)
         show(summary(options.out, report), lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
@@ -132,8 +132,7 @@ def run_campaign(
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:
-        output = DataSetOutput(options.out, campaign)
-        run = Run(campaign, options, output, terminal, page).execute()
+        run = cast_campaign(options.out, campaign, options, terminal, page)
         names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
         figures = {"folder": str(options.out), "jobs": run.done}
         figures |= {"failed": [row.name for row in run.failed]}

@@ -26,8 +26,11 @@ from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
+from ..run.options import RunOptions
+from ..run.progress import Screen
+from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun
-from ..run.runner import Output, Run
+from ..run.runner import Run
 from ..run.store.database import FILE
 from ..run.store.run_store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec
@@ -56,8 +59,27 @@ _FINISHED = re.compile(
 _BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")
 
 
+def run_campaign(
+    target: Path | Storage,
+    campaign: CampaignSpec,
+    options: RunOptions,
+    screen: Screen,
+    page: RunPage,
+) -> CampaignRun:
+    """Cast the jobs of a campaign, write the data set, and return a summary."""
+    output = DataSetOutput(target, campaign)
+    with Run(campaign, options, screen, page, dataset=output.dataset) as run:
+        run.enter(output.lock())
+        if (finished := output.check_existing(run)) is not None:
+            return finished
+        run.open_store()
+        output.compare_with_store(run)
+        run.cast()
+        return output.publish(run)
+
+
 @dataclass(eq=False)
-class DataSetOutput(Output[CampaignRun]):
+class DataSetOutput:
     """The data set of a campaign in a folder or storage."""
 
     target: Path | Storage
@@ -74,7 +96,7 @@ class DataSetOutput(Output[CampaignRun]):
         self._lost_record = ""  # a note, if the record was damaged
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Lock the target while the body runs."""
         self.dataset.check_installed()
         with result_folder(self.target):
@@ -82,7 +104,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     # -- existing files -----------------------------------------------------------------------
 
-    def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
+    def check_existing(self, run: Run) -> CampaignRun | None:
         """Refuse, remove or check a finished data set.
 
         Returns its sums if no job is left to do.
@@ -149,7 +171,7 @@ class DataSetOutput(Output[CampaignRun]):
         has_all = intact_count == len(self.campaign.numbers)
         return has_table and has_all and _is_indexed(storage, intact_count)
 
-    def _finished(self, run: Run[CampaignRun]) -> CampaignRun:
+    def _finished(self, run: Run) -> CampaignRun:
         """Show that a data set is complete, and return its sums."""
         run.screen.tell(f"{self.dataset.storage} is already complete")
         for row in self._rows:
@@ -159,7 +181,7 @@ class DataSetOutput(Output[CampaignRun]):
         run.page.finish(sums.seconds)
         return sums
 
-    def look(self, run: Run[CampaignRun]) -> None:
+    def compare_with_store(self, run: Run) -> None:
         """Compare existing jobs with the run's store, and add jobs that the store lacks."""
         store = run.store
         options = run.options
@@ -202,7 +224,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     # -- the end ------------------------------------------------------------------------------
 
-    def finish(self, run: Run[CampaignRun]) -> CampaignRun:
+    def publish(self, run: Run) -> CampaignRun:
         """Write the shared files, and remove the run unless jobs have failed."""
         store = run.store
         loop = run.loop

@@ -21,6 +21,7 @@ from lidarsim.base.words import listed
 
 from ..base.field_words import differences
 from ..base.fingerprint import fingerprint
+from ..base.open3d_module import load_open3d
 from ..base.shard import ALL, Shard
 from ..base.software import software
 from ..clouds.folder import LAST_FILE, output_place, refuse_missing, result_folder
@@ -35,11 +36,11 @@ from ..run.pipeline.committed_job import CommittedJob
 from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
 from ..run.run_page import RunPage
-from ..run.run_result import CampaignRun, RunResult
+from ..run.run_result import CampaignRun
 from ..run.runner import Run
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
-from ..run.store.run_store import RUN_FOLDER, parts_of, remove_run, with_sensors
+from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
 from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.scenario import Scenario
@@ -556,70 +557,65 @@ def _merge_survey(
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
             "with `--scenario`."
         )
-    fields: dict[str, Any] = {
-        "scenario": built.scenario,
-        "shard_folders": shard_folders,
-        "notes": notes,
-    }
-    output = _Merged(out, job.survey, job.outputs, made_of["extent"], **fields)
+    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], built.scenario)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
-    return Run(jobs, options, output, screen, RunPage()).execute()[1]
+    with Run(jobs, options, screen, RunPage()) as run:
+        run.enter(output.lock())
+        if not run.continues_run:
+            output.refuse(lambda: jobs.identity, lambda: jobs.fields)
+        run.open_store()
+        _take_points(run.store, shard_folders, notes)
+        load_open3d()
+        return output.publish(run)[1]
 
 
-@dataclass(eq=False)
-class _Merged(SurveyOutput):
-    """The result of a survey whose points are in shard folders."""
+def _take_points(
+    store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
+) -> None:
+    """Take the points of all folders into the store of a run.
 
-    shard_folders: Sequence[_ShardFolder] = ()
-    notes: Sequence[str] = ()
-    casts = False
+    Raises LidarError that names damaged files.
+    """
+    damaged = list[str]()
+    only = store.only_job
+    mark = store.db.meta["mark"]
+    assert only is not None, "of a survey"
 
-    def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
-        """Take all points into the run's store.
-
-        Raises LidarError that names damaged files.
-        """
-        store = run.store
-        damaged = list[str]()
-        only = store.only_job
-        mark = store.db.meta["mark"]
-        assert only is not None, "of a survey"
-
-        def take(source: Storage, part_file: Receipt) -> Receipt | None:
-            """Take a file and return its receipt, or None if the file is missing or damaged."""
-            name = part_name(mark, 0, part_file.first, part_file.stop)
-            with (
-                explained(f"{source.path(part_file.name)} cannot be copied"),
-                suppress(FileNotFoundError),
+    def take(source: Storage, part_file: Receipt) -> Receipt | None:
+        """Take a file and return its receipt, or None if the file is missing or damaged."""
+        name = part_name(mark, 0, part_file.first, part_file.stop)
+        with (
+            explained(f"{source.path(part_file.name)} cannot be copied"),
+            suppress(FileNotFoundError),
+        ):
+            store.storage.take(source, part_file.name, name)
+            receipt = only.receipt(name)
+            if (
+                receipt is not None
+                and replace(receipt, name=part_file.name, summaries=b"") == part_file
             ):
-                store.storage.take(source, part_file.name, name)
-                receipt = only.receipt(name)
-                if (
-                    receipt is not None
-                    and replace(receipt, name=part_file.name, summaries=b"") == part_file
-                ):
-                    return receipt
-                store.storage.remove([name])
-            return None
+                return receipt
+            store.storage.remove([name])
+        return None
 
-        for shard_folder in self.shard_folders:
-            if casting := shard_folder.record["casting"]:
-                store.cast_with(shard_folder.record["backend"], casting)
-            if shard_folder.trials and not only.trials:
-                store.db.add_trials(only, shard_folder.trials)
-            source = parts_of(shard_folder.storage.below(RUN_FOLDER), shard_folder.record["parts"])
-            missing = (
-                receipt
-                for receipt in shard_folder.points
-                if only.parts.missing(receipt.first, receipt.stop)
-            )
-            for expected, receipt in read_ahead(partial(take, source), missing):
-                if receipt is None or not store.db.commit([(only, receipt)]):
-                    damaged.append(source.path(expected.name))
-        if damaged:
-            raise LidarError(_missing_or_damaged(damaged))
-        if not only.trials:  # the first shard, which plans, is missing
-            only.job = replace(only.job, planning=None)
-        only.frames = only.scans.stop
-        only.resumed = 0
-        store.notes = [*self.notes]
+    for shard_folder in shard_folders:
+        if casting := shard_folder.record["casting"]:
+            store.cast_with(shard_folder.record["backend"], casting)
+        if shard_folder.trials and not only.trials:
+            store.db.add_trials(only, shard_folder.trials)
+        source = parts_of(shard_folder.storage.below(RUN_FOLDER), shard_folder.record["parts"])
+        missing = (
+            receipt
+            for receipt in shard_folder.points
+            if only.parts.missing(receipt.first, receipt.stop)
+        )
+        for expected, receipt in read_ahead(partial(take, source), missing):
+            if receipt is None or not store.db.commit([(only, receipt)]):
+                damaged.append(source.path(expected.name))
+    if damaged:
+        raise LidarError(_missing_or_damaged(damaged))
+    if not only.trials:  # the first shard, which plans, is missing
+        only.job = replace(only.job, planning=None)
+    only.frames = only.scans.stop
+    only.resumed = 0
+    store.notes = [*notes]

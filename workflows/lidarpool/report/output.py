@@ -30,9 +30,13 @@ from ..clouds.format_table import FORMATS, plugin_formats, row_of
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
+from ..run.job_source import OneJob
+from ..run.options import RunOptions
 from ..run.pipeline.stage_messages import Receipt
+from ..run.progress import Screen
+from ..run.run_page import RunPage
 from ..run.run_result import RunResult
-from ..run.runner import Output, Run
+from ..run.runner import Run
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
@@ -49,11 +53,28 @@ _SURVEY = ("scene", "survey")  # entries of the identity that distinguish survey
 _OF_FORMATS = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
 
 
-@dataclass(eq=False)
-class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
-    """The result of a survey in a folder or storage.
+def run_survey(
+    jobs: OneJob, options: RunOptions, output: SurveyOutput, screen: Screen, page: RunPage
+) -> tuple[RunResult, dict[str, Any]]:
+    """Cast a survey, write its result, remove the run, and return the result and its report.
 
-    The run returns the result and its report.
+    `cloud.ply` grows while the survey is cast.
+    """
+    parts = output.add_parts
+    with Run(jobs, options, screen, page, on_parts=parts) as run:
+        run.enter(output.lock())
+        if not run.continues_run:
+            output.refuse(lambda: jobs.identity, lambda: jobs.fields, overwrite=options.overwrite)
+        run.open_store()
+        output.begin_cloud(run)
+        load_open3d()  # writes the cloud in the end; a missing library is reported at the start
+        run.cast()
+        return output.publish(run)
+
+
+@dataclass(eq=False)
+class SurveyOutput:
+    """The result of a survey in a folder or storage.
 
     `formats` are written beside the cloud. `extent` is "cloud"; "page" for the page and the content
     of pictures, too; or "pictures" for the pictures, too. `judge` returns a note on the result.
@@ -84,22 +105,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         return [column.name for column in optional_columns(columns)]
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Lock the folder while the body runs."""
         for output_format in self.formats:
             output_format.check_installed()
         with result_folder(self.target) as self._folder:
             yield
-
-    def prepare(self) -> None:
-        """Load Open3D, which writes the cloud in the end."""
-        load_open3d()
-
-    def begin(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
-        """Refuse the result of another survey."""
-        if not run.continues_run:
-            jobs = run.jobs
-            self.refuse(lambda: jobs.identity, lambda: jobs.fields, overwrite=run.options.overwrite)
 
     def refuse(
         self,
@@ -146,23 +157,20 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             raise LidarError(f"{lists} {advice}")
         check_foreign_files(storage, _formats({*further, *listed}))
 
-    def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
+    def begin_cloud(self, run: Run) -> None:
         """Begin the cloud, with the points of an earlier run."""
         job = run.store.only_job
         assert job is not None, "of a survey"
-        folder = run.stack.enter_context(staging(self._folder, self.target))
-        growing = GrowingCloud(folder / CLOUD, job)
-        self._growing = run.stack.enter_context(growing)
+        folder = run.enter(staging(self._folder, self.target))
+        self._growing = run.enter(GrowingCloud(folder / CLOUD, job))
 
-    def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Append parts to the cloud."""
+    def add_parts(self, receipts: Sequence[Receipt]) -> None:
+        """Append parts to the cloud, and return at once."""
         if self._growing is not None:
             self._growing.add(receipts)
 
-    def finish(
-        self, run: Run[tuple[RunResult, dict[str, Any]]]
-    ) -> tuple[RunResult, dict[str, Any]]:
-        """Write the result, remove the run, and return the result and its report.
+    def publish(self, run: Run) -> tuple[RunResult, dict[str, Any]]:
+        """Write the result of a run, remove the run, and return the result and its report.
 
         LIDAR workers write formats in pieces. Without such formats, the cluster ends before the
         result is written.
@@ -171,7 +179,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         in_pieces = any(output_format.has_many_files for output_format in self.formats)
         workers = None
         if not in_pieces:
-            run.cluster_stack.close()
+            run.leave_cluster()
             timeline.mark(timeline.STOPPED)
         elif run.cluster is not None:
             workers = LidarWorkers(run.cluster)

@@ -1,18 +1,9 @@
-"""A run of one or many jobs, from its options to its result: for commands and for Python.
+"""Casts the jobs of a run: opens its store, starts its workers, and casts what is missing.
 
-The way through the driver: `Run.execute` locks the output, which may have the result already.
-Workers of this machine begin to start while the `RunStore` is opened. For the first `Job` with
-something left to be cast, it makes a `Cluster` and a `RunLoop`. The loop adds each job, as a
-`JobUnderWay` of the store, to the `Pipeline`. Stage 1 sends ranges of scans; the `Dispatcher`
-makes batches of them, asks `policies.offers` which worker gets them, and `CastingWorkers.submit`
-gives them to that worker as a task. There `rigs.intersect` casts each batch by a `Rig`, as
-`lidarsim/simulator/pulses.py` tells. The dispatcher sends a `CollectOrder` to a collector, which
-stores the columns as a part and sends a `Receipt`; `Pipeline` commits it. Of a survey, stage 3
-returns the `Summaries` of scans in order, and the pipeline hands a `ScanFrame` of each to
-`on_frame`. The parts of a campaign's job whose scans are committed go to the `JobWriter`, and
-`RunLoop` commits the job's row. The parts of a survey become the points of a `RunResult`.
-`Output.finish` makes the result: files of a survey (`report/output.py`) or a campaign
-(`report/campaign_output.py`).
+`Run` is what a survey, a campaign, a shard and a merge have in common. Each of these is a function
+that calls the methods of `Run` in order and writes its own result: `cast_to_store` below for
+results that stay in the store, `run_survey` in `report/output.py`, `run_campaign` in
+`report/campaign_output.py`, and `merge` in `report/merging.py`, which casts nothing.
 """
 
 from __future__ import annotations
@@ -21,8 +12,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Self, TypeVar
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
@@ -48,104 +38,135 @@ from .run_result import RunResult
 from .store.database import FILE
 from .store.run_store import RunStore, remove_run
 
-R = TypeVar("R")
+T = TypeVar("T")
 
 
-class Output(Generic[R]):
-    """Destination of the results of a run."""
+def cast_to_store(
+    jobs: Jobs,
+    options: RunOptions,
+    screen: Screen,
+    page: RunPage,
+    on_frame: Callable[[ScanFrame], None] | None = None,
+    made_of: Mapping[str, Any] | None = None,
+) -> RunResult:
+    """Cast the only job of a run, and leave its points in the store of the run.
 
-    dataset: DataSet | None = None  # jobs are written into it; else the parts of the job stay
-    casts = True  # False if missing scans are not to be cast
-
-    def held(self) -> AbstractContextManager[object]:
-        """Return a context that locks the destination."""
-        return nullcontext()
-
-    def begin(self, run: Run[R]) -> R | None:
-        """Refuse files that must not be replaced, and return the result if no work is left."""
-        return None
-
-    def prepare(self) -> None:
-        """Load what writes the results, so that a missing library is reported at the start."""
-
-    def look(self, run: Run[R]) -> None:
-        """Compare the output with the results of an earlier run in the store."""
-
-    def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Note that parts of the only job were committed, and return at once."""
-
-    def finish(self, run: Run[R]) -> R:
-        """Write the last files, and return the result."""
-        raise NotImplementedError
+    `on_frame` is called with each frame in scan order. `made_of` is stored with the points, so that
+    the shards of a survey can be merged.
+    """
+    with Run(jobs, options, screen, page, on_frame) as run:
+        run.open_store()
+        run.cast()
+        return run.keep(made_of)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredOutput(Output[RunResult]):
-    """Points that stay in the run's store, with the sources of the job in `made_of`."""
+class Run:
+    """The store and the workers of a run, as a context manager.
 
-    made_of: Mapping[str, Any] | None = None
+    Within the context, lock the destination of the result with `enter` if there is one, then call
+    `open_store`, and `cast` unless all points are taken from elsewhere. `store`, `result` and
+    `notes` then have what was committed.
 
-    def finish(self, run: Run[RunResult]) -> RunResult:
-        """Return the result of the only job."""
-        result = run.result()
-        if self.made_of is not None:
-            made_of, notes = map(json.dumps, (self.made_of, result.notes))
-            run.store.db.set(made_of=made_of, notes=notes)
-            run.store.save(force=True)
-        run.page.finish(result.seconds, result)
-        run.store.db.close()
-        return result
+    Parameters
+    ----------
+    jobs
+        The jobs of the run.
+    options
+        Options of the run.
+    screen, page
+        Where progress and warnings are shown.
+    on_frame
+        Function that is called with each frame of the only job, in scan order.
+    on_parts
+        Function that is called with committed parts of the only job; it must return at once.
+    dataset
+        Data set to which the jobs of a campaign are written. Without it, the parts of the only job
+        stay in the store.
 
-
-class Run(Generic[R]):
-    """Casts the remaining jobs of a run, and has their output written.
-
-    Call `execute` once. LidarError if the destination holds another result, the cluster lacks
-    workers or software, or a task fails; the notes of errors and interrupts name the committed
-    results.
+    Raises
+    ------
+    LidarError
+        If the store belongs to another run, the cluster lacks workers or software, or a task fails.
+        The notes of errors and interrupts name the committed results.
     """
 
     def __init__(
         self,
         jobs: Jobs,
         options: RunOptions,
-        output: Output[R],
         screen: Screen,
         page: RunPage,
         on_frame: Callable[[ScanFrame], None] | None = None,
+        *,
+        on_parts: Callable[[Sequence[Receipt]], None] = lambda receipts: None,
+        dataset: DataSet | None = None,
     ) -> None:
         self.jobs = jobs
         self.options = options
-        self.output = output
         self.screen = screen
         self.page = page
+        self.dataset = dataset
         self._on_frame = on_frame
+        self._on_committed = on_parts
         self._warnings = tuple(screen.warnings)  # about the scenario, before the run
         self._pacer = None if options.pace is None else Pacer(options.pace)
         self._unshown: list[Receipt] = []  # parts whose frames wait for their time
         self.started = time.monotonic()
-        self.stack = ExitStack()
-        self.cluster_stack = ExitStack()  # leaves the cluster
+        self._stack = ExitStack()
+        self._cluster_stack = ExitStack()  # leaves the cluster
         self.store: RunStore
         self._local: StartedAhead | None = None  # workers of this machine, for this run
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.loop: RunLoop | None = None
         self._maker: JobMaker | None = None  # makes all jobs after the first
 
-    def execute(self) -> R:
-        """Cast remaining jobs, and return the result of the output."""
-        with self.stack:
-            self._lock_output()
-            if (result := self.output.begin(self)) is not None:
-                return result
-            # Workers start while this process prepares the run, unless nothing may be left to cast.
-            if self.output.casts and not self.resume:
-                self._start_local()
-            self._open_store()
-            self.output.prepare()
-            if (first := self._first_job()) is not None:
-                self._run_on_cluster(first)
-            return self.output.finish(self)
+    def __enter__(self) -> Self:
+        if (self.options.restart or self.options.overwrite) and self.resume:
+            raise LidarError(
+                "`restart` and `overwrite` cannot be combined with `resume`, `retry_failed` or "
+                "`verify`, because they remove the run that these options continue."
+            )
+        self._stack.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> bool | None:
+        return self._stack.__exit__(*error)
+
+    def enter(self, context: AbstractContextManager[T]) -> T:
+        """Enter a context that ends with the run, after its cluster."""
+        return self._stack.enter_context(context)
+
+    def open_store(self) -> None:
+        """Open the store, which may have points of an earlier run, and begin to start workers."""
+        options = self.options
+        # Workers start while this process prepares the run, unless nothing may be left to cast.
+        if not self.resume:
+            self._start_local()
+        if options.restart and options.folder is not None:
+            remove_run(options.folder)
+        checking = "checking the points of the earlier run"
+        with self.screen.status(checking) if self.continues_run else nullcontext():
+            self.store = RunStore(
+                self.jobs, options.backend, options.folder, options.scratch_dir, resume=self.resume
+            )
+        # A task of a batch queue resumes its shard whether the shard has begun or not.
+        explained = self.store.committed_in_words or self.store.notes or self.jobs.shard != ALL
+        if options.resume and self.store.only_job and not explained:
+            location = options.out or options.folder
+            self.store.notes.append(f"{location} contained no unfinished run to resume")
+        self._stack.enter_context(self.store.kept_on_error())
+        if self.store.only_job is not None:
+            self.page.begun(self.store.only_job)
+
+    def cast(self) -> None:
+        """Cast all scans of the jobs that are not committed."""
+        self._stack.enter_context(self._cluster_stack)
+        if (first := self._first_job()) is not None:
+            self._run_on_cluster(first)
+
+    def leave_cluster(self) -> None:
+        """Stop the workers of this run, or disconnect from a cluster, before the run ends."""
+        self._cluster_stack.close()
 
     def warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
         """Warn if jobs of a campaign have no points, and return the warning as notes."""
@@ -178,47 +199,18 @@ class Run(Generic[R]):
             planning = job is not None and job.planning is not None
             slots = slots_needed(self.options, planning=planning, writing=job is None)
             self._local = start_local(self.options, slots)
-            self.stack.push(self._local)
-
-    def _lock_output(self) -> None:
-        if (self.options.restart or self.options.overwrite) and self.resume:
-            raise LidarError(
-                "`restart` and `overwrite` cannot be combined with `resume`, `retry_failed` or "
-                "`verify`, because they remove the run that these options continue."
-            )
-        self.stack.enter_context(self.output.held())
-
-    def _open_store(self) -> None:
-        options = self.options
-        if options.restart and options.folder is not None:
-            remove_run(options.folder)
-        checking = "checking the points of the earlier run"
-        with self.screen.status(checking) if self.continues_run else nullcontext():
-            self.store = RunStore(
-                self.jobs, options.backend, options.folder, options.scratch_dir, resume=self.resume
-            )
-        # A task of a batch queue resumes its shard whether the shard has begun or not.
-        explained = self.store.committed_in_words or self.store.notes or self.jobs.shard != ALL
-        if options.resume and self.store.only_job and not explained:
-            location = options.out or options.folder
-            self.store.notes.append(f"{location} contained no unfinished run to resume")
-        self.stack.enter_context(self.store.kept_on_error())
-        if self.store.only_job is not None:
-            self.page.begun(self.store.only_job)
-        self.output.look(self)
-        self.stack.enter_context(self.cluster_stack)
+            self._stack.push(self._local)
 
     def _first_job(self) -> Job | None:
         """Return the first job that can be made, or None if all scans are cast."""
         if (only_job := self.store.only_job) is not None:
-            return None if only_job.complete or not self.output.casts else only_job.job
+            return None if only_job.complete else only_job.job
         jobs = self.jobs
-        dataset = self.output.dataset
         db = self.store.db
-        assert dataset is not None, "a campaign has one"
+        assert self.dataset is not None, "a campaign has one"
         numbers = (number for number in jobs.numbers if not db.ended(number))
-        self._maker = JobMaker(jobs, numbers, dataset.columns)
-        self.stack.callback(self._maker.close)
+        self._maker = JobMaker(jobs, numbers, self.dataset.columns)
+        self._stack.callback(self._maker.close)
         while isinstance(entry := self._maker.take(wait=True), JobRow):
             self.store.end([entry])
             self.page.ended(entry)
@@ -228,14 +220,13 @@ class Run(Generic[R]):
         """Cast the remaining jobs, on a cluster with the slots that the first job needs."""
         store = self.store
         options = self.options
-        enter = self.cluster_stack.enter_context
+        enter = self._cluster_stack.enter_context
         if options.starts_workers:
             check_backend_here(store.backend or options.backend, store.advice)
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
-        dataset = self.output.dataset
-        self.page.follow(self.cluster.partitions, dataset)
+        self.page.follow(self.cluster.partitions, self.dataset)
         listeners = Listeners(self._frame, self._on_parts)
-        self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, listeners)
+        self.loop = RunLoop(self.cluster, store, self.page, self._maker, self.dataset, listeners)
         with self.screen.progress() as show:
             self.loop.run(first, show)
 
@@ -252,7 +243,7 @@ class Run(Generic[R]):
             self.page.on_parts(receipts)
         else:
             self._unshown += receipts
-        self.output.on_parts(receipts)
+        self._on_committed(receipts)
 
     def _show_parts(self, stop: int) -> None:
         """Show the parts up to a scan, whose frames are due."""
@@ -261,7 +252,7 @@ class Run(Generic[R]):
             self._unshown = [part for part in self._unshown if part.first >= stop]
             self.page.on_parts(due)
 
-    # -- for outputs -------------------------------------------------------------------------
+    # -- what was committed --------------------------------------------------------------------
 
     def notes(self, job: Job | None = None) -> tuple[str, ...]:
         """Return the notes of the run, after the warnings about its scenario."""
@@ -315,6 +306,19 @@ class Run(Generic[R]):
         self.store.notes.append(warning)
         self.screen.warn(warning)
 
+    def keep(self, made_of: Mapping[str, Any] | None = None) -> RunResult:
+        """Return the result of the only job, whose points stay in the store.
+
+        `made_of` is stored with the points.
+        """
+        result = self.result()
+        if made_of is not None:
+            self.store.db.set(made_of=json.dumps(made_of), notes=json.dumps(result.notes))
+            self.store.save(force=True)
+        self.page.finish(result.seconds, result)
+        self.store.db.close()
+        return result
+
     def result_is_in(self, location: object) -> None:
         """Add a note that the result is complete to any later error or interrupt."""
 
@@ -322,4 +326,4 @@ class Run(Generic[R]):
             if error is not None:
                 error.add_note(f"The result in {location} is complete.")
 
-        self.stack.push(note)
+        self._stack.push(note)
