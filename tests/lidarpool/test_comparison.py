@@ -754,3 +754,12 @@ def test_the_axis_of_small_distances_has_numbers_that_can_be_read():
     texts = [text.get_text() for text in axis.get_ticklabels(which="both") if text.get_text()]
     assert {"0.001", "0.002", "0.005", "0.01"} <= {*texts}
     assert not [text for text in texts if "times" in text]
+
+
+def test_coordinates_of_a_damaged_file_are_refused(tmp_path):
+    points = np.random.default_rng(1).uniform(-9, 9, (1000, 3))
+    np.save(tmp_path / "whole.npy", points)
+    points[7] = 1e226, 0, 0
+    np.save(tmp_path / "damaged.npy", points)
+    with pytest.raises(LidarError, match=r"damaged\.npy extends 1e\+226 m from the origin, .* dam"):
+        compare(tmp_path / "damaged.npy", tmp_path / "whole.npy")

@@ -174,3 +174,12 @@ def test_numbers_of_what_is_left_out():
     assert OmittedPoints(1, 0).note() == (
         "1 withheld point was skipped. To keep it, use --keep-noise (keep_noise=True in Python)"
     )
+
+
+def test_views_of_sweeps_state_what_they_leave_out(tmp_path):
+    fields = "FIELDS x y z classification\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 1"
+    head = f"VERSION .7\n{fields}\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n"
+    for number in range(2):
+        (tmp_path / f"{number}.pcd").write_text(f"{head}1 2 3 2\n4 5 6 7\n7 8 9 18\n")
+    view = open_view(tmp_path)
+    assert len(view.points) == 2 and "4 noise points (classes 7 and 18)" in view.note

@@ -7,6 +7,7 @@ import numpy as np
 from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.sweep import Columns, Sweep
+from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
 from ..clouds.recording import Recording
 
@@ -21,7 +22,9 @@ def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False
 
     Raises LidarError if the recording cannot be read.
     """
-    return with_compared_columns(recording[number], with_rays=with_rays).returns()
+    sweep = with_compared_columns(recording[number], with_rays=with_rays).returns()
+    _check_reach(recording, sweep)
+    return sweep
 
 
 def compared_in_world(recording: Recording, number: int) -> Sweep:
@@ -33,6 +36,7 @@ def compared_in_world(recording: Recording, number: int) -> Sweep:
     """
     sweep = with_compared_columns(recording[number])
     sweep = sweep.with_columns(intensity=sweep.intensity).returns()
+    _check_reach(recording, sweep)
     if recording.is_cloud:
         return sweep
     if sweep.pose is None:
@@ -41,6 +45,15 @@ def compared_in_world(recording: Recording, number: int) -> Sweep:
             "sensor. Compare it with a recording that consists of sweeps."
         )
     return sweep.replace(points=sweep.in_world())
+
+
+def _check_reach(recording: Recording, sweep: Sweep) -> None:
+    """Raise LidarError if a coordinate is implausibly large."""
+    if (reach := float(np.abs(sweep.points).max(initial=0.0))) > MAX_COORDINATE_M:
+        raise LidarError(
+            f"{recording.name} extends {reach:.3g} m from the origin, which is farther than "
+            "anything on Earth. The file is probably damaged, or its length unit is wrong."
+        )
 
 
 def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:

@@ -112,10 +112,10 @@ def recorded_view(
     if first.is_cloud:
         cloud = _cloud_of(first, on_part)
         sweeps = None
-        notes += first.omission_notes
     else:
         cloud, sweeps, further_notes = _sweeps_of(sensors)
         notes += further_notes
+    notes += [note for recording in sensors.values() for note in recording.omission_notes]
     if not len(cloud):
         left_out = "".join(f" {note}." for note in first.omission_notes)
         raise LidarError(f"{first.name} contains no points.{left_out}")
