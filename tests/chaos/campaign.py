@@ -178,7 +178,7 @@ class Arena:
         link.symlink_to(stranger)
         driver = self.start(out)
         _, err = driver.communicate(timeout=ENDS_WITHIN_S)
-        if driver.returncode != 2 or f"{link} is a link" not in err:
+        if driver.returncode != 2 or f"{link} is a symbolic link" not in err:
             tally.errors.append(f"with {link} as a link: {err}")
         if [path.name for path in stranger.iterdir()] != ["thesis.txt"]:
             tally.differing.append(f"files behind {link}")

@@ -250,11 +250,15 @@ def test_a_cluster_that_lacks_something(case, refused):
         refused(command if case == "two resources" else [*command, "--startup-timeout", "0s"], says)
 
 
-# {scenario: what the message says}
+# {scenario: what the message says about the casting worker}
 TOO_LARGE: dict[str, str] = {
-    "steps: 100000\npool: {batch_mb: 501}": "batch_mb is 501, more than the 500 MB",
+    "steps: 100000\npool: {batch_mb: 501}": (
+        "`batch_mb` is 501, but the casting worker at {worker} has only 500 MB for each slot. "
+        "Reduce it, or start the casting workers with a larger `--memory-limit`."
+    ),
     "sensor: {rays_per_revolution: 100000, layers: 128, step_deg: 360}": (
-        "Casting one scan takes about 671 MB, more than the 500 MB"
+        "Casting one scan takes about 1,916 MB, but the casting worker at {worker} has only "
+        "500 MB for each slot. Use a smaller `step_deg`, fewer rays or fewer columns, or start "
     ),
 }
 
@@ -270,9 +274,10 @@ def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused
     }
     with cluster_of(workers, {}, host="127.0.0.1") as cluster:
         options = ["s.yaml", "--scheduler", cluster.scheduler_address]
-        refused(["run", *options], TOO_LARGE[scenario])
+        says = TOO_LARGE[scenario].format(worker=cluster.workers["caster"].worker_address)
+        refused(["run", *options], says)
         outcome = lidarpool("check", *options)
-        assert outcome.code == 2 and TOO_LARGE[scenario] in outcome.err
+        assert outcome.code == 2 and says in outcome.err
 
 
 def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monkeypatch):

@@ -270,7 +270,7 @@ def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_p
     assert json.loads((out / "report.json").read_text())["files"] == MADE
     assert names_in(out) == {*MADE} and hidden(out / "report.html") == ["intensity"]
     outcome = run("--pictures", "--cloud-only")
-    assert outcome.code == 2 and "leaves out what --pictures draws" in outcome.err
+    assert outcome.code == 2 and "`--cloud-only` and `--pictures` cannot be combined" in outcome.err
 
 
 @pytest.mark.parametrize("words", [["--version"], ["--help"], ["run", "--help"], [None]])
