@@ -537,7 +537,7 @@ def test_one_slot_too_few_names_what_it_is_for(files, lidarpool, tmp_path):
         refused = lidarpool(*run, "--scheduler", few.scheduler_address)
     assert refused.code == 2 and refused.err.count("\n") == 1
     assert "writing jobs of a campaign" in refused.err and '--resources "LIDAR=' in refused.err
-    assert "kept in" not in refused.err and not (files / "ds").exists()
+    assert "stored in" not in refused.err and not (files / "ds").exists()
 
 
 def test_other_content_or_software_is_refused(files, finished, lidarpool, slots):

@@ -343,7 +343,7 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
         "note: the scene was recognized as an object of 1 x 1 x 1 m, so the default is"
         in outcome.out
     )
-    assert "no GPU" not in outcome.out
+    assert "worker with a GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)
     kind = "GPU" if backend == "cuda" else "CPU"
     assert re.search(

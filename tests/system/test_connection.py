@@ -54,7 +54,7 @@ def address():
 @pytest.fixture
 def waiting_run(tmp_path, address):
     """A run that waits for its scheduler, and has said so."""
-    scenario = "sensor: {layers: 2, step_deg: 90}\nsteps: 2\nplanning: {enabled: false}\n"
+    scenario = "scene: seed\nsensor: {layers: 2, step_deg: 90}\nsteps: 2\n"
     options = ["--scheduler", address, "--startup-timeout", "10m", "--cloud-only"]
     run = RunningCommand(tmp_path, scenario, *options)
     yield run.wait_for(rf"note: waiting for the scheduler at {address} for up to 59\d s more: ")
@@ -72,7 +72,9 @@ def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_p
 @pytest.mark.slow
 def test_waiting_for_a_scheduler_ends_with_an_interrupt(waiting_run):
     assert waiting_run.signal(signal.SIGINT) == 130
-    assert waiting_run.said.splitlines()[-1].startswith("lidarpool: interrupted")
+    assert waiting_run.said.splitlines()[-1] == (
+        "lidarpool: Interrupted. All processes were stopped, and the output folder is unchanged."
+    )
 
 
 def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypatch):
