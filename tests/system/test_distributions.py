@@ -67,7 +67,7 @@ DISTRIBUTIONS = {
         "scheduler",
         ("poolpart",),
         without=frozenset({"lidarpool", "raybeam", "numpy"}),
-        prints="1 2 45\n",
+        prints="1 2\n1024\n45\n",
     ),
     "lidarsim": Distribution(
         "workflows/lidarsim",

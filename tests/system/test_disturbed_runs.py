@@ -71,14 +71,16 @@ def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
         Client(cluster, set_as_default=False) as client,
-        pytest.raises(LidarError, match="Partition 'GPU' has had no workers for 2 s") as end,
+        pytest.raises(
+            LidarError, match="because partition 'GPU' has had no workers for 2 s"
+        ) as end,
     ):
         simulate(
             Scene.seed(), SURVEY, client=client, on_frame=on_frame, folder=tmp_path / "run",
             worker_timeout_s=2.0,
         )  # fmt: skip
     assert '--resources "GPU=1"' in str(end.value)
-    assert "of 180 scans are kept" in end.value.__notes__[0]
+    assert "of 180 scans are stored in" in end.value.__notes__[0]
 
 
 def _pause(client: Client, name: str, *, on: bool) -> None:

@@ -151,7 +151,7 @@ def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tm
     outcome = lidarpool("run", campaign, *given)
     assert outcome.code == 1, outcome.err
     [warning] = warnings(outcome)
-    assert warning.startswith(f"2 jobs have no points: 0001, 0003; in job 0001 {NOTHING}")
+    assert warning.startswith(f"2 jobs have no points: 0001, 0003. Job 0001: {NOTHING}")
     assert warning in json.loads(outcome.out)["notes"]
     outcome = lidarpool("run", campaign, *given, "--resume")  # nothing is left to do
     assert outcome.code == 1 and [warning] == warnings(outcome)
@@ -198,6 +198,6 @@ def test_python_logs_a_warning(client, caplog, tmp_path):
     caplog.clear()
     merge([tmp_path / "part-1", tmp_path / "part-2"], tmp_path / "merged")
     [record] = [one for one in caplog.records if one.levelno == logging.WARNING]
-    names, _, advice = record.message.partition("; ")
+    names, _, advice = record.message.partition(". ")
     assert names == "2 jobs have no points: 0000, 0001"
     assert advice == "To see the most likely reason, run `lidarpool check CAMPAIGN --job N`"

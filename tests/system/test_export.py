@@ -127,8 +127,11 @@ def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpoo
     # Without them, their files go with the result that had them.
     (tmp_path / "again" / "imu.csv").write_text("of a user")
     scenario.write_text(text)
-    assert "another survey" in lidarpool(*run).err
-    assert f"note: {out} holds the result of another" in lidarpool("check", *run[1:4]).out
+    assert f"{out} contains the result of a different survey" in lidarpool(*run).err
+    assert (
+        f"note: {out} contains the result of a different survey ("
+        in lidarpool("check", *run[1:4]).out
+    )
     assert lidarpool(*run, "--overwrite").code == 0
     assert not measured & {path.name for path in out.iterdir()}
     other = tmp_path / "again"
@@ -136,7 +139,8 @@ def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpoo
     assert (other / "imu.csv").read_text() == "of a user"
     scenario.write_text(text + navigation)
     refused = lidarpool(*run[:3], other, *run[4:])
-    assert refused.code == 2 and "another survey" in refused.err
+    assert refused.code == 2
+    assert f"{other} contains the result of a different survey" in refused.err
 
 
 def _messages(path):
@@ -210,7 +214,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
         patch.setattr(Storage, "write", full)
         failed = run()
     assert failed.code == 2 and failed.err.count("\n") == 1
-    assert f"Writing {out}/kitti failed: the worker" in failed.err
+    assert f"Writing {out}/kitti failed: The worker" in failed.err
     assert "cannot write the output: No space left on device. " in failed.err
     assert "are stored in" in failed.err
     assert {path.name for path in out.iterdir()} == {"run"}

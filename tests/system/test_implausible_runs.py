@@ -31,8 +31,8 @@ def slots() -> Iterator[str]:
         ("base.yaml", [], "warning: `noise.range_m`"),
         ("base.yaml", ["--shard", "2/2"], "warning: `noise.range_m`"),
         ("c.yaml", ["--job", "1"], "warning: `noise.range_m`"),
-        ("c.yaml", [], "warning: job 0000: noise.range_m"),
-        ("c.yaml", ["--shard", "2/2"], "warning: job 0001: noise.range_m"),
+        ("c.yaml", [], "warning: job 0000: `noise.range_m`"),
+        ("c.yaml", ["--shard", "2/2"], "warning: job 0001: `noise.range_m`"),
     ],
     ids=["survey", "shard of a survey", "job", "campaign", "shard of a campaign"],
 )

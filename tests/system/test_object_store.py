@@ -125,7 +125,7 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     assert (exported.code, exported.out) == (0, f"{url}/pcd\n")
     assert Storage.at(f"{url}/pcd").sizes()
     again = lidarpool("export", url, "--format", "pcd")
-    assert again.code == 2 and f"{url}/pcd is there already" in again.err
+    assert again.code == 2 and f"{url}/pcd already exists. Pass another folder" in again.err
 
     Storage.at(url).remove(["report.json"])
     for command in (["plot"], ["export", "--format", "pcd"], ["view"]):
@@ -160,7 +160,7 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     monkeypatch.setattr(Storage, "write", full)
     failed = lidarpool(*run, url, "--overwrite")
     assert failed.code == 2 and failed.err.count("\n") == 1
-    assert f"Writing {url}/nuscenes failed: the worker" in failed.err
+    assert f"Writing {url}/nuscenes failed: The worker" in failed.err
     assert "Access Denied" in failed.err and "--resume" in failed.err
     assert not {"nuscenes", "report.json"} & Storage.at(url).entries().keys()
 
