@@ -306,7 +306,7 @@ def test_a_campaign_goes_to_the_bucket_though_its_driver_is_killed(
     system, folder = fsspec.url_to_fs(url)
     system.invalidate_cache()
     found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
-    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/"))}
+    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/", "jobs."))}
     assert jobs == bytes_of(tmp_path / "here")
     assert not any(name.startswith("run/") or name.endswith("-dataset") for name in found)
 
@@ -327,11 +327,11 @@ def test_shards_in_the_bucket_are_merged_there_and_here(environment, lidarpool, 
                 done = lidarpool("merge", *shards, "--out", out, "-q")
                 assert done.code == 0, done
                 notice = "warning: 1 job has no points: 0000" if name == "campaign" else ""
-                assert done.err.partition(";")[0] == notice, done
+                assert done.err.partition(". ")[0] == notice, done
     system, folder = fsspec.url_to_fs(f"{BUCKET}/campaign/all")
     system.invalidate_cache()
     found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
-    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/"))}
+    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/", "jobs."))}
     whole = bytes_of(tmp_path / "campaign")
     assert jobs == bytes_of(tmp_path / "campaign-all") == whole
     cloud = (tmp_path / "survey/cloud.ply").read_bytes()
