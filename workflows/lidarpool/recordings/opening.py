@@ -111,12 +111,6 @@ def open_recording(
     LidarError
         If the source does not exist or is not supported, if it contains several sensors and none is
         chosen, or if its coordinate system distorts lengths.
-
-    Examples
-    --------
-    >>> recording = open_recording("drive.mcap")  # doctest: +SKIP
-    >>> recording[0].points.shape  # doctest: +SKIP
-    (28800, 3)
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:

@@ -82,6 +82,8 @@ def read_points(
         If the file cannot be read, is too large, or has fewer than `MIN_POINTS` points, or if its
         coordinate system distorts lengths (`stated_meters`, `Reprojection`).
     """
+    if path.is_dir() and path.suffix.lower() in point_suffixes():
+        raise LidarError(f"{path} cannot be read: Is a directory.")
     cloud_format = None if path.is_dir() else format_of_path(path, str(path))
     if cloud_format is None or not cloud_format.for_scenes:
         if advice := advice_on(path):
