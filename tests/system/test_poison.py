@@ -61,7 +61,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
 def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
     monkeypatch.setattr(lidarpool.run.pipeline.long_stages, "MAX_DEATHS", 2)
     sabotage("sort.get", POISON)
-    with pytest.raises(LidarError, match=r"stage \w+ was started 3 times, and each time"):
+    with pytest.raises(LidarError, match=r"^Stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
     assert left_over(client) == ([], [], [])
 
