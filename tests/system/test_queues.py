@@ -196,8 +196,8 @@ def test_partitions_without_jobs_get_some_when_a_run_needs_them(empty_queue, tmp
     run = Command(tmp_path, file)
     run.wait_for(r"started SLURMCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
     run.wait_for(
-        r"waiting for workers for up to \d+ s more: Partition 'GPU' has 0 of the 1 required slot.*; "
-        r"\d jobs? (is|are) in the queue or starting"
+        r"waiting for workers for up to \d+ s more: Partition 'GPU' has 0 of the 1 required slot"
+        r".*; \d jobs? (is|are) in the queue or starting"
     )
     assert empty_queue.jobs()["waiting"][1] == "PENDING"
     empty_queue.ask("scontrol", "release", "jobname=waiting")
