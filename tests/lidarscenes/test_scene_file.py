@@ -144,6 +144,6 @@ def test_commands(arguments, words):
 @pytest.mark.slow
 def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path):
     arguments = ["terrain", "out.obj", "--triangles", "800", "--side", "1000", "--trees", "5000"]
-    with pytest.raises(LidarError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):
+    with pytest.raises(LidarError, match=r"out.obj would contain 4\d,\d+,\d+ triangles, because"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
     assert not list(tmp_path.iterdir())
