@@ -305,8 +305,7 @@ class ExportSpec:
 
         Returns
         -------
-        The intensity that is stored as the largest integer, or None if intensities are stored as
-        floats or the cloud has no intensities.
+        As `CloudFormat.write`.
 
         Raises
         ------
