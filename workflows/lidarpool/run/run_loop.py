@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import listed, plural, rounded
@@ -28,16 +28,15 @@ from ..scenario.build import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
 from .job_source import JobMaker, failed_row
+from .listener import Listener
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
 from .pipeline.pipeline import Pipeline
-from .pipeline.stage_messages import Receipt, ScanFrame
 from .pipeline.stage_names import GPU, LIDAR, OTHER
 from .pipeline.task_book import StageTotals
 from .planning_trials import TrialPump
 from .progress import Progress, Show
-from .run_page import RunPage
 from .store.job_under_way import JobUnderWay
 from .store.run_store import RunStore
 from .writer import JobFiles, JobWriter
@@ -46,13 +45,6 @@ PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
 EXTRA_JOBS = 64  # jobs under way, at most, in addition to two for each GPU slot
-
-
-class Listeners(NamedTuple):
-    """Functions that are called in the run's thread with results of the single job of a survey."""
-
-    on_frame: Callable[[ScanFrame], None]  # called with each frame
-    on_parts: Callable[[Sequence[Receipt]], None]  # called with committed parts
 
 
 class RunLoop:
@@ -64,31 +56,29 @@ class RunLoop:
         Checked cluster with the partitions GPU, LIDAR and OTHER.
     store
         Database of the run, and storage of its parts.
-    page
-        Page of the run, which shows ended jobs.
     maker
         Makes the jobs of a campaign after the first; None for the single job of a survey.
     dataset
         Data set into which the jobs of a campaign are written; None for a survey, whose parts are
         kept.
-    listeners
-        Functions that are called with results of the single job of a survey.
+    listener
+        Object that is notified of the parts and frames of a survey, and whose page shows ended
+        jobs.
     """
 
     def __init__(
         self,
         cluster: Cluster,
         store: RunStore,
-        page: RunPage,
         maker: JobMaker | None,
         dataset: DataSet | None,
-        listeners: Listeners,
+        listener: Listener,
     ) -> None:
         self._cluster = cluster
         self._store = store
-        self._page = page
         self._maker = maker
-        self._listeners = listeners
+        self._listener = listener
+        self._page = listener.page
         options = cluster.options
         run_id = uuid.uuid4().hex[:8]
         mark = store.db.meta["mark"]
@@ -215,8 +205,8 @@ class RunLoop:
                 on_device=cluster.backend == "cuda",
             ),
             scans_of_run=len(job.scans) * jobs_left,
-            on_frame=partial(cluster.call, self._listeners.on_frame) if is_only else None,
-            on_parts=self._listeners.on_parts if is_only else None,
+            on_frame=partial(cluster.call, self._listener.frame) if is_only else None,
+            on_parts=self._listener.parts if is_only else None,
         )
         self._jobs_begun += 1
         self._scans_begun += len(job.scans)
