@@ -41,8 +41,8 @@ from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
 from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
-from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
+from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .campaign_output import (
     CAMPAIGN_FILE,
@@ -546,8 +546,8 @@ def _merge_survey(
             "`--scenario`."
         )
     with screen.status("reading the scene"):
-        built = build(Scenario.load(path, made_of["options"]))
-        job = built.job()
+        prepared = prepare(Scenario.load(path, made_of["options"]))
+        job = prepared.job
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
@@ -557,8 +557,8 @@ def _merge_survey(
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
             "with `--scenario`."
         )
-    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], built.scenario)
-    options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
+    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], prepared.scenario)
+    options = RunOptions(folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     with output.lock():
         if not options.continues_run:
             output.check_existing(jobs)

@@ -24,7 +24,7 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from ..base import timeline
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from ..scenario.build import Job
+from ..scenario.job import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
 from .job_source import JobMaker, failed_row

@@ -37,10 +37,10 @@ from ..clouds.boxes import Boxes
 from ..clouds.kitti import intensity_of
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import sweep_of_job
-from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import Keep
 from ..scenario.empty_cloud import empty_cloud_reason
+from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
 from .cluster.cluster import client_of
 from .cluster.watch import Waiting, Watch

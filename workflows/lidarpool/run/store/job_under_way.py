@@ -16,7 +16,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ..pipeline.pipeline_job import PipelineJob
 from ..pipeline.stage_messages import Receipt, samples_of_scan, summary_type
 from ..progress import Progress

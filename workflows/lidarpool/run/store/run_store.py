@@ -25,7 +25,7 @@ from ...base.shard import shard_in_words
 from ...base.software import software
 from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, identity_of
 from ..pipeline.failures import storing
 from .database import (
