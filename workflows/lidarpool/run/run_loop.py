@@ -13,9 +13,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import listed, plural, rounded
@@ -32,27 +31,21 @@ from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
 from .pipeline.pipeline import Pipeline
-from .pipeline.stage_messages import Receipt, ScanFrame
-from .pipeline.stage_names import GPU, LIDAR, OTHER
+from .pipeline.pipeline_job import PipelineJob
+from .pipeline.stage_messages import Receipt, ScanFrame, Summaries
+from .pipeline.stage_names import GPU, LIDAR, OTHER, SORT
 from .pipeline.task_book import StageTotals
 from .planning_trials import TrialPump
 from .progress import Progress, Show
 from .run_page import RunPage
-from .store.job_under_way import JobUnderWay
 from .store.run_store import RunStore
+from .store.stored_job import StoredJob
 from .writer import JobFiles, JobWriter
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
-EXTRA_JOBS = 64  # jobs under way, at most, in addition to two for each GPU slot
-
-
-class Listeners(NamedTuple):
-    """Functions that are called in the run's thread with results of the single job of a survey."""
-
-    on_frame: Callable[[ScanFrame], None]  # called with each frame
-    on_parts: Callable[[Sequence[Receipt]], None]  # called with committed parts
+EXTRA_JOBS = 64  # jobs in flight, at most, in addition to two for each GPU slot
 
 
 class RunLoop:
@@ -71,8 +64,9 @@ class RunLoop:
     dataset
         Data set into which the jobs of a campaign are written; None for a survey, whose parts are
         kept.
-    listeners
-        Functions that are called with results of the single job of a survey.
+    on_frame, on_parts
+        Functions that are called with each frame, and with committed parts, of the single job of a
+        survey.
     """
 
     def __init__(
@@ -82,13 +76,15 @@ class RunLoop:
         page: RunPage,
         maker: JobMaker | None,
         dataset: DataSet | None,
-        listeners: Listeners,
+        on_frame: Callable[[ScanFrame], None],
+        on_parts: Callable[[Sequence[Receipt]], None],
     ) -> None:
         self._cluster = cluster
         self._store = store
         self._page = page
         self._maker = maker
-        self._listeners = listeners
+        self._on_frame = on_frame
+        self._on_parts = on_parts
         options = cluster.options
         run_id = uuid.uuid4().hex[:8]
         mark = store.db.meta["mark"]
@@ -111,8 +107,10 @@ class RunLoop:
         self._trials: TrialPump | None = None
         # Rows of the job table for jobs that have ended, and are not yet in the run's database.
         self._rows: list[JobRow] = []
+        self._jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast or written}
         self._scans_begun = 0
         self._jobs_begun = 0
+        self._scans_to_come = 0  # estimated scans of jobs that are not begun yet
         self._remover = ThreadPoolExecutor(1, "remove")
         self._only_committed = False  # True once the only job is committed
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
@@ -126,7 +124,7 @@ class RunLoop:
         """True once all jobs have ended."""
         if self._maker is None:
             return self._only_committed
-        return self._maker.ended and not self._store.under_way
+        return self._maker.ended and not self._store.in_flight
 
     def step(self) -> bool:
         """Begin jobs, step pipeline and writer once, and commit ended jobs.
@@ -136,44 +134,62 @@ class RunLoop:
         LidarError if a failure concerns all jobs.
         """
         moved = self._admit()
-        moved |= self._pipeline.step()
-        for job, error in self._pipeline.take_ended():
-            moved = True
+        news = self._pipeline.step(self._scans_to_come)
+        moved |= news.moved
+        if self._writer is None and news.parts:
+            self._on_parts(news.parts)
+        for job, summaries in news.frames:
+            self._hand_out(job, summaries)
+        for job, error in news.ended:
             if error is not None:
                 self._fail(job.number, error)
             elif self._writer is None:
                 self._only_committed = True
             else:
-                self._writer.add(self._files_of(self._store.under_way[job.number]))
-        error_of_all: LidarError | None = None
+                self._writer.add(self._files_of(job))
+        error_of_all = self._write()
+        moved |= bool(self._rows)
+        self._commit()
+        if error_of_all is not None:
+            raise error_of_all
+        return moved
+
+    def _hand_out(self, job: PipelineJob, summaries: Summaries) -> None:
+        """Call the user's function with each new frame of a job, in scan order."""
+        stored = self._store.in_flight[job.number]
+        for frame in stored.frames(summaries):
+            job.trace("frame", SORT, [frame.scan])
+            self._cluster.call(self._on_frame, frame)
+            # Only now: after an error of the caller the frame is handed out again.
+            stored.committed.advance_frames(frame.scan + 1)
+            job.trace("release", SORT, [frame.scan])
+
+    def _write(self) -> LidarError | None:
+        """Step the writer once, and return an error that concerns all jobs, if there is any."""
+        if self._writer is None:
+            return None
         # A stage whose worker has died gets its slot first.
         slots = 0 if self._pipeline.stages.lacks_slot else self._cluster.spare
-        more_to_come = bool(self._pipeline.jobs)
-        for files, outcome in (
-            () if self._writer is None else self._writer.step(slots, more_to_come=more_to_come)
-        ):
-            moved = True
+        error_of_all: LidarError | None = None
+        for files, outcome in self._writer.step(slots, more_to_come=bool(self._pipeline.jobs)):
             if isinstance(outcome, JobError):
                 self._fail(files.row.number, outcome)
             elif isinstance(outcome, LidarError):
                 error_of_all = outcome
             else:
                 self._rows.append(outcome)
-        self._commit()
-        if error_of_all is not None:
-            raise error_of_all
-        return moved
+        return error_of_all
 
     def _admit(self) -> bool:
         """Begin jobs that are ready, if there is room, and return True if any was begun."""
         moved = False
-        max_under_way = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
+        max_in_flight = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, as many as have batches in one task, and go on together: then
         # they share messages and tasks.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
         if self._maker is None or not self._maker.has(together):
             return False
-        while self._pipeline.has_room and len(self._store.under_way) < max_under_way:
+        while self._pipeline.has_room and len(self._store.in_flight) < max_in_flight:
             if (entry := self._maker.take()) is None:
                 break
             moved = True
@@ -185,47 +201,44 @@ class RunLoop:
 
     def _begin(self, job: Job) -> None:
         """Begin a job, unless its scans are too large for the workers."""
-        under_way = self._store.open_job(job)
+        stored = self._store.open_job(job)
         try:
             if self._writer is not None:  # the only job of a run was checked at the start
                 self._cluster.check(job)
-            self._add_to_pipeline(under_way)
+            self._add_to_pipeline(stored)
         except JobError as error:  # too large for the workers, or it cannot be pickled
             self._fail(job.number, error)
 
-    def _add_to_pipeline(self, job: JobUnderWay) -> None:
+    def _add_to_pipeline(self, stored: StoredJob) -> None:
         """Add a job to the pipeline, begin its planning, and estimate the scans to come."""
         cluster = self._cluster
-        is_only = self._writer is None
-        planning = job.job.planning
-        if is_only and planning is not None:
-            self._trials = TrialPump(cluster.tasks(OTHER), planning, job.trials)
+        job = stored.job
+        if self._writer is None and job.planning is not None:
+            self._trials = TrialPump(cluster.tasks(OTHER), job.planning, stored.trials)
             self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
             # End the request for slots that was made before there were tasks: from now on, waiting
             # trials let an adaptive partition grow.
             self._trials.tasks.partition.want(0)
         # Many jobs follow in a campaign, so that batches need not be divided among all slots.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
-        self._pipeline.begin(
-            job,
-            scans_per_task=scans_that_fit(
-                job.scene,
-                job.survey,
-                cluster.options.batch_mb * MB,
-                on_device=cluster.backend == "cuda",
-            ),
-            scans_of_run=len(job.scans) * jobs_left,
-            on_frame=partial(cluster.call, self._listeners.on_frame) if is_only else None,
-            on_parts=self._listeners.on_parts if is_only else None,
+        limit = cluster.options.batch_mb * MB
+        on_device = cluster.backend == "cuda"
+        self._jobs[job.number] = self._pipeline.begin(
+            stored.committed,
+            job.scene,
+            job.survey,
+            scans_per_task=scans_that_fit(job.scene, job.survey, limit, on_device=on_device),
+            scans_of_run=len(stored.scans) * jobs_left,
         )
         self._jobs_begun += 1
-        self._scans_begun += len(job.scans)
-        to_come = max(0, jobs_left - len(self._store.under_way))
-        self._pipeline.scans_to_come = to_come * self._scans_begun // self._jobs_begun
+        self._scans_begun += len(stored.scans)
+        to_come = max(0, jobs_left - len(self._store.in_flight))
+        self._scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
-    def _files_of(self, under_way: JobUnderWay) -> JobFiles:
+    def _files_of(self, casting: PipelineJob) -> JobFiles:
         """Return the input of the writer for a job whose scans are all committed."""
-        job = under_way.job
+        stored = self._store.in_flight[casting.number]
+        job = stored.job
         row = JobRow(
             number=job.number,
             name=job.name,
@@ -234,11 +247,11 @@ class RunLoop:
             scans=job.survey.scan_count,
             sweeps=len(job.sweeps),
             rays=job.survey.ray_count,
-            hits=under_way.parts.hit_count,
+            hits=stored.parts.hit_count,
             # The casting times of an earlier run are not stored.
-            seconds=None if under_way.resumed else under_way.seconds,
+            seconds=None if stored.resumed else casting.seconds,
         )
-        return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
+        return JobFiles(row, stored.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
         """Record the row of a failed job, or raise the error if the run is a survey's."""
@@ -255,24 +268,25 @@ class RunLoop:
         self._rows = []
         if not rows:
             return
-        under_way = self._store.under_way  # jobs that could not be made are not in it
-        ended = [(row, under_way[row.number]) for row in rows if row.number in under_way]
+        in_flight = self._store.in_flight  # jobs that could not be made are not in it
+        ended = [(row, in_flight[row.number]) for row in rows if row.number in in_flight]
         self._store.name_sensors(
             (
                 carried.name or "lidar",
                 f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz",
             )
-            for row, job in ended
+            for row, stored in ended
             if row.done
-            for carried in job.survey.carried
+            for carried in stored.job.survey.carried
             for sensor in [carried.sensor]
         )
         self._store.end(rows)
         for row in rows:
+            self._jobs.pop(row.number, None)
             self._page.ended(row)
         self._remover.submit(self._remove, ended)
 
-    def _remove(self, ended: Sequence[tuple[JobRow, JobUnderWay]]) -> None:
+    def _remove(self, ended: Sequence[tuple[JobRow, StoredJob]]) -> None:
         """Remove the parts of jobs that have ended, after the page has read their points."""
         for row, job in ended:
             with suppress(LidarError, OSError):  # remaining files do no harm
@@ -281,14 +295,26 @@ class RunLoop:
             with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in job.parts.ordered])
 
-    def under_way(self) -> list[dict[str, Any]]:
+    def in_flight(self) -> list[dict[str, Any]]:
         """Return the states of the jobs that are being cast, then of the jobs being written.
 
-        `JobUnderWay.status` describes the fields of a state.
+        `RunPage.on_progress` describes the fields of a state.
         """
         writing = {row.number for row in self._writer.jobs} if self._writer else set()
-        jobs = [*self._store.under_way.values()]
-        states = [job.status(is_writing=job.number in writing) for job in jobs]
+        states = []
+        for number, casting in self._jobs.items():
+            stored = self._store.in_flight[number]
+            states.append(
+                {
+                    "name": stored.job.name,
+                    "values": stored.job.values,
+                    "stored": stored.parts.scans_done,
+                    "scans": len(stored.scans),
+                    "points": stored.parts.point_count,
+                    "seconds": casting.seconds,
+                    "writing": number in writing,
+                }
+            )
         return sorted(states, key=itemgetter("writing"))
 
     # -- to the end --------------------------------------------------------------------------
@@ -403,25 +429,27 @@ class RunLoop:
         waits_for = LIDAR if self._pipeline.stages.waiting else ""
         progress = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, progress)
-        self._cluster.call(self._page.on_progress, progress, self.under_way)
+        self._cluster.call(self._page.on_progress, progress, self.in_flight)
 
     def _save(self) -> None:
         """Store finished trials, and the number of frames handed out, in the run's database."""
         if self._trials is not None and (only_job := self._store.only_job) is not None:
-            self._store.db.add_trials(only_job, self._trials.trials[len(only_job.trials) :])
+            new_trials = self._trials.trials[len(only_job.trials) :]
+            self._store.db.add_trials(only_job.committed, new_trials)
         self._store.save()
 
     def _progress(self) -> Progress:
         """Return the counts of the run, without its time."""
-        if (job := self._store.only_job) is None:
+        if (stored := self._store.only_job) is None:
             numbers = self._store.jobs.numbers
             ended = self._store.db.ended_count
             return Progress(jobs=len(numbers), jobs_done=ended)
+        casting = self._jobs[stored.job.number]
         progress = replace(
-            job.progress(),
-            generated=job.generated - job.scans.start,
-            cast=min(job.resumed + job.cast, len(job.scans)),
-            replayed=job.offered_again,
+            stored.progress(),
+            generated=casting.generated - stored.scans.start,
+            cast=min(stored.resumed + casting.cast, len(stored.scans)),
+            replayed=self._pipeline.dispatcher.replayed,
         )
         if self._trials is None:
             return progress

@@ -32,7 +32,7 @@ from .options import RunOptions
 from .pace import Pacer
 from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Screen
-from .run_loop import Listeners, RunLoop
+from .run_loop import RunLoop
 from .run_page import RunPage
 from .run_result import RunResult
 from .store.database import FILE
@@ -225,8 +225,15 @@ class Run:
             check_backend_here(store.backend or options.backend, store.advice)
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         self.page.follow(self.cluster.partitions, self.dataset)
-        listeners = Listeners(self._frame, self._on_parts)
-        self.loop = RunLoop(self.cluster, store, self.page, self._maker, self.dataset, listeners)
+        self.loop = RunLoop(
+            self.cluster,
+            store,
+            self.page,
+            self._maker,
+            self.dataset,
+            self._frame,
+            self._on_parts,
+        )
         with self.screen.progress() as show:
             self.loop.run(first, show)
 
@@ -291,7 +298,7 @@ class Run:
             seconds=time.monotonic() - self.started if loop else 0.0,
             survey_seconds=times.get("survey", 0.0),
             planning_seconds=times.get("planning", 0.0),
-            replayed=only_job.offered_again,
+            replayed=loop.replayed if loop else 0,
         )
 
     def _warn_of_empty_cloud(self, job: Job) -> None:

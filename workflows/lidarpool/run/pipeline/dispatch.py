@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Collection, Iterable, Mapping
 
 from poolpart.task_locations import TaskLocations
 
@@ -26,42 +25,31 @@ from .stage_messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .task_records import TaskRecord
 
-MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a request to stage 1
+MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a message to stage 1
 PIECES = 16  # batches, at most, that a batch is divided into when its worker has died with it alone
-
-
-class Stages(Protocol):
-    """Interface of stages 1 (GENERATE) and 4 (COLLECT) for a dispatcher."""
-
-    collector_count: int  # including collectors that are starting
-
-    @property
-    def collectors(self) -> Mapping[str, str]:
-        """Collectors that take orders: {name: address of the worker}."""
-        ...
-
-    def advise(self, scans: int) -> None:
-        """Set the number of scans in each range that stage 1 sends from now on."""
-        ...
-
-    def send(self, name: str, messages: Sequence[CollectOrder]) -> None:
-        """Send orders to a collector."""
-        ...
 
 
 class Dispatcher:
     """Dispatches the batches of all jobs, and isolates scans that kill their workers.
 
-    The run's `mark` is in the file names of parts. Jobs that cannot be cast are in `failed`, until
-    they are dropped.
+    Jobs that cannot be cast are in `failed`, until they are dropped.
+
+    Parameters
+    ----------
+    workers
+        Workers that cast the batches.
+    collector_count
+        Number of collectors, including those that are starting.
+    mark
+        Text of the run, which is in the file names of all parts.
     """
 
-    def __init__(self, workers: CastingWorkers, stages: Stages, mark: str) -> None:
+    def __init__(self, workers: CastingWorkers, collector_count: int, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[PipelineJob, JobError] = {}
-        self.advice = 1  # scans in each range that stage 1 sends: as many as in a batch
+        self.advice = 1  # scans of a batch, which each range from stage 1 should have
         self._workers = workers
-        self._stages = stages
+        self._collector_count = collector_count
         self._mark = mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: uncommitted batches}
         self._batch_count = 0  # batches so far
@@ -99,19 +87,16 @@ class Dispatcher:
             if batch.job.number == receipt.job and first <= batch.first and batch.stop <= stop
         ]
 
-    # -- amount of work under way -----------------------------------------------------------
+    # -- amount of work in flight -----------------------------------------------------------
 
     @property
     def max_weight(self) -> int:
-        """Largest permitted weight of the batches under way (`policies.weight`)."""
+        """Largest permitted weight of the batches in flight (`policies.weight`)."""
         slots = self._workers.slot_count
-        collectors = self._stages.collector_count
-        return policies.max_under_way(slots, collectors, self.per_task)
+        return policies.max_under_way(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of further batches of a job that may be under way.
-
-        No batch may be under way if the weight is 0 or less.
+        """Return the weight of further batches of a job that may be in flight, if positive.
 
         The job has no room if many batches of any jobs are younger than the oldest batch of this
         job: the sorter, and the memory, would have to hold their scans.
@@ -127,7 +112,7 @@ class Dispatcher:
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
     def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
-        """Update the sizes of batches and tasks from casting times, and advise stage 1.
+        """Update the sizes of batches and tasks from casting times.
 
         Each record is of one batch: its casting time, and in `items` its number of scans.
         """
@@ -142,11 +127,8 @@ class Dispatcher:
             advice = policies.scans_per_batch(
                 self._recent_casts, job.scans_per_task, job.scans_of_run, slots
             )
-            if (
-                abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice
-            ):  # advice costs a request
+            if abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice:
                 self.advice = advice
-                self._stages.advise(advice)
 
     # -- casting ---------------------------------------------------------------------------
 
@@ -156,7 +138,7 @@ class Dispatcher:
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
         job.generated = max(stop, job.generated)
-        for missing_start, missing_stop in job.parts.missing(first, stop):
+        for missing_start, missing_stop in job.committed.parts.missing(first, stop):
             # The advised size may exceed the memory of this job's casting tasks.
             for start in range(missing_start, missing_stop, job.scans_per_task):
                 batch_stop = min(start + job.scans_per_task, missing_stop)
@@ -232,7 +214,6 @@ class Dispatcher:
         if state is BatchState.WAITING:
             self._forget_task(batch)
         batch.move(state)
-        batch.job.offered_again += 1
         self.replayed += 1
         if reason in (Outcome.DIED.value, Outcome.GONE.value):
             self.lost_workers.add(batch.worker)
@@ -318,13 +299,16 @@ class Dispatcher:
 
     # -- stage 4 -----------------------------------------------------------------------------
 
-    def hand_over(self) -> bool:
-        """Assign batches that were cast to collectors, and return True if any was assigned."""
+    def assign(self, collectors: Mapping[str, str]) -> dict[str, list[CollectOrder]]:
+        """Assign batches that were cast to collectors, and return the orders of each collector.
+
+        `collectors` maps the name of each running collector to the address of its worker.
+        """
+        orders: dict[str, list[CollectOrder]] = {}
         if not (cast := self.in_states(BatchState.CAST)):
-            return False
-        orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
+            return orders
         batches = [*cast, *self.in_states(BatchState.COLLECTING)]
-        for task, name in policies.handovers(batches, self._stages.collectors):
+        for task, name in policies.handovers(batches, collectors):
             parts = []
             for batch in task:
                 batch.collector = name
@@ -336,9 +320,7 @@ class Dispatcher:
                 parts.append((number, (first, batch.stop), part))
             order = CollectOrder(task[0].key, task[0].worker, tuple(parts))
             orders.setdefault(name, []).append(order)
-        for name, messages in orders.items():
-            self._stages.send(name, messages)
-        return bool(orders)
+        return orders
 
     def recast_part(self, receipt: Receipt) -> None:
         """Cast the batches of a part again, which was lost with the worker that held the part."""
