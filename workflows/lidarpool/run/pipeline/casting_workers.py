@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
-from enum import Enum, auto
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -44,7 +43,6 @@ CHECKING = "Checking the casting workers"
 PREPARING = "Preparing the scene on the casting workers"
 
 
-@dataclass(eq=False)
 class _Payload:
     """A value that casting tasks bring to workers without a copy.
 
@@ -52,43 +50,73 @@ class _Payload:
     workers of this machine map; other workers get a future of its bytes.
     """
 
-    name: str  # name on the workers
-    make: Callable[[], object]  # returns the value, again if the future is lost
-    small: Pickled | None  # pickled small value
-    shared: SharedValue | None = None
-    future: Future | None = None  # None until a worker needs it
-    recipients: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
-    holders: set[str] = field(default_factory=set)  # addresses of workers that have received it
-    blind: set[str] = field(default_factory=set)  # addresses of workers that do not see `shared`
+    def __init__(self, name: str, make: Callable[[], object], partition: Partition) -> None:
+        self.name = name  # name on the workers
+        self.future: Future | None = None  # None until a worker needs it
+        self.recipients: set[str] = set()  # addresses of workers that it was sent to
+        self._make = make  # returns the value, again if the future is lost
+        self._partition = partition
+        self._holders: set[str] = set()  # addresses of workers that have received it
+        self._blind: set[str] = set()  # addresses of workers that do not see `_shared`
+        self._futures = 0  # so far
+        self._small: Pickled | None = None
+        self._shared: SharedValue | None = None
+        pickled = Pickled.from_value(make())
+        if pickled.nbytes <= INLINE_BYTES:
+            self._small = pickled.copy()
+        else:
+            with suppress(OSError):  # this system has no shared memory, or too little
+                self._shared = SharedValue(pickled)
+
+    def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
+        """Return the argument that brings the value to a worker, or None if it has a copy."""
+        if worker in self._holders:
+            return None
+        self.recipients.add(worker)
+        if self._small is not None:
+            return self._small
+        if self._shared is not None and worker not in self._blind and _is_here(worker):
+            return self._shared.handle
+        if self.future is None or self.future.status in ("lost", "cancelled", "error"):
+            self._futures += 1
+            self.future = share(
+                self._partition,
+                Pickled.from_value(self._make()).copy(),
+                key=f"{self.name}-packed-{self._futures}",
+                priority=10,
+            )
+        return self.future
+
+    def record_copy(self, worker: str) -> None:
+        """Record that a worker has a copy."""
+        self._holders.add(worker)
+
+    def record_loss(self, worker: str, *, unseen: bool = False) -> None:
+        """Record that a worker has no copy, and perhaps does not see the shared memory."""
+        self._holders.discard(worker)
+        if unseen:
+            self._blind.add(worker)
 
     def release(self) -> None:
         """Release the memory now: the traceback of an error may keep this object for a while."""
-        if self.shared is not None:
-            self.shared.close()
+        if self._shared is not None:
+            self._shared.close()
         if self.future is not None:
             self.future.release()
 
 
-class WorkerState(Enum):
-    """How far a worker has come.
-
-    A worker that leaves is forgotten, unless it was refused.
-    """
-
-    CHECKING = auto()  # a task on the worker asks for its software
-    CASTING = auto()  # it may cast
-    REFUSED = auto()  # other software, or a lost GPU: it gets no task of this run
-
-
 @dataclass(eq=False)
 class _Worker:
-    """A worker that the run knows, by its address."""
+    """A worker that the run knows, by its address: it is checked, and then casts or is refused.
 
-    # The task that checks it. Its answer is not kept on the worker: a worker with a result cannot
-    # be returned to the queue.
+    A refused worker has different software or has lost its GPU, and gets no tasks of this run. A
+    worker that leaves is forgotten, unless it was refused.
+    """
+
+    # The task that asks for its software. Its answer is not kept on the worker: a worker with a
+    # result cannot be returned to the queue.
     check: Future | None
-    state: WorkerState = WorkerState.CHECKING
-    slots: int = 0  # casting tasks at a time
+    slots: int = 0  # casting tasks at a time; 0 while it is checked, or if it is refused
     unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
 
 
@@ -116,7 +144,7 @@ class CastingWorkers:
         self._software = dict(software)
         # {job: (plan of its rig, static part of its scene, which other jobs may share)}
         self._jobs: dict[int, tuple[_Payload, _Payload]] = {}
-        # {ids of the fields of a scene: its static part}, last used last. `_Payload.make` holds the
+        # {ids of the fields of a scene: its static part}, last used last. The payload holds the
         # scene, so that the ids stay valid.
         self._scenes: dict[tuple[int, ...], _Payload] = {}
         self._workers: dict[str, _Worker] = {}  # {address: worker}
@@ -133,8 +161,7 @@ class CastingWorkers:
     @property
     def slots(self) -> dict[str, int]:
         """Workers that were checked and take tasks, {address: tasks at a time}."""
-        casting = self._in_state(WorkerState.CASTING)
-        return {a: worker.slots for a, worker in casting.items() if a in self.locations.free}
+        return {a: self._workers[a].slots for a in self._casting if a in self.locations.free}
 
     @property
     def slot_count(self) -> int:
@@ -147,9 +174,14 @@ class CastingWorkers:
         shared = [payload.future for payload in self._payloads if payload.future is not None]
         return [*(cast for cast, _ in self._casts.values()), *self._checks.values(), *shared]
 
-    def _in_state(self, state: WorkerState) -> dict[str, _Worker]:
-        """Return the workers in a state, {address: worker}."""
-        return {a: worker for a, worker in self._workers.items() if worker.state is state}
+    @property
+    def _casting(self) -> set[str]:
+        """Addresses of workers that may cast."""
+        return {a for a, worker in self._workers.items() if worker.slots}
+
+    @property
+    def _refused(self) -> set[str]:
+        return self._workers.keys() - self._casting - self._checks.keys()
 
     @property
     def _checks(self) -> dict[str, Future]:
@@ -206,44 +238,12 @@ class CastingWorkers:
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for payload in old:
             payload.release()
-            for address in payload.recipients & self._in_state(WorkerState.CASTING).keys():
+            for address in payload.recipients & self._casting:
                 self._workers[address].unneeded.append(payload.name)
 
     def _payload(self, label: str, make: Callable[[], object]) -> _Payload:
         self._name_count += 1
-        name = f"{self.run}.{label}-{self._name_count}"
-        pickled = Pickled.from_value(make())
-        if pickled.nbytes <= INLINE_BYTES:
-            return _Payload(name, make, pickled.copy())
-        shared = None
-        with suppress(OSError):  # this system has no shared memory, or too little
-            shared = SharedValue(pickled)
-        return _Payload(name, make, None, shared)
-
-    def _share(self, payload: _Payload) -> Future:
-        self._name_count += 1
-        key = f"{payload.name}-packed-{self._name_count}"
-        return share(
-            self._partition, Pickled.from_value(payload.make()).copy(), key=key, priority=10
-        )
-
-    def _payload_for(
-        self, payload: _Payload, worker: str
-    ) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that brings a payload to a worker.
-
-        Returns None if the worker has a copy.
-        """
-        if worker in payload.holders:
-            return None
-        payload.recipients.add(worker)
-        if payload.small is not None:
-            return payload.small
-        if payload.shared is not None and worker not in payload.blind and _is_here(worker):
-            return payload.shared.handle
-        if payload.future is None or payload.future.status in ("lost", "cancelled", "error"):
-            payload.future = self._share(payload)
-        return payload.future
+        return _Payload(f"{self.run}.{label}-{self._name_count}", make, self._partition)
 
     # -- casting ---------------------------------------------------------------------------
 
@@ -263,7 +263,7 @@ class CastingWorkers:
             for job, spans_of_job in spans.items()
         ]
         payloads = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
-        arguments = [self._payload_for(payload, worker) for payload in payloads]
+        arguments = [payload.argument_for(worker) for payload in payloads]
         # Each offer has a separate key. A task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         self._name_count += 1
@@ -290,14 +290,12 @@ class CastingWorkers:
         payloads = {payload for job in jobs for payload in self._jobs.get(job, ())}
         if status == "finished":
             for payload in payloads:
-                payload.holders.add(worker)
+                payload.record_copy(worker)
             return Outcome.DONE
         error = error_of(future)
         if isinstance(error, RigMissing):
             for payload in payloads:
-                payload.holders.discard(worker)
-                if isinstance(error, MemoryUnseen):
-                    payload.blind.add(worker)
+                payload.record_loss(worker, unseen=isinstance(error, MemoryUnseen))
             return Outcome.NO_RIG
         if isinstance(error, DeviceLost):
             self._count_lost_device(error, worker)
@@ -319,7 +317,7 @@ class CastingWorkers:
             return
         self._lost_devices.add(error.process)
         # Until its process ends; the next has another address.
-        self._workers[worker] = _Worker(None, WorkerState.REFUSED)
+        self._workers[worker] = _Worker(None)
         self.notes.append(f"the GPU of {worker} stopped responding ({error})")
         if not error.restarts:
             raise LidarError(
@@ -355,8 +353,7 @@ class CastingWorkers:
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.locations = look_for_tasks(self._client, self._partition.name, keys)
-        refused = self._in_state(WorkerState.REFUSED).keys()
-        for address in self._workers.keys() - self.locations.members - refused:
+        for address in self._workers.keys() - self.locations.members - self._refused:
             self._remove(address)
         for address in sorted(self.locations.free.keys() - self._workers.keys()):
             self._name_count += 1
@@ -405,9 +402,8 @@ class CastingWorkers:
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
-        casting = self._in_state(WorkerState.CASTING).keys()
-        addresses = [*casting & self.locations.members]
-        for address in casting:
+        addresses = [*self._casting & self.locations.members]
+        for address in self._casting:
             del self._workers[address]
         if self._client.status == "running":
             self.want(0)
@@ -427,27 +423,24 @@ class CastingWorkers:
         worker = self._workers[address]
         worker.check = None
         if differs := difference(software, self._software):
-            worker.state = WorkerState.REFUSED
             self.notes.append(
                 f"worker {identity['name']} at {address} was not used because it has {differs}"
             )
-            if self._in_state(WorkerState.REFUSED).keys() >= self.locations.members:
+            if self._refused >= self.locations.members:
                 raise LidarError(
                     f"No worker of partition {self._partition.name!r} has the software that the "
                     f"run requires. The worker at {address} has {differs}. Install the same "
                     "versions on all workers."
                 )
             return
-        slots = identity["resources"].get(self._partition.name, 1)
-        worker.state = WorkerState.CASTING
-        worker.slots = max(1, int(slots))
+        worker.slots = max(1, int(identity["resources"].get(self._partition.name, 1)))
         self._died.clear()
 
     def _remove(self, address: str) -> None:
         """Remove a worker that has gone."""
         check = self._workers.pop(address).check
         for payload in self._payloads:
-            payload.holders.discard(address)
+            payload.record_loss(address)
         if check is None:
             return
         location = self.locations.tasks.get(check.key)
