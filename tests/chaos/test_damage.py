@@ -23,7 +23,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
-from lidarpool.run.pipeline.committed import CommittedResults
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 

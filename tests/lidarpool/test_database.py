@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from lidarpool import LidarError, Planning
 from lidarpool.columns.parts import part_name
 from lidarpool.plan import run_trial
-from lidarpool.run.pipeline.committed import CommittedResults
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 

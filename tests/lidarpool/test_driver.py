@@ -18,7 +18,7 @@ from lidarpool.run.pipeline import batches as job_state
 from lidarpool.run.pipeline import dispatch, pipeline_job, policies
 from lidarpool.run.pipeline import pipeline as driver
 from lidarpool.run.pipeline.batches import BatchState, Outcome
-from lidarpool.run.pipeline.committed import CommittedResults
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.dispatch import PIECES
 from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline

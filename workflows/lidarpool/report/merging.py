@@ -32,7 +32,7 @@ from ..datasets.job_table import JobRow
 from ..plan import Trial
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
-from ..run.pipeline.committed import CommittedResults
+from ..run.pipeline.committed_results import CommittedResults
 from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
 from ..run.run_page import RunPage

@@ -46,7 +46,7 @@ from .cluster.watch import Waiting, Watch
 from .job_source import JobMaker
 from .options import RunOptions
 from .pipeline.casting_workers import CastingWorkers
-from .pipeline.committed import CommittedResults
+from .pipeline.committed_results import CommittedResults
 from .pipeline.dispatch import Dispatcher
 from .pipeline.failures import JobError
 from .pipeline.pipeline_job import PipelineJob

@@ -30,7 +30,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.survey.survey import Survey
 
 from .casting_workers import CastingWorkers
-from .committed import CommittedResults
+from .committed_results import CommittedResults
 from .dispatch import Dispatcher
 from .failures import JobError
 from .long_stages import LongStages

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from ...base.tracing import trace
-from .committed import CommittedResults
+from .committed_results import CommittedResults
 
 
 @dataclass(eq=False)

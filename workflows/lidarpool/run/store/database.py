@@ -24,7 +24,7 @@ from lidarsim.base.errors import LidarError
 from ...columns.parts import part_name
 from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
-from ..pipeline.committed import CommittedResults
+from ..pipeline.committed_results import CommittedResults
 from ..pipeline.stage_messages import Receipt
 
 FORMAT = 9

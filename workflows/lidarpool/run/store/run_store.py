@@ -26,7 +26,7 @@ from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
 from ...scenario.build import Job
 from ..job_source import CONTENT, Jobs, identity_of
-from ..pipeline.committed import CommittedResults
+from ..pipeline.committed_results import CommittedResults
 from ..pipeline.failures import storing
 from .database import (
     FILE,

@@ -18,7 +18,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack
 from ...plan import Trial
 from ...scenario.build import Job
-from ..pipeline.committed import CommittedParts, CommittedResults
+from ..pipeline.committed_results import CommittedParts, CommittedResults
 from ..pipeline.stage_messages import (
     Receipt,
     ScanFrame,
