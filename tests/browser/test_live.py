@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from lidarpool import Job, Scene, Survey
+from lidarpool.run.cluster.cluster import ClusterConnection
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
+from lidarpool.run.listener import Listener
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.run.runner import Run
+from lidarpool.run.runner import cast, open_store
 from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -52,8 +54,6 @@ class Driven:
         begun = time.monotonic()
         options = RunOptions(client=client)
         screen = Screen(lambda progress: None)
-        survey_run = Run(job, options, screen, live, self.on_frame)
-        self.run = survey_run
 
         def on_frame(frame):
             while self.points.parts.point_count >= self.most:
@@ -65,10 +65,13 @@ class Driven:
 
         def run():
             try:
-                with survey_run:
-                    survey_run.open_store()
-                    survey_run.cast()
-                    survey_run.keep()
+                with (
+                    ClusterConnection(job, options, screen) as connection,
+                    open_store(job, options, screen) as self.store,
+                ):
+                    committed = cast(self.store, connection, Listener(live, self.on_frame))
+                    result = committed.result(screen)
+                    live.finish(result.seconds, result)
             except BaseException as error:
                 self.error = error
 
@@ -82,7 +85,7 @@ class Driven:
     @property
     def points(self):
         """What is committed."""
-        return self.run.store.only_job
+        return self.store.only_job
 
     def ended(self):
         """Wait for its end."""

@@ -31,10 +31,11 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.report.growing_cloud import GrowingCloud
-from lidarpool.run.pipeline.stage_messages import Receipt
+from lidarpool.run.cluster.cluster import ClusterConnection
+from lidarpool.run.listener import Listener
 from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.run_result import RunResult
-from lidarpool.run.runner import Run
+from lidarpool.run.runner import cast, open_store
 
 from .arena import Arena
 from .checker import Verdict, judge
@@ -83,26 +84,28 @@ def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
 
     Returns the bytes of the file, too; None if it failed, as it may where a part is damaged.
     """
-    clouds: list[GrowingCloud] = []
     written: list[bytes] = []
 
-    def add_parts(parts: Sequence[Receipt]) -> None:
-        clouds[0].add(parts)
-
-    def cast(jobs: Any, run_options: Any, screen: Any, page: Any, on_frame: Any) -> RunResult:
-        with Run(jobs, run_options, screen, page, on_frame, on_parts=add_parts) as run:
-            run.open_store()
-            job = run.store.only_job
+    def cast_and_grow(
+        jobs: Any, run_options: Any, screen: Any, page: Any, on_frame: Any
+    ) -> RunResult:
+        with (
+            ClusterConnection(jobs, run_options, screen) as connection,
+            open_store(jobs, run_options, screen) as store,
+        ):
+            job = store.only_job
             assert job is not None
-            clouds.append(run.enter(GrowingCloud(Path(folder, "growing.ply"), job)))
-            run.cast()
-            path = Path(folder, "cloud.ply")
-            if clouds[0].finish(path, job.points()) is not None:
-                written.append(path.read_bytes())
-            return run.keep()
+            with GrowingCloud(Path(folder, "growing.ply"), job) as cloud:
+                listener = Listener(page, on_frame, cloud.add, run_options.pace)
+                result = cast(store, connection, listener).result(screen)
+                path = Path(folder, "cloud.ply")
+                if cloud.finish(path, job.points()) is not None:
+                    written.append(path.read_bytes())
+            store.keep(None, ())
+            return result
 
     with tempfile.TemporaryDirectory(prefix="chaos-ply-") as folder:
-        with patch("lidarpool.api.simulation.cast_to_store", cast):
+        with patch("lidarpool.api.simulation.cast_to_store", cast_and_grow):
             result = simulate(*arguments, **options)
         left = {path.name for path in Path(folder).iterdir()}
     assert left == ({"cloud.ply"} if written else set()), left

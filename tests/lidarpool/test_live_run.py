@@ -21,11 +21,12 @@ from tests.shapes import box
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_output import run_campaign
-from lidarpool.run import pace
+from lidarpool.run import listener
 from lidarpool.run.job_source import OneJob
+from lidarpool.run.listener import Listener
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
-from lidarpool.run.runner import Run, cast_to_store
+from lidarpool.run.runner import cast_to_store
 from lidarpool.run.store.run_store import RunStore
 from lidarpool.showing.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
 from lidarpool.showing.pages.live_job import LiveJob
@@ -78,20 +79,20 @@ def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
     clock = SimpleNamespace(now=7.0)
     clock.monotonic = lambda: clock.now
     clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
-    monkeypatch.setattr(pace, "time", clock)
+    monkeypatch.setattr(listener, "time", clock)
     shown = []
     page = SimpleNamespace(
         on_frame=lambda frame: shown.append((round(clock.now, 9), frame.scan)),
         on_parts=lambda parts: shown.append((round(clock.now, 9), *[part.name for part in parts])),
     )
-    run = Run(make_job(8), RunOptions(pace=0.1), Screen(), page)
+    passed = Listener(page, pace=0.1)
     parts = [SimpleNamespace(name=name, first=first) for name, first in (("b", 2), ("a", 0))]
-    run._on_parts(parts)
+    passed.parts(parts)
     assert shown == []
     for scan, time_s in enumerate((0.0, 0.1, 0.2, 0.3, 0.0)):  # the last of a second sensor
         if scan == 3:
             clock.now += 5
-        run._frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
+        passed.frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
     assert shown == [(7, "a"), (7, 0), (8, 1), (9, "b"), (9, 2), (14, 3), (14, 4)]
 
 

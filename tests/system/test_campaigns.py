@@ -766,10 +766,10 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     ("options", "words"),
     [
         (["--job", 99], "Job 99 does not exist"),
-        (["--resume", "--overwrite"], "`overwrite` cannot be combined with `resume`"),
+        (["--resume", "--overwrite"], "`restart` and `overwrite` cannot be combined with `resume`"),
         (["--cloud-only"], "cannot be used with campaigns"),
-        (["--resume", "--restart"], "--restart"),
-        (["--retry-failed", "--restart"], "--restart"),
+        (["--resume", "--restart"], "`restart` and `overwrite` cannot be combined"),
+        (["--retry-failed", "--restart"], "`restart` and `overwrite` cannot be combined"),
         (["--retry-failed", "--job", 1], "--retry-failed"),
     ],
 )

@@ -7,7 +7,7 @@ import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,6 @@ from lidarsim.base.validation import checked
 from lidarsim.base.words import plural, scans_in_words
 
 from ..clouds.writing import save_cloud
-from ..run.job_source import fields_of
 from ..run.run_result import RunResult
 
 if TYPE_CHECKING:
@@ -81,8 +80,7 @@ class Result(RunResult):
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
         with output.lock():
-            fields = partial(fields_of, self.scene, self.survey, self.planning)
-            output.refuse(lambda: self.identity, fields, overwrite=overwrite)
+            output.check_existing(self, overwrite=overwrite)
             output.write(self)
 
     @checked

@@ -335,12 +335,10 @@ def run(
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
-    if options.restart and (options.resume or options.verify):
-        raise click.UsageError("`--restart` cannot be combined with `--resume` or `--verify`.")
     if number is not None and settings["shard"] is not None:
         raise click.UsageError("`--job` and `--shard` cannot be combined.")
-    if options.retry_failed and (options.restart or number is not None):
-        raise click.UsageError("`--retry-failed` cannot be combined with `--restart` or `--job`.")
+    if options.retry_failed and number is not None:
+        raise click.UsageError("`--retry-failed` cannot be combined with `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from lidarsim.base.words import listed, plural, rounded, scans_in_words
 from ..base.job_errors import lines_of_errors
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
-from ..run.job_source import fields_of, identity_of
+from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice, unlabeled
@@ -155,8 +154,7 @@ def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -
 def _refuse_other_result(job: Job, options: RunOptions) -> None:
     """Raise a LidarError if the folder of the result holds another result."""
     assert options.out is not None, "commands write"
-    fields = partial(fields_of, job.scene, job.survey, job.planning)
-    SurveyOutput(options.out, job.survey, job.outputs).refuse(lambda: identity_of(job), fields)
+    SurveyOutput(options.out, job.survey, job.outputs).check_existing(OneJob(job))
 
 
 def _holds_files(folder: Path | Storage | None) -> bool:

@@ -26,15 +26,19 @@ from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
+from ..run.cluster.cluster import ClusterConnection
+from ..run.committed import Committed
+from ..run.listener import Listener
 from ..run.options import RunOptions
 from ..run.progress import Screen
 from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun
-from ..run.runner import Run
+from ..run.runner import cast, open_store
 from ..run.store.database import FILE
 from ..run.store.run_store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_jobs import file_hashes
+from ..scenario.empty_cloud import empty_cloud_reason, empty_jobs_warning
 
 CAMPAIGN_FILE = "campaign.json"  # the campaign of the data set, and the software that wrote it
 # Entries of CAMPAIGN_FILE and their types.
@@ -67,26 +71,32 @@ def run_campaign(
     page: RunPage,
 ) -> CampaignRun:
     """Cast the jobs of a campaign, write the data set, and return a summary."""
-    output = DataSetOutput(target, campaign)
-    with Run(campaign, options, screen, page, dataset=output.dataset) as run:
-        run.enter(output.lock())
-        if (finished := output.check_existing(run)) is not None:
+    output = DataSetOutput(target, campaign, options, screen, page)
+    with output.lock():
+        if (finished := output.check_existing()) is not None:
             return finished
-        run.open_store()
-        output.compare_with_store(run)
-        run.cast()
-        return output.publish(run)
+        with (
+            ClusterConnection(campaign, options, screen) as connection,
+            open_store(campaign, options, screen) as store,
+        ):
+            output.compare_with_store(store)
+            committed = cast(store, connection, Listener(page), output.dataset)
+            return output.publish(committed)
 
 
 @dataclass(eq=False)
 class DataSetOutput:
-    """The data set of a campaign in a folder or storage."""
+    """The data set of a campaign in a folder or storage, as the output of a run."""
 
     target: Path | Storage
     campaign: CampaignSpec
+    options: RunOptions
+    screen: Screen
+    page: RunPage
     dataset: DataSet = field(init=False)
 
     def __post_init__(self) -> None:
+        self._begun_at = time.monotonic()
         storage = replace(Storage.at(self.target), durable=False)
         self.dataset = DataSet(storage, **asdict(self.campaign.keep))
         # Of a finished data set: its record, rows, and faults of jobs, {number: a clause}.
@@ -104,18 +114,18 @@ class DataSetOutput:
 
     # -- existing files -----------------------------------------------------------------------
 
-    def check_existing(self, run: Run) -> CampaignRun | None:
+    def check_existing(self) -> CampaignRun | None:
         """Refuse, remove or check a finished data set.
 
         Returns its sums if no job is left to do.
         """
         storage = self.dataset.storage
-        options = run.options
+        options = self.options
         run_folder = storage.below(RUN_FOLDER)
         entries = storage.entries()
         unfinished = FILE in run_folder.sizes()
         starts_anew = options.restart or options.overwrite
-        if not run.resume and (starts_anew or not unfinished):
+        if not options.may_continue and (starts_anew or not unfinished):
             if INDEX_FILE in entries and not options.overwrite:
                 raise LidarError(
                     f"{storage} contains a finished data set, but each data set requires a "
@@ -124,7 +134,7 @@ class DataSetOutput:
                 )
             if starts_anew:
                 _remove_dataset(storage, run_folder)
-        if not run.resume or CAMPAIGN_FILE not in entries or unfinished:
+        if not options.may_continue or CAMPAIGN_FILE not in entries or unfinished:
             return None
         try:
             self._record = check_same(storage, self.campaign)
@@ -139,7 +149,7 @@ class DataSetOutput:
         if (files := file_hashes(self.campaign.files)) != [*map(tuple, self._record["files"])]:
             # `_check_jobs` has found no job of an older file
             write_record(storage, {**self._record, "files": files})
-        return self._finished(run)
+        return self._finished()
 
     def _check_shards(self, shards: Sequence[str]) -> None:
         """Raise LidarError unless a finished data set has the shards of this run."""
@@ -171,31 +181,46 @@ class DataSetOutput:
         has_all = intact_count == len(self.campaign.numbers)
         return has_table and has_all and _is_indexed(storage, intact_count)
 
-    def _finished(self, run: Run) -> CampaignRun:
-        """Show that a data set is complete, and return its sums."""
-        run.screen.tell(f"{self.dataset.storage} is already complete")
+    def _finished(self) -> CampaignRun:
+        """Report that the data set is complete, and return its sums."""
+        self.screen.tell(f"{self.dataset.storage} is already complete")
         for row in self._rows:
-            run.page.ended(row)
-        notes = tuple(run.warn_of_empty_jobs(self._rows))
-        sums = CampaignRun.from_rows(self._rows, time.monotonic() - run.started, notes=notes)
-        run.page.finish(sums.seconds)
+            self.page.ended(row)
+        notes = (*self._warnings_of_empty_jobs(self._rows),)
+        sums = CampaignRun.from_rows(self._rows, self._seconds(), notes=notes)
+        self.page.finish(sums.seconds)
         return sums
 
-    def compare_with_store(self, run: Run) -> None:
+    def _seconds(self) -> float:
+        """Return the wall time of the run so far."""
+        return time.monotonic() - self._begun_at
+
+    def _warnings_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
+        """Warn if jobs have no points, and return the warning, if any."""
+        empty = [row for row in rows if row.done and not row.points]
+        if not empty:
+            return []
+        reason = ""
+        with suppress(LidarError):  # a file that the job is made of may be gone
+            job = self.campaign.job(empty[0].number)
+            reason = empty_cloud_reason(job.scene, job.survey)
+        warning = empty_jobs_warning(empty, reason)
+        self.screen.warn(warning)
+        return [warning]
+
+    def compare_with_store(self, store: RunStore) -> None:
         """Compare existing jobs with the run's store, and add jobs that the store lacks."""
-        store = run.store
-        options = run.options
+        options = self.options
         storage = self.dataset.storage
         if self._record is not None:
             store.cast_with(self._record["backend"], self._record["casting"])
             rows = [row for row in self._rows if row.number in self.campaign.numbers]
             store.adopt(rows, sensors=json.dumps(self._record["sensors"]))
-        elif run.resume:
+        elif options.may_continue:
             store.notes += [self._lost_record] * bool(self._lost_record)
             self._take_over(store)
-        dataset_files(
-            storage, begun=store.begun or bool(store.committed_in_words)
-        )  # some were perhaps taken over
+        # Some jobs were perhaps taken over.
+        dataset_files(storage, begun=store.begun or bool(store.committed_in_words))
         if self._record is None:
             _, self._wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.committed_in_words:
@@ -205,7 +230,7 @@ class DataSetOutput:
         if self._wrong:
             store.notes.append(f"these jobs are run again: {listed([*self._wrong.values()])}")
         for row in store.rows():
-            run.page.ended(row)
+            self.page.ended(row)
 
     def _take_over(self, store: RunStore) -> None:
         """Add finished jobs to the store whose database was lost."""
@@ -224,27 +249,27 @@ class DataSetOutput:
 
     # -- the end ------------------------------------------------------------------------------
 
-    def publish(self, run: Run) -> CampaignRun:
+    def publish(self, committed: Committed) -> CampaignRun:
         """Write the shared files, and remove the run unless jobs have failed."""
-        store = run.store
-        loop = run.loop
-        seconds = time.monotonic() - run.started
-        fields: dict[str, Any] = {
-            "stages": loop.stages if loop else (),
-            "replayed": loop.replayed if loop else 0,
-            "notes": run.notes(),
-        }
-        warnings = run.warn_of_empty_jobs(store.rows())
+        store = committed.store
+        seconds = self._seconds()
+        notes = committed.notes
+        warnings = self._warnings_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
-            fields["notes"] = (*fields["notes"], *warnings)
+            notes += (*warnings,)
         if untimed := [row.name for row in store.rows() if row.done and row.seconds is None]:
-            note = (
+            notes += (
                 "the casting times of these jobs are unknown, because a run was interrupted before "
-                f"their results were recorded: {listed(untimed)}"
+                f"their results were recorded: {listed(untimed)}",
             )
-            fields["notes"] = (*fields["notes"], note)
         sums = CampaignRun.from_rows(
-            store.rows(), seconds, store.resumed, sensors=store.sensors, **fields
+            store.rows(),
+            seconds,
+            store.resumed,
+            sensors=store.sensors,
+            stages=committed.stages,
+            replayed=committed.replayed,
+            notes=notes,
         )
         record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         record |= {"fields": dict(store.fields)}
@@ -259,7 +284,7 @@ class DataSetOutput:
             store.db.close()
         else:
             store.remove()
-        run.page.finish(sums.seconds)
+        self.page.finish(sums.seconds)
         return sums
 
 

@@ -30,14 +30,14 @@ from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_seconds import known_seconds, read_seconds
 from ..datasets.job_table import JobRow
 from ..plan import Trial
+from ..run.committed import Committed
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.pipeline.committed_results import CommittedResults
 from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
-from ..run.run_page import RunPage
 from ..run.run_result import CampaignRun
-from ..run.runner import Run
+from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
 from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
@@ -559,14 +559,14 @@ def _merge_survey(
         )
     output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], built.scenario)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
-    with Run(jobs, options, screen, RunPage()) as run:
-        run.enter(output.lock())
-        if not run.continues_run:
-            output.refuse(lambda: jobs.identity, lambda: jobs.fields)
-        run.open_store()
-        _take_points(run.store, shard_folders, notes)
-        load_open3d()
-        return output.publish(run)[1]
+    with output.lock():
+        if not options.continues_run:
+            output.check_existing(jobs)
+        with open_store(jobs, options, screen) as store:
+            _take_points(store, shard_folders, notes)
+            load_open3d()
+            result = Committed(store).result(screen)
+            return output.publish(result, store, screen)[1]
 
 
 def _take_points(

@@ -30,13 +30,15 @@ from ..clouds.format_table import FORMATS, plugin_formats, row_of
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
-from ..run.job_source import OneJob
+from ..run.cluster.cluster import Cluster, ClusterConnection
+from ..run.job_source import Identified, OneJob
+from ..run.listener import Listener
 from ..run.options import RunOptions
-from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
-from ..run.runner import Run
+from ..run.runner import cast, open_store
+from ..run.store.run_store import RunStore
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
@@ -60,16 +62,22 @@ def run_survey(
 
     `cloud.ply` grows while the survey is cast.
     """
-    parts = output.add_parts
-    with Run(jobs, options, screen, page, on_parts=parts) as run:
-        run.enter(output.lock())
-        if not run.continues_run:
-            output.refuse(lambda: jobs.identity, lambda: jobs.fields, overwrite=options.overwrite)
-        run.open_store()
-        output.begin_cloud(run)
-        load_open3d()  # writes the cloud in the end; a missing library is reported at the start
-        run.cast()
-        return output.publish(run)
+    with output.lock():
+        if not options.continues_run:
+            output.check_existing(jobs, overwrite=options.overwrite)
+        with (
+            ClusterConnection(jobs, options, screen) as connection,
+            open_store(jobs, options, screen) as store,
+            output.growing_cloud(store) as cloud,
+        ):
+            load_open3d()  # writes the cloud in the end; a missing library is reported at the start
+            committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
+            result = committed.result(screen)
+            page.finish(result.seconds, result)
+            if not output.in_pieces:
+                connection.close()
+                timeline.mark(timeline.STOPPED)
+            return output.publish(result, store, screen, connection.cluster)
 
 
 @dataclass(eq=False)
@@ -94,6 +102,11 @@ class SurveyOutput:
         ]
 
     @property
+    def in_pieces(self) -> bool:
+        """True if a format has many files, which workers can write."""
+        return any(output_format.has_many_files for output_format in self.formats)
+
+    @property
     def _has_page(self) -> bool:
         """True if the page, which shows the points from above, is written."""
         return self.extent != "cloud"
@@ -112,20 +125,12 @@ class SurveyOutput:
         with result_folder(self.target) as self._folder:
             yield
 
-    def refuse(
-        self,
-        identity: Callable[[], Mapping[str, str]],
-        fields: Callable[[], Mapping[str, str]],
-        *,
-        overwrite: bool = False,
-    ) -> None:
+    def check_existing(self, inputs: Identified, *, overwrite: bool = False) -> None:
         """Refuse a target that holds the result of another survey, or files of no result.
 
-        `identity` returns `RunResult.identity` of this result, which takes a moment for large
-        scenes, and `fields` its fields in words. LidarError if there is a result of another scene
-        or survey, a damaged result, or a file that this result would replace and that no report
-        there lists, each unless `overwrite`; or a folder that would be replaced and holds foreign
-        files.
+        LidarError if there is a result of another scene or survey, a damaged result, or a file that
+        this result would replace and that no report there lists, each unless `overwrite`; or a
+        folder that would be replaced and holds foreign files.
         """
         target = self.target
         storage = Storage.at(target)
@@ -140,9 +145,9 @@ class SurveyOutput:
                 return
         earlier, listed, earlier_fields = _earlier(storage)
         if REPORT in entries and not overwrite:
-            expected = identity()
+            expected = inputs.identity  # takes a moment for large scenes
             if earlier != {name: expected[name] for name in _SURVEY}:
-                changed = differences(earlier_fields, fields()) if earlier_fields else ""
+                changed = differences(earlier_fields, inputs.fields) if earlier_fields else ""
                 raise LidarError(
                     f"{target} contains the result of a different "
                     f"survey{f' ({changed})' * bool(changed)}. {advice}"
@@ -157,47 +162,45 @@ class SurveyOutput:
             raise LidarError(f"{lists} {advice}")
         check_foreign_files(storage, _formats({*further, *listed}))
 
-    def begin_cloud(self, run: Run) -> None:
-        """Begin the cloud, with the points of an earlier run."""
-        job = run.store.only_job
-        assert job is not None, "of a survey"
-        folder = run.enter(staging(self._folder, self.target))
-        self._growing = run.enter(GrowingCloud(folder / CLOUD, job))
+    @contextmanager
+    def growing_cloud(self, store: RunStore) -> Iterator[GrowingCloud]:
+        """Begin the cloud, with the points of an earlier run; parts are added while casting."""
+        assert store.only_job is not None, "of a survey"
+        with (
+            staging(self._folder, self.target) as folder,
+            GrowingCloud(folder / CLOUD, store.only_job) as self._growing,
+        ):
+            yield self._growing
 
-    def add_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Append parts to the cloud, and return at once."""
-        if self._growing is not None:
-            self._growing.add(receipts)
-
-    def publish(self, run: Run) -> tuple[RunResult, dict[str, Any]]:
+    def publish(
+        self, result: RunResult, store: RunStore, screen: Screen, cluster: Cluster | None = None
+    ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result of a run, remove the run, and return the result and its report.
 
-        LIDAR workers write formats in pieces. Without such formats, the cluster ends before the
-        result is written.
+        LIDAR workers of the cluster write formats in pieces.
         """
-        result = run.result()
-        in_pieces = any(output_format.has_many_files for output_format in self.formats)
-        workers = None
-        if not in_pieces:
-            run.leave_cluster()
-            timeline.mark(timeline.STOPPED)
-        elif run.cluster is not None:
-            workers = LidarWorkers(run.cluster)
-        run.page.finish(result.seconds, result)
+        workers = LidarWorkers(cluster) if cluster is not None and self.in_pieces else None
         if note := self.judge(result):
             result = replace(result, notes=(*result.notes, note))
+        is_in_place = False
 
-        def in_place() -> None:
-            run.result_is_in(self.target)
-            run.store.remove()
+        def on_written() -> None:
+            nonlocal is_in_place
+            is_in_place = True
+            store.remove()
 
         extents = {
             "cloud": "",
             "page": " and the report",
             "pictures": ", the report and the pictures",
         }
-        with run.screen.writing(f"writing the cloud{extents[self.extent]}") as show:
-            return result, self.write(result, in_place, workers, show)
+        try:
+            with screen.writing(f"writing the cloud{extents[self.extent]}") as show:
+                return result, self.write(result, on_written, workers, show)
+        except BaseException as error:
+            if is_in_place:
+                error.add_note(f"The result in {self.target} is complete.")
+            raise
 
     def write(
         self,

@@ -24,7 +24,6 @@ from lidarsim.survey.survey import CloudOptions, Survey
 
 from ..clouds.flight_lines import scanned_lines
 from ..plan.planning import Search
-from ..run.job_source import fields_of
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
 from ..run.planning_trials import TRIAL
@@ -76,7 +75,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     return {
         "versions": versions(),
         "identity": dict(result.identity),
-        "fields": fields_of(scene, survey, result.planning),
+        "fields": result.fields,
         "machine": {"system": platform.platform(), "processor": platform.machine()},
         "backend": result.backend,
         "notes": list(result.notes),

@@ -74,7 +74,21 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
     return dict(fields_in_words(values))
 
 
-class Jobs(Protocol):
+class Identified(Protocol):
+    """Inputs that results depend on, as hashes and in words."""
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """Hashes of all inputs that the results depend on, by name."""
+        ...
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Fields that the results depend on, in words, to name those that differ."""
+        ...
+
+
+class Jobs(Identified, Protocol):
     """The jobs of a run: `OneJob` of a survey, or a campaign."""
 
     @property
@@ -100,16 +114,6 @@ class Jobs(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the values that differ from job to job."""
-        ...
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Hashes of all inputs that the results depend on, by name."""
-        ...
-
-    @property
-    def fields(self) -> Mapping[str, str]:
-        """Fields that the results depend on, in words, to name those that differ."""
         ...
 
     @property

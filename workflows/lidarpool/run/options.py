@@ -12,6 +12,7 @@ from distributed import Client
 from pydantic import Field
 
 from lidarsim.base.declared import declared
+from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
@@ -20,6 +21,7 @@ from lidarsim.base.words import did_you_mean
 from ..base.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
+from .store.database import FILE
 
 # The page in the browser (also True), or a viewer; False for none.
 Live = bool | Literal["page", "foxglove", "rerun"]
@@ -56,6 +58,25 @@ class RunOptions(TaskOptions):
     live: Live = False
     pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames; 1 is that of the scanner
     stay: bool = True  # False if the live page, or viewer, ends with the run
+
+    def __post_init__(self) -> None:
+        if (self.restart or self.overwrite) and self.may_continue:
+            raise LidarError(
+                "The options `restart` and `overwrite` cannot be combined with `resume`, "
+                "`retry_failed` or `verify`, because they remove the run that these options "
+                "continue."
+            )
+
+    @property
+    def may_continue(self) -> bool:
+        """True if the run may continue an earlier run."""
+        return self.resume or self.retry_failed or self.verify
+
+    @property
+    def continues_run(self) -> bool:
+        """True if the run continues an unfinished run, which is in `folder`."""
+        folder = self.folder
+        return self.may_continue and folder is not None and FILE in Storage.at(folder).sizes()
 
     def with_pool(
         self, pool: PoolSection, overrides: Mapping[str, Any] = MappingProxyType({})

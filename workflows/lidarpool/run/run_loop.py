@@ -27,17 +27,17 @@ from ..scenario.build import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
 from .job_source import JobMaker, failed_row
+from .listener import Listener
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
 from .pipeline.long_stages import LongStages
 from .pipeline.pipeline import Pipeline
 from .pipeline.pipeline_job import PipelineJob
-from .pipeline.stage_messages import Receipt, ScanFrame, Summaries
+from .pipeline.stage_messages import Summaries
 from .pipeline.stage_names import GPU, LIDAR, OTHER, SORT
 from .pipeline.task_book import StageTotals
 from .planning_trials import TrialPump
 from .progress import Progress, Show
-from .run_page import RunPage
 from .store.run_store import RunStore
 from .store.stored_job import StoredJob
 from .writer import JobFiles, JobWriter
@@ -57,34 +57,29 @@ class RunLoop:
         Checked cluster with the partitions GPU, LIDAR and OTHER.
     store
         Database of the run, and storage of its parts.
-    page
-        Page of the run, which shows ended jobs.
     maker
         Makes the jobs of a campaign after the first; None for the single job of a survey.
     dataset
         Data set into which the jobs of a campaign are written; None for a survey, whose parts are
         kept.
-    on_frame, on_parts
-        Functions that are called with each frame, and with committed parts, of the single job of a
-        survey.
+    listener
+        Object that is notified of the parts and frames of a survey, and whose page shows ended
+        jobs.
     """
 
     def __init__(
         self,
         cluster: Cluster,
         store: RunStore,
-        page: RunPage,
         maker: JobMaker | None,
         dataset: DataSet | None,
-        on_frame: Callable[[ScanFrame], None],
-        on_parts: Callable[[Sequence[Receipt]], None],
+        listener: Listener,
     ) -> None:
         self._cluster = cluster
         self._store = store
-        self._page = page
         self._maker = maker
-        self._on_frame = on_frame
-        self._on_parts = on_parts
+        self._listener = listener
+        self._page = listener.page
         options = cluster.options
         run_id = uuid.uuid4().hex[:8]
         mark = store.db.meta["mark"]
@@ -137,7 +132,7 @@ class RunLoop:
         news = self._pipeline.step(self._scans_to_come)
         moved |= news.moved
         if self._writer is None and news.parts:
-            self._on_parts(news.parts)
+            self._listener.parts(news.parts)
         for job, summaries in news.frames:
             self._hand_out(job, summaries)
         for job, error in news.ended:
@@ -159,7 +154,7 @@ class RunLoop:
         stored = self._store.in_flight[job.number]
         for frame in stored.frames(summaries):
             job.trace("frame", SORT, [frame.scan])
-            self._cluster.call(self._on_frame, frame)
+            self._cluster.call(self._listener.frame, frame)
             # Only now: after an error of the caller the frame is handed out again.
             stored.committed.advance_frames(frame.scan + 1)
             job.trace("release", SORT, [frame.scan])

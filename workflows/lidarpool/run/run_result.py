@@ -17,6 +17,7 @@ from lidarsim.survey.survey import Survey
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
 from ..plan import Plan, Planning, Trial
+from .job_source import fields_of
 from .pipeline.task_book import StageTotals
 from .pipeline.task_records import TaskRecord
 
@@ -93,6 +94,11 @@ class RunResult:
         If a stage has thousands of tasks, only every n-th task is included.
         """
         return tuple(record for totals in self.stages for record in totals.records)
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Fields of scene, survey and planning, in words."""
+        return fields_of(self.scene, self.survey, self.planning)
 
     @cached_property
     def cloud(self) -> Cloud:

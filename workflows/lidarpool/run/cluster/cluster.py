@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from typing import Any
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from typing import Any, Self
 
 from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
 from lidarsim.base.errors import LidarError
+from lidarsim.simulator.casting.scene_caster import check_backend_here
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
 from ...base import timeline
 from ...scenario.build import Job
+from ..job_source import Jobs
 from ..options import RunOptions
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
@@ -38,11 +40,62 @@ LOST_S = 0.5  # time until a client notices that its scheduler is gone
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
-def start_local(options: RunOptions, required_slots: Mapping[str, int]) -> StartedAhead:
-    """Begin to start the workers of a run on this machine."""
-    check_starts_workers()
-    workers = options.gpu_workers, options.other_workers
-    return StartedAhead(local_client(required_slots, *workers, tls=options.tls))
+class ClusterConnection:
+    """Connection of a run to its cluster, which is opened if something is left to be cast.
+
+    Within the context, workers of this machine start in the background, unless an earlier run may
+    have left nothing to cast. The context stops the workers that were started for the run.
+
+    Attributes
+    ----------
+    cluster
+        The cluster, or None until the connection is opened.
+    """
+
+    def __init__(self, jobs: Jobs, options: RunOptions, screen: Screen) -> None:
+        self.cluster: Cluster | None = None
+        self.screen = screen
+        self._jobs = jobs
+        self._options = options
+        self._stack = ExitStack()
+        self._local: StartedAhead | None = None  # workers of this machine
+
+    def __enter__(self) -> Self:
+        options = self._options
+        if options.starts_workers and not options.may_continue:
+            job = self._jobs.only_job
+            planning = job is not None and job.planning is not None
+            slots = slots_needed(options, planning=planning, writing=job is None)
+            self._local = self._stack.push(_start_local(options, slots))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def open(self, first: Job, store: RunStore) -> Cluster:
+        """Connect to a cluster with the slots that a job needs, and check the cluster for the job.
+
+        LidarError if workers, memory or software are missing.
+        """
+        options = self._options
+        if options.starts_workers:
+            check_backend_here(store.backend or options.backend, store.advice)
+        writing = store.only_job is None
+        slots = slots_needed(options, planning=first.planning is not None, writing=writing)
+        if options.cluster is not None:
+            options.cluster.require(slots)
+        waiting = Waiting(options.startup_timeout_s, self.screen.tell)
+        client = self._stack.enter_context(
+            client_of(options, slots, waiting, self.screen, self._local)
+        )
+        timeline.mark(timeline.WORKERS)
+        self.cluster = Cluster(client, first, store, options, self.screen, slots, waiting)
+        return self.cluster
+
+    def close(self) -> None:
+        """Stop the workers that were started for the run, or disconnect from a cluster."""
+        self.cluster = None
+        self._stack.close()
 
 
 def client_of(
@@ -66,34 +119,35 @@ def client_of(
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
-    local = local or start_local(options, required_slots)
+    local = local or _start_local(options, required_slots)
     return screen.starting(local, "starting the workers", shares_terminal=True)
+
+
+def _start_local(options: RunOptions, slots: Mapping[str, int]) -> StartedAhead:
+    """Begin to start the workers of a run on this machine."""
+    check_starts_workers()
+    workers = options.gpu_workers, options.other_workers
+    return StartedAhead(local_client(slots, *workers, tls=options.tls))
 
 
 class Cluster:
     """The cluster of a run, checked for jobs such as `first`.
 
-    `store` lists the remaining jobs, and the software of earlier runs. `enter` enters the context
-    of the client, and its caller leaves that context in the end. `local` as of `client_of`.
-    LidarError if workers, memory or software are missing.
+    `store` lists the remaining jobs, and the software of earlier runs. LidarError if workers,
+    memory or software are missing.
     """
 
     def __init__(
         self,
+        client: Client,
         first: Job,
         store: RunStore,
         options: RunOptions,
         screen: Screen,
-        enter: Callable[[AbstractContextManager[Client]], Client],
-        local: StartedAhead | None,
+        required_slots: Mapping[str, int],
+        waiting: Waiting,
     ) -> None:
-        writing = store.only_job is None
-        required_slots = slots_needed(options, planning=first.planning is not None, writing=writing)
-        if options.cluster is not None:
-            options.cluster.require(required_slots)
-        waiting = Waiting(options.startup_timeout_s, screen.tell)
-        self.client = client = enter(client_of(options, required_slots, waiting, screen, local))
-        timeline.mark(timeline.WORKERS)
+        self.client = client
         self.options = options
         self._screen = screen
         # For errors about a lost cluster; a client that was never connected is refused below.
@@ -110,7 +164,7 @@ class Cluster:
                 store.advice,
                 store.casting if store.committed_in_words else {},
                 waiting,
-                writing=writing,
+                writing=store.only_job is None,
             )
             self._pool = workers.pool
             self._casting = workers.casting

@@ -6,6 +6,7 @@ import json
 import secrets
 import shutil
 import tempfile
+import time
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -79,6 +80,8 @@ class RunStore:
         run uses the earlier location of its parts.
     resume
         Whether to continue an existing run; otherwise there must be none.
+    warnings
+        Warnings about the scenario, which precede the notes of the run.
 
     Raises
     ------
@@ -96,7 +99,9 @@ class RunStore:
         parts_location: str | Path | Storage | None = None,
         *,
         resume: bool = False,
+        warnings: Sequence[str] = (),
     ) -> None:
+        self.opened_at = time.monotonic()
         if parts_location is not None and location is None:
             raise LidarError(
                 "`parts` requires `folder`, because the database in that folder lists the parts."
@@ -104,6 +109,7 @@ class RunStore:
         self.jobs = jobs
         self._requested_backend = backend
         self.lasting = location is not None
+        self.warnings = (*warnings,)
         self.notes: list[str] = []  # remarks for the user
         self.begun = False  # True if it continues an earlier run
         self._removed = False
@@ -449,6 +455,13 @@ class RunStore:
         self.db.save_frames(stored.committed for stored in self.in_flight.values())
         if self._remote:
             self._remote.save(self.db, force=force)
+
+    def keep(self, made_of: Mapping[str, Any] | None, notes: Sequence[str]) -> None:
+        """Close the store, whose points stay, and store notes and `made_of` with them if given."""
+        if made_of is not None:
+            self.db.set(made_of=json.dumps(made_of), notes=json.dumps(notes))
+            self.save(force=True)
+        self.db.close()
 
     def tidy(self) -> None:
         """Remove parts that are in no job in flight, of dead or superseded collectors."""

@@ -1,0 +1,90 @@
+"""What a run reports while it casts: committed parts and frames, at the pace of the scanner."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from .pipeline.stage_messages import Receipt, ScanFrame
+from .run_page import RunPage
+
+
+class Listener:
+    """Passes committed parts and frames of a survey to the page and to the caller of a run.
+
+    The methods are called in the thread of the run.
+
+    Parameters
+    ----------
+    page
+        Page of the run.
+    on_frame
+        Function that is called with each frame, in scan order.
+    on_parts
+        Function that is called with committed parts; it must return at once.
+    pace
+        Speed of the frames relative to the scanner, or None to pass frames on at once. The page
+        gets the points of a frame not before the frame.
+    """
+
+    def __init__(
+        self,
+        page: RunPage,
+        on_frame: Callable[[ScanFrame], object] | None = None,
+        on_parts: Callable[[Sequence[Receipt]], object] | None = None,
+        pace: float | None = None,
+    ) -> None:
+        self.page = page
+        self._on_frame = on_frame
+        self._on_parts = on_parts
+        self._pacer = None if pace is None else Pacer(pace)
+        self._unshown: list[Receipt] = []  # parts whose frames wait for their time
+
+    def frame(self, frame: ScanFrame) -> None:
+        """Pass a frame on when it is due."""
+        if self._pacer is not None:
+            self._pacer.wait(frame.time_ns)
+            self._show_parts(frame.scan + 1)
+        self.page.on_frame(frame)
+        if self._on_frame is not None:
+            self._on_frame(frame)
+
+    def parts(self, receipts: Sequence[Receipt]) -> None:
+        """Pass committed parts on."""
+        if self._pacer is None:
+            self.page.on_parts(receipts)
+        else:
+            self._unshown += receipts
+        if self._on_parts is not None:
+            self._on_parts(receipts)
+
+    def _show_parts(self, stop: int) -> None:
+        """Show the parts up to a scan, whose frames are due."""
+        due = sorted((part for part in self._unshown if part.first < stop), key=lambda p: p.first)
+        if due:
+            self._unshown = [part for part in self._unshown if part.first >= stop]
+            self.page.on_parts(due)
+
+
+class Pacer:
+    """Waits until frames are due, at a speed relative to the scanner.
+
+    The first frame is due at once. A frame that comes late is due at once, and later frames do not
+    catch up: the display is never faster than the scanner.
+    """
+
+    def __init__(self, speed: float) -> None:
+        self._ns_per_s = speed * 1e9
+        self._last: tuple[float, float] | None = None  # time of the survey, ns; when it was due, s
+
+    def wait(self, time_ns: float) -> None:
+        """Wait until a frame is due, whose scan began at `time_ns` since the survey's start."""
+        now_s = time.monotonic()
+        if self._last is not None:
+            last_ns, last_s = self._last
+            # Scans of a second sensor follow all scans of the first, and begin anew.
+            due_s = last_s + max(time_ns - last_ns, 0.0) / self._ns_per_s
+            if due_s > now_s:
+                time.sleep(due_s - now_s)
+                now_s = due_s
+        self._last = time_ns, now_s
