@@ -23,6 +23,7 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from ..base import timeline
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
+from ..plan import Planning, Trial
 from ..scenario.build import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
@@ -112,24 +113,100 @@ class RunLoop:
         self.stages: tuple[StageTotals, ...] = ()
         self.replayed = 0  # batches that were cast or sent more than once
 
-    # -- jobs come and go --------------------------------------------------------------------
+    def run(self, first: Job, show: Show) -> None:
+        """Cast, write and plan all jobs.
+
+        On any error, all tasks have been stopped.
+
+        `first` is the first job, and `show` is called with the progress.
+        """
+        cluster = self._cluster
+        pipeline = self._pipeline
+        try:
+            with cluster.partitions_page(), cluster.stopping(self._stop):
+                pipeline.open()
+                self._loop(first, show)
+                pipeline.finish()
+        finally:
+            if self._writer is not None:
+                self._writer.close()
+            self._remover.shutdown()
+        self._save()
+        self._store.save(force=True)
+        self._store.tidy()
+        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
+        books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
+        self.stages = tuple(totals for book in books for totals in book.stages.values())
+        self._store.notes += pipeline.notes
+        self.replayed = pipeline.dispatcher.replayed
+        # The report of a survey has the number of repeated batches.
+        if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
+            self._store.notes.append(
+                f"{plural(len(lost), 'worker')} died, left or stopped responding "
+                f"({listed(lost)}). Batches that were cast or sent again: {self.replayed:,}"
+            )
+        if self._writer is not None and self._writer.hidden:
+            storage = self._writer.dataset.storage
+            note = (
+                f"no worker of partition {LIDAR} can access {storage}, so the driver wrote the "
+                "data set"
+            )
+            self._store.notes.append(note)
+
+    def _loop(self, first: Job, show: Show) -> None:
+        """Step jobs and planning until all have finished, and show progress meanwhile.
+
+        Once the last job has ended, the stages of the pipeline are closed, and the loop waits for
+        their end.
+        """
+        pipeline = self._pipeline
+        started = time.monotonic()
+        pause_s = 0.0
+        self._begin(first)  # and its trials
+        timeline.mark(timeline.FIRST_BATCH)
+        # Detects partitions without workers. The stages on LIDAR last as long as the run: workers
+        # that take no more tasks are good enough there.
+        watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
+        shown_at = saved_at = float("-inf")
+        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
+        while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
+            moved = self._step_jobs(started, watch)
+            moved |= self._step_planning(started, watch)
+            now_s = time.monotonic()
+            if now_s - saved_at >= SAVE_EVERY_S:
+                saved_at = now_s
+                self._save()
+            watch.look()
+            if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
+                shown_at = now_s
+                self._show_progress(show, now_s - started)
+            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
+            if pipeline.stages.ended:
+                time.sleep(pause_s)
+            else:
+                pipeline.wait(
+                    pause_s, [future.key for tasks in tasks_beside for future in tasks.running]
+                )
+        self._store.notes += watch.notes
 
     @property
-    def finished(self) -> bool:
+    def _finished(self) -> bool:
         """True once all jobs have ended."""
         if self._maker is None:
             return self._only_committed
         return self._maker.ended and not self._store.in_flight
 
-    def step(self) -> bool:
-        """Begin jobs, step pipeline and writer once, and commit ended jobs.
+    def _step_jobs(self, started: float, watch: Watch) -> bool:
+        """Begin, cast, write and commit jobs, until all have ended.
 
-        Returns True after changes.
-
-        LidarError if a failure concerns all jobs.
+        `started` is the time when the loop started, by the monotonic clock, seconds. Returns True
+        if anything moved. LidarError if a failure concerns all jobs.
         """
+        pipeline = self._pipeline
+        if pipeline.stages.closed:
+            return False
         moved = self._admit()
-        news = self._pipeline.step(self._scans_to_come)
+        news = pipeline.step(self._scans_to_come)
         moved |= news.moved
         if self._writer is None and news.parts:
             self._listener.parts(news.parts)
@@ -147,7 +224,95 @@ class RunLoop:
         self._commit()
         if error_of_all is not None:
             raise error_of_all
+        if pipeline.progress:
+            timeline.mark(timeline.FIRST_RECEIPT)
+        if self._finished:
+            pipeline.close()
+            self.times["survey"] = time.monotonic() - started
+            timeline.mark(timeline.LAST_RECEIPT)
+            watch.forget([GPU, LIDAR])
         return moved
+
+    def _step_planning(self, started: float, watch: Watch) -> bool:
+        """Step the trials until all have finished, and return True if anything moved."""
+        if self._trials is None or "planning" in self.times:
+            return False
+        moved = self._trials.step()
+        if self._trials.finished:
+            self.times["planning"] = time.monotonic() - started
+            timeline.mark(timeline.PLANNED)
+            watch.forget([OTHER])
+        return moved
+
+    def _save(self) -> None:
+        """Store finished trials, and the number of frames handed out, in the run's database."""
+        if self._trials is not None and (only_job := self._store.only_job) is not None:
+            new_trials = self._trials.trials[len(only_job.trials) :]
+            self._store.db.add_trials(only_job.committed, new_trials)
+        self._store.save()
+
+    def _show_progress(self, show: Show, seconds: float) -> None:
+        """Show the counts of the run and its time so far, at the terminal and on the page."""
+        waits_for = LIDAR if self._pipeline.stages.waiting else ""
+        progress = replace(self._progress(), seconds=seconds, waits_for=waits_for)
+        self._cluster.call(show, progress)
+        self._cluster.call(self._page.on_progress, progress, self._states)
+
+    def _progress(self) -> Progress:
+        """Return the counts of the run."""
+        if (stored := self._store.only_job) is None:
+            job_count = len(self._store.jobs.numbers)
+            return Progress(jobs=job_count, jobs_done=self._store.db.ended_count)
+        casting = self._jobs[stored.job.number]
+        trials = stored.trials if self._trials is None else self._trials.trials
+        return replace(
+            stored.progress(),
+            generated=casting.generated - stored.scans.start,
+            cast=min(stored.resumed + casting.cast, len(stored.scans)),
+            replayed=self._pipeline.dispatcher.replayed,
+            trials_done=len(trials),
+        )
+
+    def _states(self) -> list[dict[str, Any]]:
+        """Return the states of the jobs that are being cast, then of the jobs being written.
+
+        `RunPage.on_progress` describes the fields of a state.
+        """
+        writing = {row.number for row in self._writer.jobs} if self._writer else set()
+        pairs = [(self._store.in_flight[number], job) for number, job in self._jobs.items()]
+        states = [
+            {
+                "name": stored.job.name,
+                "values": stored.job.values,
+                "stored": stored.parts.scans_done,
+                "scans": len(stored.scans),
+                "points": stored.parts.point_count,
+                "seconds": casting.seconds,
+                "writing": casting.number in writing,
+            }
+            for stored, casting in pairs
+        ]
+        return sorted(states, key=itemgetter("writing"))
+
+    def _stop(self, reason: str) -> None:
+        """Stop all tasks because of an error, as far as the cluster can be reached.
+
+        `reason` is the error in words, which the stages get.
+        """
+        client = self._cluster.client
+        pipeline = self._pipeline
+        trials = self._trials
+        steps: list[Callable[[], object]] = [lambda: pipeline.stop(reason), pipeline.finish]
+        if trials is not None:
+            steps.append(trials.tasks.cancel)
+        for step in steps:
+            # Dask would try for half a minute to reach a cluster that is gone.
+            if client.status != "running":
+                return
+            with suppress(Exception):  # report the first error
+                step()
+
+    # -- jobs come and go --------------------------------------------------------------------
 
     def _hand_out(self, job: PipelineJob, summaries: Summaries) -> None:
         """Call the user's function with each new frame of a job, in scan order."""
@@ -195,29 +360,34 @@ class RunLoop:
         return moved
 
     def _begin(self, job: Job) -> None:
-        """Begin a job, unless its scans are too large for the workers."""
+        """Add a job to the pipeline, and begin its planning.
+
+        The job fails if its scans are too large for the workers, or it cannot be pickled.
+        """
         stored = self._store.open_job(job)
         try:
             if self._writer is not None:  # the only job of a run was checked at the start
                 self._cluster.check(job)
-            self._add_to_pipeline(stored)
-        except JobError as error:  # too large for the workers, or it cannot be pickled
+            elif job.planning is not None:
+                self._begin_planning(job.planning, stored.trials)
+            self._cast(stored)
+        except JobError as error:
             self._fail(job.number, error)
 
-    def _add_to_pipeline(self, stored: StoredJob) -> None:
-        """Add a job to the pipeline, begin its planning, and estimate the scans to come."""
-        cluster = self._cluster
+    def _begin_planning(self, planning: Planning, earlier_trials: Sequence[Trial]) -> None:
+        self._trials = TrialPump(self._cluster.tasks(OTHER), planning, earlier_trials)
+        self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
+        # End the request for slots that was made before there were tasks: from now on, waiting
+        # trials let an adaptive partition grow.
+        self._trials.tasks.partition.want(0)
+
+    def _cast(self, stored: StoredJob) -> None:
+        """Add a job to the pipeline, and estimate the scans to come."""
         job = stored.job
-        if self._writer is None and job.planning is not None:
-            self._trials = TrialPump(cluster.tasks(OTHER), job.planning, stored.trials)
-            self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
-            # End the request for slots that was made before there were tasks: from now on, waiting
-            # trials let an adaptive partition grow.
-            self._trials.tasks.partition.want(0)
         # Many jobs follow in a campaign, so that batches need not be divided among all slots.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
-        limit = cluster.options.batch_mb * MB
-        on_device = cluster.backend == "cuda"
+        limit = self._cluster.options.batch_mb * MB
+        on_device = self._cluster.backend == "cuda"
         self._jobs[job.number] = self._pipeline.begin(
             stored.committed,
             job.scene,
@@ -289,181 +459,3 @@ class RunLoop:
                     self._page.look(row, job)
             with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in job.parts.ordered])
-
-    def in_flight(self) -> list[dict[str, Any]]:
-        """Return the states of the jobs that are being cast, then of the jobs being written.
-
-        `RunPage.on_progress` describes the fields of a state.
-        """
-        writing = {row.number for row in self._writer.jobs} if self._writer else set()
-        states = []
-        for number, casting in self._jobs.items():
-            stored = self._store.in_flight[number]
-            states.append(
-                {
-                    "name": stored.job.name,
-                    "values": stored.job.values,
-                    "stored": stored.parts.scans_done,
-                    "scans": len(stored.scans),
-                    "points": stored.parts.point_count,
-                    "seconds": casting.seconds,
-                    "writing": number in writing,
-                }
-            )
-        return sorted(states, key=itemgetter("writing"))
-
-    # -- to the end --------------------------------------------------------------------------
-
-    def run(self, first: Job, show: Show) -> None:
-        """Cast, write and plan all jobs.
-
-        On any error, all tasks have been stopped.
-
-        `first` is the first job, and `show` is called with the progress.
-        """
-        cluster = self._cluster
-        pipeline = self._pipeline
-        try:
-            with cluster.partitions_page(), cluster.stopping(self._stop):
-                pipeline.open()
-                self._loop(first, show)
-                pipeline.finish()
-        finally:
-            if self._writer is not None:
-                self._writer.close()
-            self._remover.shutdown()
-        self._save()
-        self._store.save(force=True)
-        self._store.tidy()
-        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
-        books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
-        self.stages = tuple(totals for book in books for totals in book.stages.values())
-        self._store.notes += pipeline.notes
-        self.replayed = pipeline.dispatcher.replayed
-        # The report of a survey has the number of repeated batches.
-        if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
-            self._store.notes.append(
-                f"{plural(len(lost), 'worker')} died, left or stopped responding "
-                f"({listed(lost)}). Batches that were cast or sent again: {self.replayed:,}"
-            )
-        if self._writer is not None and self._writer.hidden:
-            storage = self._writer.dataset.storage
-            note = (
-                f"no worker of partition {LIDAR} can access {storage}, so the driver wrote the "
-                "data set"
-            )
-            self._store.notes.append(note)
-
-    def _loop(self, first: Job, show: Show) -> None:
-        """Step pipeline, writer and planning until all have finished, and show progress meanwhile.
-
-        `step` steps the first two until the last job has ended; then the stages of the pipeline are
-        closed, and the loop waits for their end.
-        """
-        pipeline = self._pipeline
-        started = time.monotonic()
-        pause_s = 0.0
-        self._begin(first)  # and its trials
-        timeline.mark(timeline.FIRST_BATCH)
-        # Detects partitions without workers. The stages on LIDAR last as long as the run: workers
-        # that take no more tasks are good enough there.
-        watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
-        shown_at = saved_at = float("-inf")
-        tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
-        while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
-            moved = self._step_survey(started, watch)
-            moved |= self._step_planning(started, watch)
-            now_s = time.monotonic()
-            if now_s - saved_at >= SAVE_EVERY_S:
-                saved_at = now_s
-                self._save()
-            watch.look()
-            if now_s - shown_at >= PROGRESS_EVERY_S or self.finished:
-                shown_at = now_s
-                self._show_progress(show, now_s - started)
-            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            if pipeline.stages.ended:
-                time.sleep(pause_s)
-            else:
-                pipeline.wait(
-                    pause_s, [future.key for tasks in tasks_beside for future in tasks.running]
-                )
-        self._store.notes += watch.notes
-
-    def _step_survey(self, started: float, watch: Watch) -> bool:
-        """Step pipeline and writer until all jobs have ended, and return True if anything moved.
-
-        `started` is the time when the loop started, by the monotonic clock, seconds.
-        """
-        pipeline = self._pipeline
-        if pipeline.stages.closed:
-            return False
-        moved = self.step()
-        if pipeline.progress:
-            timeline.mark(timeline.FIRST_RECEIPT)
-        if self.finished:
-            pipeline.close()
-            self.times["survey"] = time.monotonic() - started
-            timeline.mark(timeline.LAST_RECEIPT)
-            watch.forget([GPU, LIDAR])
-        return moved
-
-    def _step_planning(self, started: float, watch: Watch) -> bool:
-        """Step the trials until all have finished, and return True if anything moved."""
-        if self._trials is None or "planning" in self.times:
-            return False
-        moved = self._trials.step()
-        if self._trials.finished:
-            self.times["planning"] = time.monotonic() - started
-            timeline.mark(timeline.PLANNED)
-            watch.forget([OTHER])
-        return moved
-
-    def _show_progress(self, show: Show, seconds: float) -> None:
-        """Show the counts of the run and its time so far, at the terminal and on the page."""
-        waits_for = LIDAR if self._pipeline.stages.waiting else ""
-        progress = replace(self._progress(), seconds=seconds, waits_for=waits_for)
-        self._cluster.call(show, progress)
-        self._cluster.call(self._page.on_progress, progress, self.in_flight)
-
-    def _save(self) -> None:
-        """Store finished trials, and the number of frames handed out, in the run's database."""
-        if self._trials is not None and (only_job := self._store.only_job) is not None:
-            new_trials = self._trials.trials[len(only_job.trials) :]
-            self._store.db.add_trials(only_job.committed, new_trials)
-        self._store.save()
-
-    def _progress(self) -> Progress:
-        """Return the counts of the run, without its time."""
-        if (stored := self._store.only_job) is None:
-            numbers = self._store.jobs.numbers
-            ended = self._store.db.ended_count
-            return Progress(jobs=len(numbers), jobs_done=ended)
-        casting = self._jobs[stored.job.number]
-        progress = replace(
-            stored.progress(),
-            generated=casting.generated - stored.scans.start,
-            cast=min(stored.resumed + casting.cast, len(stored.scans)),
-            replayed=self._pipeline.dispatcher.replayed,
-        )
-        if self._trials is None:
-            return progress
-        return replace(progress, trials_done=len(self._trials.trials))
-
-    def _stop(self, reason: str) -> None:
-        """Stop all tasks because of an error, as far as the cluster can be reached.
-
-        `reason` is the error in words, which the stages get.
-        """
-        client = self._cluster.client
-        pipeline = self._pipeline
-        trials = self._trials
-        steps: list[Callable[[], object]] = [lambda: pipeline.stop(reason), pipeline.finish]
-        if trials is not None:
-            steps.append(trials.tasks.cancel)
-        for step in steps:
-            # Dask would try for half a minute to reach a cluster that is gone.
-            if client.status != "running":
-                return
-            with suppress(Exception):  # report the first error
-                step()
