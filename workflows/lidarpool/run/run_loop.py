@@ -114,11 +114,9 @@ class RunLoop:
         self.replayed = 0  # batches that were cast or sent more than once
 
     def run(self, first: Job, show: Show) -> None:
-        """Cast, write and plan all jobs.
+        """Cast, write and plan `first` and all other jobs, and call `show` with the progress.
 
         On any error, all tasks have been stopped.
-
-        `first` is the first job, and `show` is called with the progress.
         """
         cluster = self._cluster
         pipeline = self._pipeline
@@ -191,7 +189,6 @@ class RunLoop:
 
     @property
     def _finished(self) -> bool:
-        """True once all jobs have ended."""
         if self._maker is None:
             return self._only_committed
         return self._maker.ended and not self._store.in_flight
@@ -259,7 +256,6 @@ class RunLoop:
         self._cluster.call(self._page.on_progress, progress, self._states)
 
     def _progress(self) -> Progress:
-        """Return the counts of the run."""
         if (stored := self._store.only_job) is None:
             job_count = len(self._store.jobs.numbers)
             return Progress(jobs=job_count, jobs_done=self._store.db.ended_count)
@@ -295,10 +291,7 @@ class RunLoop:
         return sorted(states, key=itemgetter("writing"))
 
     def _stop(self, reason: str) -> None:
-        """Stop all tasks because of an error, as far as the cluster can be reached.
-
-        `reason` is the error in words, which the stages get.
-        """
+        """Stop all tasks because of an error, as far as the cluster can be reached."""
         client = self._cluster.client
         pipeline = self._pipeline
         trials = self._trials
@@ -382,7 +375,6 @@ class RunLoop:
         self._trials.tasks.partition.want(0)
 
     def _cast(self, stored: StoredJob) -> None:
-        """Add a job to the pipeline, and estimate the scans to come."""
         job = stored.job
         # Many jobs follow in a campaign, so that batches need not be divided among all slots.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count

@@ -282,10 +282,7 @@ class _Casting:
         return True
 
     def _fetch(self, orders: Sequence[CollectOrder]) -> bool:
-        """Fetch the columns of casting tasks from their workers.
-
-        Returns True if any columns were ordered.
-        """
+        """Fetch the columns of casting tasks, and return True if any columns were ordered."""
         for order in orders:
             results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
@@ -303,16 +300,12 @@ class _Casting:
         return bool(orders)
 
     def _end(self, streamed: _StreamedSweeps) -> None:
-        """Stop casting a job."""
         del self._jobs[streamed.job.number]
         self._dispatcher.drop(streamed.casting)
         self._casting.remove(streamed.job.number)
 
     def _warn_if_empty(self, streamed: _StreamedSweeps) -> None:
-        """Warn of the first job without points.
-
-        This process casts rays to find the reason.
-        """
+        """Warn of the first job without points, and cast rays here to find the reason."""
         if streamed.points_read or self._warned:
             return
         self._warned = True

@@ -176,7 +176,6 @@ class CastingWorkers:
 
     @property
     def _casting(self) -> set[str]:
-        """Addresses of workers that may cast."""
         return {a for a, worker in self._workers.items() if worker.slots}
 
     @property
@@ -201,9 +200,7 @@ class CastingWorkers:
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Register a job.
-
-        Returns its pickled survey, and a name that jobs of its scene share.
+        """Register a job, and return its pickled survey and a name that jobs of its scene share.
 
         JobError if the job cannot be pickled.
         """
@@ -226,8 +223,7 @@ class CastingWorkers:
     def remove(self, job: int) -> None:
         """Stop casting a job.
 
-        With the next task of another job, the workers drop the rig of this job, and old unused
-        scenes.
+        Workers drop its rig, and old unused scenes, with the next task of another job.
         """
         if (payloads := self._jobs.pop(job, None)) is None:
             return
@@ -248,9 +244,7 @@ class CastingWorkers:
     # -- casting ---------------------------------------------------------------------------
 
     def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Submit batches, each with its job, to a worker as a task.
-
-        Returns the key of the task.
+        """Submit batches, each with its job, to a worker as a task, and return the key of the task.
 
         The jobs must share a scene.
         """
@@ -309,10 +303,7 @@ class CastingWorkers:
         return Outcome.PENDING
 
     def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
-        """Note that a worker has lost its GPU.
-
-        Raises LidarError if that happens again and again.
-        """
+        """Refuse a worker that has lost its GPU. LidarError if this happens again and again."""
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
@@ -437,7 +428,6 @@ class CastingWorkers:
         self._died.clear()
 
     def _remove(self, address: str) -> None:
-        """Remove a worker that has gone."""
         check = self._workers.pop(address).check
         for payload in self._payloads:
             payload.record_loss(address)
@@ -459,10 +449,7 @@ def _is_here(address: str) -> bool:
 
 
 def share(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns `value` for other tasks.
-
-    Dask repeats it if a worker dies.
-    """
+    """Submit a task that returns `value` for other tasks, again if a worker dies."""
     with warnings.catch_warnings():
         # A large value makes a large graph, which is the only way to have it recomputed.
         warnings.filterwarnings("ignore", message="Sending large graph")

@@ -39,10 +39,7 @@ class CommittedParts:
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
-        """Return the part of a committed scan.
-
-        Raises KeyError if the scan is not committed.
-        """
+        """Return the part of a committed scan, or raise KeyError for other scans."""
         for part in self.ordered[self._index(scan) :][:1]:
             if scan in part.scans:
                 return part

@@ -68,7 +68,6 @@ class Dispatcher:
         return [batch for batch in self.batches.values() if batch.state in states]
 
     def _batches_of(self, job: PipelineJob) -> list[Batch]:
-        """Return the uncommitted batches of a job."""
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _batches_within(self, receipt: Receipt) -> list[Batch]:
@@ -222,7 +221,6 @@ class Dispatcher:
             self._blame(batch, INTERSECT, batch.worker)
 
     def _remove(self, batch: Batch) -> None:
-        """Remove a batch that is committed, divided or condemned."""
         self._forget_task(batch)
         del self.batches[batch.job.number, batch.first]
 
@@ -246,10 +244,7 @@ class Dispatcher:
     # -- poison batches ----------------------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batch, and divide or condemn the batch.
-
-        `policies.kills_alone` is the rule.
-        """
+        """Count the death of a worker against its batch, and divide or condemn the batch."""
         batch.deaths[stage] += 1
         kills = policies.kills_alone(batch, stage)
         if stage == INTERSECT and not batch.job.cast and kills > 0:

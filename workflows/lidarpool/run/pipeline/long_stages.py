@@ -50,8 +50,6 @@ Order = Description | CollectOrder | Summaries  # order to a stage
 
 @dataclass(eq=False)
 class _StageTask:
-    """Current task of a stage."""
-
     future: Future
     worker: str  # address of the only worker that may run the task
     inlet: Pipe  # pipe that the driver fills
@@ -125,10 +123,7 @@ class LongStages:
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
-        """Create the pipes and the probe file.
-
-        The caller must call `finish` afterwards.
-        """
+        """Create the pipes and the probe file. `finish` must be called afterwards."""
         with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
@@ -197,10 +192,7 @@ class LongStages:
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start all stages, each on a free slot.
-
-        With too few slots, the next `look` retries.
-        """
+        """Start all stages, each on a free slot. With too few slots, the next call retries."""
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
         with suppress(RuntimeError):  # another run has just removed it (`_forget_lock`)
@@ -336,10 +328,7 @@ class LongStages:
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """Count a death of a stage's worker.
-
-        Raises LidarError when the stage keeps dying.
-        """
+        """Count a death of a stage's worker. LidarError if the stage keeps dying."""
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > MAX_DEATHS:

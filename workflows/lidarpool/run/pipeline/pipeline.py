@@ -177,10 +177,7 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages.
-
-        The caller must call `stop` on failure, and `finish` always.
-        """
+        """Start the stages. The caller must call `stop` on failure, and `finish` always."""
         self.stages.open()
         self._look(scans_to_come=0)
 
@@ -260,10 +257,7 @@ class Pipeline:
             self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs in flight, and sort and record the new parts.
-
-        Jobs that are complete with these parts end.
-        """
+        """Commit the receipts of jobs in flight, and sort, record and report the new parts."""
         stored = [
             (self.jobs[receipt.job].committed, receipt)
             for receipt in receipts
@@ -320,10 +314,7 @@ class Pipeline:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on.
-
-        `_look` repeats lost orders.
-        """
+        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on."""
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
@@ -386,10 +377,7 @@ class Pipeline:
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """End all stages at once.
-
-        `finish` must follow.
-        """
+        """End all stages at once. `finish` must follow."""
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)

@@ -133,10 +133,7 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points spread over each scan, (scans, samples, 3), meters.
-
-    Missing points are NaN.
-    """
+    """Return sample points of each scan in meters, (scans, samples, 3), with NaN if missing."""
     sample_count = samples_of_scan(returns.survey.scan_count)
     starts = np.cumsum(returns.counts) - returns.counts
     steps = np.arange(sample_count) / max(sample_count - 1, 1)
@@ -249,10 +246,7 @@ def drop_all(run: str) -> None:
 
 
 def _unpickled(data: Packed) -> Any:
-    """Return a value of the run's own driver.
-
-    Raises MemoryUnseen if its memory is not on this machine.
-    """
+    """Return a value of the run's own driver, or raise MemoryUnseen if it is out of reach."""
     if isinstance(data, SharedHandle):
         try:
             return data.load()

@@ -330,7 +330,6 @@ class RunDatabase:
         self._sql.close()
 
     def _delete(self, numbers: Iterable[int]) -> None:
-        """Delete committed results of jobs."""
         parameters = [(number,) for number in numbers if number in self.begun]
         for table in _JOB_TABLES:
             self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", parameters)
@@ -412,10 +411,7 @@ def parts_folder(mark: str) -> str:
 
 
 def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Return mark and location of parts from a database's values.
-
-    Raises ValueError if invalid.
-    """
+    """Return mark and location of parts from a database's values. ValueError if invalid."""
     mark = meta["mark"]
     location = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):

@@ -207,10 +207,7 @@ class RunStore:
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
-        """Remove an earlier run without committed results.
-
-        Raises LidarError for a damaged database.
-        """
+        """Remove an earlier run without committed results. LidarError for a damaged database."""
         if earlier.damage is not None:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
@@ -281,10 +278,7 @@ class RunStore:
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Return how the run of a database differs, as a clause with a period.
-
-        The text is empty if the runs are the same.
-        """
+        """Return how the run of a database differs, in words with a period, or no text."""
         earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
@@ -524,10 +518,7 @@ def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -
 
 
 def _hash_of(job: Job) -> str:
-    """Return the hash of a job's inputs, or no text if an input has no fingerprint.
-
-    A job without a hash is not resumed.
-    """
+    """Return the hash of a job's inputs, or no text if it has none, and is not resumed."""
     try:
         return fingerprint(identity_of(job))
     except LidarError:
@@ -535,10 +526,7 @@ def _hash_of(job: Job) -> str:
 
 
 def _database_path(folder: Storage) -> Path:
-    """Return the path of the database in a local folder.
-
-    Raises LidarError if the file is a link.
-    """
+    """Return the path of the database in a local folder. LidarError if the file is a link."""
     folder.local(f"{FILE}-journal")  # SQLite would follow a link here, too
     return folder.local(FILE)
 
