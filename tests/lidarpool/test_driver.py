@@ -70,7 +70,7 @@ class Workers:
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
         return TaskLocations(frozenset(self.slots), frozenset(self.silent), free)
 
-    def look(self):
+    def refresh(self):
         return self.seen
 
     def add(self, job, scene, survey):
@@ -80,7 +80,7 @@ class Workers:
     def remove(self, job):
         del self.jobs[job]
 
-    def want(self, slots):
+    def request_slots(self, slots):
         self.wanted.append(slots)
 
     def submit(self, batches, worker):
@@ -139,7 +139,8 @@ class Stages:
         self.collectors = {"collect-0": "tcp://a:2", "collect-1": "tcp://c:2"}
         self.orders = {name: deque() for name in self.collectors}  # what collectors have to do
         self.unsorted = []
-        self.inbox = []
+        self.inbox = []  # messages for the driver
+        self.ranges = []  # of stage 1, which the driver takes when it has room
         self.advice = 5  # scans in a batch
         self.seconds = 0.1  # that a batch takes to cast
         self.held = {}  # {name: part that is not in storage}
@@ -156,7 +157,7 @@ class Stages:
     def open(self):
         self._storage.prepare()
 
-    def look(self, progress):
+    def refresh(self, progress):
         changes = self.changes
         self.changes = ({}, [])
         if "generate" in changes[1]:
@@ -169,6 +170,10 @@ class Stages:
     def wait(self, seconds, keys, *, scans, linger_s=0.0):
         self.wanted = scans
         self.linger_s = linger_s
+        messages = [*self.inbox, *(self.ranges if scans else ())]
+        self.inbox = []
+        self.ranges = [] if scans else self.ranges
+        return messages
 
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
@@ -196,10 +201,10 @@ class Stages:
 
     def generate(self):
         """Describe some scans of the first survey that is left."""
-        if self.wanted and self.described:
+        if self.described and len(self.ranges) < 20:
             one = self.described.popleft()
             stop = min(one.stop, one.first + self.advice)
-            self.inbox.append(ScanRange(one.job, one.first, stop))
+            self.ranges.append(ScanRange(one.job, one.first, stop))
             if stop < one.stop:
                 self.described.appendleft(replace(one, first=stop))
 
@@ -274,6 +279,7 @@ class Run:
         return self.begun[number]
 
     def step(self):
+        self.driver.wait(0.0)
         news = self.driver.step()
         for part in news.parts:
             self.committed[part.job].append(part)
@@ -284,7 +290,6 @@ class Run:
                     self.frames[job.number].append((scan, count))
                     job.committed.advance_frames(scan + 1)
         self.ended |= {job.number: error for job, error in news.ended}
-        self.driver.wait(0.0)
 
     def until(self, condition, *, idle=""):
         """Let everybody work, but for those who are idle, until something is so."""

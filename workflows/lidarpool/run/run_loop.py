@@ -41,7 +41,7 @@ from .planning_trials import TrialPump
 from .progress import Progress, Show
 from .store.run_store import RunStore
 from .store.stored_job import StoredJob
-from .writer import JobFiles, JobWriter
+from .writer import DataSetWriter, WriteRequest
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
@@ -97,9 +97,9 @@ class RunLoop:
         gpus = cluster.partitions[GPU]
         workers = CastingWorkers(gpus, run_id, cluster.backend, cluster.software)
         self._pipeline = Pipeline(workers, stages, store.db, mark)
-        self._writer: JobWriter | None = None
+        self._writer: DataSetWriter | None = None
         if dataset is not None:
-            self._writer = JobWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
+            self._writer = DataSetWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
         self._trials: TrialPump | None = None
         # Rows of the job table for jobs that have ended, and are not yet in the run's database.
         self._rows: list[JobRow] = []
@@ -215,7 +215,7 @@ class RunLoop:
             elif self._writer is None:
                 self._only_committed = True
             else:
-                self._writer.add(self._files_of(job))
+                self._writer.add(self._write_request(job))
         error_of_all = self._write()
         moved |= bool(self._rows)
         self._commit()
@@ -392,7 +392,7 @@ class RunLoop:
         to_come = max(0, jobs_left - len(self._store.in_flight))
         self._scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
-    def _files_of(self, casting: PipelineJob) -> JobFiles:
+    def _write_request(self, casting: PipelineJob) -> WriteRequest:
         """Return the input of the writer for a job whose scans are all committed."""
         stored = self._store.in_flight[casting.number]
         job = stored.job
@@ -408,7 +408,7 @@ class RunLoop:
             # The casting times of an earlier run are not stored.
             seconds=None if stored.resumed else casting.seconds,
         )
-        return JobFiles(row, stored.points(), job.sweeps, job.made_of)
+        return WriteRequest(row, stored.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
         """Record the row of a failed job, or raise the error if the run is a survey's."""

@@ -138,7 +138,7 @@ class _StreamedSweeps:
     sweeps_begun: int = 0  # sweeps that the dispatcher has or had
     points_read: int = 0
 
-    def take(self, number: int) -> Sweep | None:
+    def pop(self, number: int) -> Sweep | None:
         """Remove and return a sweep, or None if scans of the sweep are not yet cast."""
         job = self.job
         survey = job.survey
@@ -199,7 +199,7 @@ class _Casting:
         while not (self._maker.ended and self._next is None and not self._in_flight):
             moved = self._step()
             streamed, number = self._in_flight[0] if self._in_flight else (None, 0)
-            if streamed is not None and (sweep := streamed.take(number)) is not None:
+            if streamed is not None and (sweep := streamed.pop(number)) is not None:
                 self._in_flight.popleft()
                 if number + 1 == len(streamed.job.sweeps):
                     self._end(streamed)
@@ -222,10 +222,10 @@ class _Casting:
         """Step the dispatcher once, and return True if there were changes."""
         moved = self._begin_sweeps()
         moved |= self._dispatcher.check()
-        if (locations := self._casting.look()) is not None:
+        if (locations := self._casting.refresh()) is not None:
             scan_count = sum(map(len, self._dispatcher.batches.values()))
-            self._casting.want(self._dispatcher.slots_wanted(scan_count))
-            self._dispatcher.leave_workers(locations)
+            self._casting.request_slots(self._dispatcher.slots_wanted(scan_count))
+            self._dispatcher.reclaim_lost(locations)
         for job, error in [*self._dispatcher.failed.items()]:
             failed = self._jobs[job.number]
             self._end(failed)
@@ -245,7 +245,9 @@ class _Casting:
             if (streamed := self._next) is not None:  # else the job has failed
                 number = streamed.sweeps_begun
                 sweeps = streamed.job.sweeps
-                self._dispatcher.take(streamed.casting, *sweeps.scans[number : number + 2].tolist())
+                self._dispatcher.add_scans(
+                    streamed.casting, *sweeps.scans[number : number + 2].tolist()
+                )
                 self._in_flight.append((streamed, number))
                 streamed.sweeps_begun += 1
                 if streamed.sweeps_begun == len(sweeps):

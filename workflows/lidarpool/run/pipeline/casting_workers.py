@@ -31,7 +31,7 @@ from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, inter
 from .stage_messages import BatchRange
 from .stage_names import INTERSECT
 
-LOOK_EVERY_S = 1.0
+REFRESH_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
 LOST_DEVICES = 3  # processes that may lose their GPU in a run, and the last ends it
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -128,7 +128,7 @@ class CastingWorkers:
     batch. The first tasks of a job on a worker bring the plan and scene of the worker's rig.
 
     Each task is bound to one worker. Dask lets such a task wait for ever when the worker is gone,
-    so `look` checks every second which workers exist. In return, Dask never fails a task for the
+    so `refresh` checks every second which workers exist. In return, Dask never fails a task for the
     deaths of its neighbors, and the driver knows which batches a dead worker had.
 
     `run` is the run's id; `software` is the software that workers must have (`base.software`).
@@ -151,7 +151,7 @@ class CastingWorkers:
         self._name_count = 0  # names and keys so far
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
         self._died: list[str] = []  # workers that died while they were checked, in a row
-        self._looked_at = float("-inf")
+        self._refreshed_at = float("-inf")
         self.locations = TaskLocations()
         self._requested_slots = -1  # number that the scheduler knows
         self._adapts = True  # False once the partition is known not to adapt to requests
@@ -332,16 +332,16 @@ class CastingWorkers:
 
     # -- checking workers --------------------------------------------------------------------
 
-    def look(self) -> TaskLocations | None:
+    def refresh(self) -> TaskLocations | None:
         """Handle workers that have joined or left, or take no tasks, if the last check is old.
 
         Returns the locations of workers and casting tasks, or None if the last check is recent.
         LidarError if no worker may cast, or several in a row die while they are checked.
         """
-        if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
+        if time.monotonic() - self._refreshed_at <= REFRESH_EVERY_S:
             self._check()
             return None
-        self._looked_at = time.monotonic()
+        self._refreshed_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.locations = look_for_tasks(self._client, self._partition.name, keys)
         for address in self._workers.keys() - self.locations.members - self._refused:
@@ -375,9 +375,9 @@ class CastingWorkers:
         for key, software in answers.items():
             address = addresses[key]
             if address in identities:  # else it has left
-                self._take(address, software, identities[address])
+                self._accept(address, software, identities[address])
 
-    def want(self, slots: int) -> None:
+    def request_slots(self, slots: int) -> None:
         """Request a number of slots of an adaptive partition, or 0 when all work is done.
 
         The driver binds each batch to a worker, so that no batch waits for workers to come.
@@ -397,7 +397,7 @@ class CastingWorkers:
         for address in self._casting:
             del self._workers[address]
         if self._client.status == "running":
-            self.want(0)
+            self.request_slots(0)
         if addresses and self._client.status == "running":
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
@@ -409,7 +409,9 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
+    def _accept(
+        self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]
+    ) -> None:
         """Record a worker that has answered the software check, and refuse different software."""
         worker = self._workers[address]
         worker.check = None

@@ -131,7 +131,7 @@ class Dispatcher:
 
     # -- casting ---------------------------------------------------------------------------
 
-    def take(self, job: PipelineJob, first: int, stop: int) -> None:
+    def add_scans(self, job: PipelineJob, first: int, stop: int) -> None:
         """Make batches of the uncommitted scans in a range that stage 1 has sent."""
         first = max(first, job.generated)  # a restarted generator repeats scans
         if first < stop:
@@ -198,7 +198,7 @@ class Dispatcher:
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
         return moved
 
-    def leave_workers(self, locations: TaskLocations) -> None:
+    def reclaim_lost(self, locations: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent or late, or take no tasks."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
@@ -354,7 +354,7 @@ class Dispatcher:
                 waiting.move(BatchState.COLLECTING)
         self._learn(records)
 
-    def leave_collectors(self, died: Mapping[str, str], started: Collection[str]) -> None:
+    def reclaim_uncollected(self, died: Mapping[str, str], started: Collection[str]) -> None:
         """Take back the batches of collectors, to be collected by another collector.
 
         `died` are the collectors whose workers died, {name: address of the worker}; `started` are

@@ -92,6 +92,7 @@ class Pipeline:
         self.progress = 0  # number of scans that were committed, plus scans that were sorted
         # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
         self._announced: dict[int, int] = {}
+        self._messages: list[Message] = []  # received since the last step
         self._news = PipelineNews()  # since the last step
 
     # -- jobs --------------------------------------------------------------------------------
@@ -179,7 +180,7 @@ class Pipeline:
     def open(self) -> None:
         """Start the stages. The caller must call `stop` on failure, and `finish` always."""
         self.stages.open()
-        self._look(scans_to_come=0)
+        self._refresh(scans_to_come=0)
 
     def step(self, scans_to_come: int = 0) -> PipelineNews:
         """Process messages, workers and batches once, and return what has changed.
@@ -188,14 +189,14 @@ class Pipeline:
 
         LidarError if a failure concerns all jobs.
         """
-        messages = self.stages.inbox
-        self.stages.inbox = []
+        messages = self._messages
+        self._messages = []
         moved = bool(messages)
         self._commit([message for message in messages if isinstance(message, Receipt)])
         for message in messages:
-            self._take(message)
+            self._handle(message)
         moved |= self.dispatcher.check()
-        self._look(scans_to_come)
+        self._refresh(scans_to_come)
         for job, error in [*self.dispatcher.failed.items()]:
             self._end(job, error)
         orders = self.dispatcher.assign(self.stages.collectors)
@@ -215,7 +216,7 @@ class Pipeline:
         `keys` are keys of Dask tasks. The next `step` takes the messages.
         """
         if self.stages.closed:
-            self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
+            self._messages += self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
             seconds = max(seconds, WAIT_S)
             keys = [*self.workers.pending, *keys]
@@ -224,9 +225,11 @@ class Pipeline:
             burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
             many_in_flight = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
             linger_s = LINGER_S * min(burst, MAX_LINGERS if many_in_flight else 1)
-            self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
+            self._messages += self.stages.wait(
+                seconds, keys, scans=self._wants_scans, linger_s=linger_s
+            )
 
-    def _take(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         """Handle a message of a stage, except for receipts (`_commit`)."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
@@ -237,7 +240,7 @@ class Pipeline:
                 if message.stop == self._announced.get(message.job):
                     del self._announced[message.job]
                 if job is not None and not job.condemned:
-                    self.dispatcher.take(job, message.first, message.stop)
+                    self.dispatcher.add_scans(job, message.first, message.stop)
             case Failed():
                 if message.stage == GENERATE:
                     self._announced.pop(message.job, None)
@@ -290,23 +293,23 @@ class Pipeline:
         self.dispatcher.recast_part(receipt)
         return False
 
-    # -- looking after workers and stages ------------------------------------------------------
+    # -- workers and stages ------------------------------------------------------------------
 
-    def _look(self, scans_to_come: int) -> None:
+    def _refresh(self, scans_to_come: int) -> None:
         """Handle workers and stages that have joined, died or are silent, if the last check is old.
 
         LidarError if a stage has failed, or workers or slots are missing for too long.
         """
-        if (locations := self.workers.look()) is not None:
+        if (locations := self.workers.refresh()) is not None:
             missing = sum(job.committed.missing_count for job in self.jobs.values())
             scan_count = scans_to_come + missing
-            self.workers.want(self.dispatcher.slots_wanted(scan_count))
-            self.dispatcher.leave_workers(locations)
+            self.workers.request_slots(self.dispatcher.slots_wanted(scan_count))
+            self.dispatcher.reclaim_lost(locations)
             since = time.monotonic() - STALL_S
             self._sort_again(job for job in self.jobs.values() if job.sorted_at < since)
-        died, started = self.stages.look(self.progress)
+        died, started = self.stages.refresh(self.progress)
         if died or started:
-            self.dispatcher.leave_collectors(died, started)
+            self.dispatcher.reclaim_uncollected(died, started)
         if GENERATE in started:  # a new stage 1 has no orders
             self._announced.clear()
             self._describe(self.jobs.values())
@@ -342,7 +345,7 @@ class Pipeline:
     def _sort(self, job: PipelineJob, receipts: Sequence[Receipt]) -> None:
         """Send the summaries of committed parts to the sorter, for jobs with frames.
 
-        `_look` sends all again when the sorter starts.
+        `_refresh` sends all again when the sorter starts.
         """
         if receipts and job.committed.has_frames:
             messages = [
@@ -373,7 +376,7 @@ class Pipeline:
 
     def close(self) -> None:
         """End the stages, once everything is committed."""
-        self.workers.want(0)  # the partition may shrink
+        self.workers.request_slots(0)  # the partition may shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
