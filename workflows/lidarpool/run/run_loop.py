@@ -17,7 +17,7 @@ from operator import itemgetter
 from typing import Any
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.words import listed, plural, rounded
+from lidarsim.base.words import listed, plural
 from lidarsim.simulator.memory import MB, scans_that_fit
 
 from ..base import timeline
@@ -417,27 +417,12 @@ class RunLoop:
         self._rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self) -> None:
-        """Commit the rows of ended jobs in the run's database, and remove the jobs' parts.
-
-        The names, models and rates of their sensors are stored for the card of the data set.
-        """
+        """Commit the rows of ended jobs in the run's database, and remove the jobs' parts."""
         rows = self._rows
         self._rows = []
         if not rows:
             return
-        in_flight = self._store.in_flight  # jobs that could not be made are not in it
-        ended = [(row, in_flight[row.number]) for row in rows if row.number in in_flight]
-        self._store.name_sensors(
-            (
-                carried.name or "lidar",
-                f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz",
-            )
-            for row, stored in ended
-            if row.done
-            for carried in stored.job.survey.carried
-            for sensor in [carried.sensor]
-        )
-        self._store.end(rows)
+        ended = self._store.end(rows)  # without jobs that could not be made
         for row in rows:
             self._jobs.pop(row.number, None)
             self._page.ended(row)

@@ -226,7 +226,7 @@ class LongStages:
             )
         for name in self._names:
             self._submit(name, free)
-        # Another run may count slots once the lock is free: the scheduler must know the tasks by then.
+        # Another run may start once the lock is free: the scheduler must know the tasks by then.
         while len(self._locate().tasks) < slot_count and time.monotonic() < now_s + SETTLE_S:
             time.sleep(0.005)
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
+from lidarsim.base.words import rounded
+from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 
 from ...base.field_words import differences
@@ -407,12 +409,26 @@ class RunStore:
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
-    def end(self, rows: Sequence[JobRow]) -> None:
-        """Commit that jobs have ended."""
+    def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
+        """Commit that jobs have ended, and return those that were in flight with their rows.
+
+        The models and rates of their sensors are stored for the card of the data set.
+        """
+        ended = [(row, self.in_flight[row.number]) for row in rows if row.number in self.in_flight]
+        named = (
+            (mounted.name or "lidar", _kind_in_words(mounted.sensor))
+            for row, stored in ended
+            if row.done
+            for mounted in stored.job.survey.carried
+        )
+        sensors = with_sensors(self.sensors, named)
+        if sensors != self.sensors:
+            self.db.set(sensors=json.dumps(sensors))
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
         for row in rows:
             self.in_flight.pop(row.number, None)
             self._identified.discard(row.number)
+        return ended
 
     def forget(self, numbers: Iterable[int]) -> None:
         """Reset jobs that have ended, so that they are cast again."""
@@ -426,12 +442,6 @@ class RunStore:
             self.db.set(**meta)
         self.end([row for row in rows if not self.db.ended(row.number)])
         self.resumed = self.db.ended_count
-
-    def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
-        """Store names of sensors with model and rate, for the card of the data set."""
-        updated = with_sensors(self.sensors, sensors)
-        if updated != self.sensors:
-            self.db.set(sensors=json.dumps(updated))
 
     # -- the end -----------------------------------------------------------------------------
 
@@ -515,6 +525,10 @@ def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -
         suffix = [_AND_OTHERS] * (_AND_OTHERS in kinds or len(names) > MAX_SENSOR_KINDS)
         merged[name] = "; ".join([*names[:MAX_SENSOR_KINDS], *suffix])
     return dict(sorted(merged.items()))
+
+
+def _kind_in_words(sensor: Sensor) -> str:
+    return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
 
 def _hash_of(job: Job) -> str:

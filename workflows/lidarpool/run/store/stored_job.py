@@ -20,6 +20,7 @@ from ...plan import Trial
 from ...scenario.build import Job
 from ..pipeline.committed_results import CommittedParts, CommittedResults
 from ..pipeline.stage_messages import (
+    SAMPLES_PER_SURVEY,
     Receipt,
     ScanFrame,
     Summaries,
@@ -28,8 +29,6 @@ from ..pipeline.stage_messages import (
 )
 from ..progress import Progress
 from .database import RunDatabase
-
-SAMPLE_RAYS = 400  # rays in pictures of a survey, about
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +188,7 @@ class StoredJob:
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
         dtype = summary_type(samples)
-        step = max(1, samples * survey.scan_count // SAMPLE_RAYS)
+        step = max(1, samples * survey.scan_count // SAMPLES_PER_SURVEY)
         rays = [np.empty((0, 2, 3), np.float32)]
         sampled_scans = range(0, survey.scan_count, step)
         chosen = {scan for scan in sampled_scans if not self.parts.missing(scan, scan + 1)}
