@@ -33,6 +33,7 @@ from lidarpool import (
 from lidarpool.report.growing_cloud import GrowingCloud
 from lidarpool.run.cluster.cluster import ClusterConnection
 from lidarpool.run.listener import Listener
+from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.run_result import RunResult
 from lidarpool.run.runner import cast, open_store
 
@@ -224,6 +225,6 @@ def disturbed(
         seconds=time.monotonic() - started,
         replayed=0 if result is None else result.replayed,
         grown=ply is not None,
-        misplaced=0 if result is None else sum(record.misplaced for record in result.records),
+        misplaced=0 if result is None else len(placement_violations(result.records)),
         error=error,
     )

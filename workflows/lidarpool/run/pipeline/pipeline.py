@@ -1,4 +1,4 @@
-"""The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
+"""The pipeline: it offers batches of all jobs, commits their parts and sorts their frames.
 
 The driver and four stages exchange messages (`stage_messages.py`):
 
@@ -11,6 +11,7 @@ The driver and four stages exchange messages (`stage_messages.py`):
 A summary of a scan has its numbers of hits and points, and the ends of a few sample rays.
 
 Everything happens in `step`, called repeatedly from one thread; no call in `step` waits for long.
+A step calls nobody back: it returns the new parts, the next frames and the jobs that have ended.
 There is one rule of recovery: uncommitted batches are offered again, and frames that were not
 handed out are sorted again, whatever was lost. Messages that arrive twice do no harm: a second
 receipt of a scan is ignored, and its part is the same file with the same bytes. The number of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -72,3 +72,8 @@ def recorded(
     recorder = Recorder(stage, partition)
     result = function(*args, **kwargs)
     return result, recorder.finish()
+
+
+def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:
+    """Select the records of tasks that ran outside their partition."""
+    return [record for record in records if record.misplaced]
