@@ -43,83 +43,6 @@ CHECKING = "Checking the casting workers"
 PREPARING = "Preparing the scene on the casting workers"
 
 
-class _Payload:
-    """A value that casting tasks bring to workers without a copy.
-
-    A small value is sent with each task. A large value lies in memory of this process, which
-    workers of this machine map; other workers get a future of its bytes.
-    """
-
-    def __init__(self, name: str, make: Callable[[], object], partition: Partition) -> None:
-        self.name = name  # name on the workers
-        self.future: Future | None = None  # None until a worker needs it
-        self.recipients: set[str] = set()  # addresses of workers that it was sent to
-        self._make = make  # returns the value, again if the future is lost
-        self._partition = partition
-        self._holders: set[str] = set()  # addresses of workers that have received it
-        self._blind: set[str] = set()  # addresses of workers that do not see `_shared`
-        self._futures = 0  # so far
-        self._small: Pickled | None = None
-        self._shared: SharedValue | None = None
-        pickled = Pickled.from_value(make())
-        if pickled.nbytes <= INLINE_BYTES:
-            self._small = pickled.copy()
-        else:
-            with suppress(OSError):  # this system has no shared memory, or too little
-                self._shared = SharedValue(pickled)
-
-    def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that brings the value to a worker, or None if it has a copy."""
-        if worker in self._holders:
-            return None
-        self.recipients.add(worker)
-        if self._small is not None:
-            return self._small
-        if self._shared is not None and worker not in self._blind and _is_here(worker):
-            return self._shared.handle
-        if self.future is None or self.future.status in ("lost", "cancelled", "error"):
-            self._futures += 1
-            self.future = share(
-                self._partition,
-                Pickled.from_value(self._make()).copy(),
-                key=f"{self.name}-packed-{self._futures}",
-                priority=10,
-            )
-        return self.future
-
-    def record_copy(self, worker: str) -> None:
-        """Record that a worker has a copy."""
-        self._holders.add(worker)
-
-    def record_loss(self, worker: str, *, unseen: bool = False) -> None:
-        """Record that a worker has no copy, and perhaps does not see the shared memory."""
-        self._holders.discard(worker)
-        if unseen:
-            self._blind.add(worker)
-
-    def release(self) -> None:
-        """Release the memory now: the traceback of an error may keep this object for a while."""
-        if self._shared is not None:
-            self._shared.close()
-        if self.future is not None:
-            self.future.release()
-
-
-@dataclass(eq=False)
-class _Worker:
-    """A worker that the run knows, by its address: it is checked, and then casts or is refused.
-
-    A refused worker has different software or has lost its GPU, and gets no tasks of this run. A
-    worker that leaves is forgotten, unless it was refused.
-    """
-
-    # The task that asks for its software. Its answer is not kept on the worker: a worker with a
-    # result cannot be returned to the queue.
-    check: Future | None
-    slots: int = 0  # casting tasks at a time; 0 while it is checked, or if it is refused
-    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
-
-
 class CastingWorkers:
     """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
 
@@ -161,7 +84,10 @@ class CastingWorkers:
     @property
     def slots(self) -> dict[str, int]:
         """Workers that were checked and take tasks, {address: tasks at a time}."""
-        return {a: self._workers[a].slots for a in self._casting if a in self.locations.free}
+        free = self.locations.free
+        return {
+            a: worker.slots for a, worker in self._workers.items() if worker.slots and a in free
+        }
 
     @property
     def slot_count(self) -> int:
@@ -443,6 +369,83 @@ class CastingWorkers:
                 f"{len(self._died)} casting workers in a row died while they were checked"
                 f"{memory_clause(self._client, self._died)}. See their logs."
             )
+
+
+class _Payload:
+    """A value that casting tasks bring to workers without a copy.
+
+    A small value is sent with each task. A large value lies in memory of this process, which
+    workers of this machine map; other workers get a future of its bytes.
+    """
+
+    def __init__(self, name: str, make: Callable[[], object], partition: Partition) -> None:
+        self.name = name  # name on the workers
+        self.future: Future | None = None  # None until a worker needs it
+        self.recipients: set[str] = set()  # addresses of workers that it was sent to
+        self._make = make  # returns the value, again if the future is lost
+        self._partition = partition
+        self._holders: set[str] = set()  # addresses of workers that have received it
+        self._blind: set[str] = set()  # addresses of workers that do not see `_shared`
+        self._futures = 0  # so far
+        self._small: Pickled | None = None
+        self._shared: SharedValue | None = None
+        pickled = Pickled.from_value(make())
+        if pickled.nbytes <= INLINE_BYTES:
+            self._small = pickled.copy()
+        else:
+            with suppress(OSError):  # this system has no shared memory, or too little
+                self._shared = SharedValue(pickled)
+
+    def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
+        """Return the argument that brings the value to a worker, or None if it has a copy."""
+        if worker in self._holders:
+            return None
+        self.recipients.add(worker)
+        if self._small is not None:
+            return self._small
+        if self._shared is not None and worker not in self._blind and _is_here(worker):
+            return self._shared.handle
+        if self.future is None or self.future.status in ("lost", "cancelled", "error"):
+            self._futures += 1
+            self.future = share(
+                self._partition,
+                Pickled.from_value(self._make()).copy(),
+                key=f"{self.name}-packed-{self._futures}",
+                priority=10,
+            )
+        return self.future
+
+    def record_copy(self, worker: str) -> None:
+        """Record that a worker has a copy."""
+        self._holders.add(worker)
+
+    def record_loss(self, worker: str, *, unseen: bool = False) -> None:
+        """Record that a worker has no copy, and perhaps does not see the shared memory."""
+        self._holders.discard(worker)
+        if unseen:
+            self._blind.add(worker)
+
+    def release(self) -> None:
+        """Release the memory now: the traceback of an error may keep this object for a while."""
+        if self._shared is not None:
+            self._shared.close()
+        if self.future is not None:
+            self.future.release()
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A worker that the run knows, by its address: it is checked, and then casts or is refused.
+
+    A refused worker has different software or has lost its GPU, and gets no tasks of this run. A
+    worker that leaves is forgotten, unless it was refused.
+    """
+
+    # The task that asks for its software. Its answer is not kept on the worker: a worker with a
+    # result cannot be returned to the queue.
+    check: Future | None
+    slots: int = 0  # casting tasks at a time; 0 while it is checked, or if it is refused
+    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
 
 
 def _is_here(address: str) -> bool:
