@@ -279,7 +279,7 @@ class Run:
         return self.begun[number]
 
     def step(self):
-        self.driver.wait(0.0)
+        self.driver.wait()
         news = self.driver.step()
         for part in news.parts:
             self.committed[part.job].append(part)
@@ -367,11 +367,11 @@ def clock(monkeypatch):
 def test_the_driver_waits_for_more_news_only_while_much_is_under_way(empty):
     for number in range(10):
         empty.begin(number, TINY)
-    empty.driver.wait(0.0)
+    empty.driver.wait()
     alone = empty.stages.linger_s
     dispatcher = empty.driver.dispatcher
     empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.max_weight, idle="cast")
-    empty.driver.wait(0.0)
+    empty.driver.wait()
     assert alone == driver.LINGER_S < empty.stages.linger_s <= 10 * driver.LINGER_S
     empty.end()
 

@@ -45,7 +45,7 @@ from .writer import DataSetWriter, WriteRequest
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
-LONGEST_PAUSE_S = 0.05  # while nothing moves
+PLANNING_PAUSE_S = 0.02  # between looks at trials, once all jobs have ended
 EXTRA_JOBS = 64  # jobs in flight, at most, in addition to two for each GPU slot
 
 
@@ -159,7 +159,6 @@ class RunLoop:
         """
         pipeline = self._pipeline
         started = time.monotonic()
-        pause_s = 0.0
         self._begin(first)  # and its trials
         timeline.mark(timeline.FIRST_BATCH)
         # Detects partitions without workers. The stages on LIDAR last as long as the run: workers
@@ -168,8 +167,8 @@ class RunLoop:
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
-            moved = self._step_jobs(started, watch)
-            moved |= self._step_planning(started, watch)
+            self._step_jobs(started, watch)
+            self._step_planning(started, watch)
             now_s = time.monotonic()
             if now_s - saved_at >= SAVE_EVERY_S:
                 saved_at = now_s
@@ -178,13 +177,10 @@ class RunLoop:
             if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
                 shown_at = now_s
                 self._show_progress(show, now_s - started)
-            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
             if pipeline.stages.ended:
-                time.sleep(pause_s)
+                time.sleep(PLANNING_PAUSE_S)
             else:
-                pipeline.wait(
-                    pause_s, [future.key for tasks in tasks_beside for future in tasks.running]
-                )
+                pipeline.wait(future.key for tasks in tasks_beside for future in tasks.running)
         self._store.notes += watch.notes
 
     @property
@@ -193,18 +189,17 @@ class RunLoop:
             return self._only_committed
         return self._maker.ended and not self._store.in_flight
 
-    def _step_jobs(self, started: float, watch: Watch) -> bool:
+    def _step_jobs(self, started: float, watch: Watch) -> None:
         """Begin, cast, write and commit jobs, until all have ended.
 
-        `started` is the time when the loop started, by the monotonic clock, seconds. Returns True
-        if anything moved. LidarError if a failure concerns all jobs.
+        `started` is the time when the loop started, by the monotonic clock, seconds. LidarError if
+        a failure concerns all jobs.
         """
         pipeline = self._pipeline
         if pipeline.stages.closed:
-            return False
-        moved = self._admit()
+            return
+        self._admit()
         news = pipeline.step(self._scans_to_come)
-        moved |= news.moved
         if self._writer is None and news.parts:
             self._listener.parts(news.parts)
         for job, summaries in news.frames:
@@ -217,7 +212,6 @@ class RunLoop:
             else:
                 self._writer.add(self._write_request(job))
         error_of_all = self._write()
-        moved |= bool(self._rows)
         self._commit()
         if error_of_all is not None:
             raise error_of_all
@@ -228,18 +222,16 @@ class RunLoop:
             self.times["survey"] = time.monotonic() - started
             timeline.mark(timeline.LAST_RECEIPT)
             watch.forget([GPU, LIDAR])
-        return moved
 
-    def _step_planning(self, started: float, watch: Watch) -> bool:
-        """Step the trials until all have finished, and return True if anything moved."""
+    def _step_planning(self, started: float, watch: Watch) -> None:
+        """Step the trials until all have finished."""
         if self._trials is None or "planning" in self.times:
-            return False
-        moved = self._trials.step()
+            return
+        self._trials.step()
         if self._trials.finished:
             self.times["planning"] = time.monotonic() - started
             timeline.mark(timeline.PLANNED)
             watch.forget([OTHER])
-        return moved
 
     def _save(self) -> None:
         """Store finished trials, and the number of frames handed out, in the run's database."""
@@ -333,24 +325,21 @@ class RunLoop:
                 self._rows.append(outcome)
         return error_of_all
 
-    def _admit(self) -> bool:
-        """Begin jobs that are ready, if there is room, and return True if any was begun."""
-        moved = False
+    def _admit(self) -> None:
+        """Begin jobs that are ready, if there is room."""
         max_in_flight = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, as many as have batches in one task, and go on together: then
         # they share messages and tasks.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
         if self._maker is None or not self._maker.has(together):
-            return False
+            return
         while self._pipeline.has_room and len(self._store.in_flight) < max_in_flight:
             if (entry := self._maker.take()) is None:
                 break
-            moved = True
             if isinstance(entry, JobRow):
                 self._rows.append(entry)
             else:
                 self._begin(entry)
-        return moved
 
     def _begin(self, job: Job) -> None:
         """Add a job to the pipeline, and begin its planning.

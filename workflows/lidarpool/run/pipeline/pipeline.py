@@ -44,7 +44,7 @@ STALL_S = 60.0  # time without frames of the sorter, after which it gets its sum
 WAIT_S = 0.05  # wait for news while the driver is idle
 LINGER_S = 0.004  # wait for more news after the first, for each job or batch of a task
 MAX_LINGERS = 25  # jobs or batches that are counted for that wait
-CLOSING_S = 0.001  # longest wait while the stages end
+CLOSING_S = 0.001  # wait for news while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have ahead at least, whatever their size
 
 
@@ -69,7 +69,6 @@ class PipelineNews:
     frames: list[tuple[PipelineJob, Summaries]] = field(default_factory=list)
     # Jobs that have ended, each with its error or None.
     ended: list[tuple[PipelineJob, JobError | None]] = field(default_factory=list)
-    moved: bool = False  # True if anything has changed
 
 
 class Pipeline:
@@ -192,43 +191,38 @@ class Pipeline:
         """
         messages = self._messages
         self._messages = []
-        moved = bool(messages)
         self._commit([message for message in messages if isinstance(message, Receipt)])
         for message in messages:
             self._handle(message)
-        moved |= self.dispatcher.check()
+        self.dispatcher.check()
         self._refresh(scans_to_come)
         for job, error in [*self.dispatcher.failed.items()]:
             self._end(job, error)
-        orders = self.dispatcher.assign(self.stages.collectors)
-        for name, collect_orders in orders.items():
-            self.stages.send(name, collect_orders)
-        moved |= bool(orders)
-        moved |= self.dispatcher.offer()
+        for name, orders in self.dispatcher.assign(self.stages.collectors).items():
+            self.stages.send(name, orders)
+        self.dispatcher.offer()
         news = self._news
         self._news = PipelineNews()
-        news.moved = moved or bool(news.ended)
         return news
 
-    def wait(self, seconds: float, keys: Iterable[str] = ()) -> None:
-        """Wait for messages, or the end of a casting task or a task of `keys`.
+    def wait(self, keys: Iterable[str] = ()) -> None:
+        """Wait a moment for messages, or the end of a casting task or a Dask task of `keys`.
 
-        The wait lasts `seconds` at most, or `WAIT_S` if that is longer; after `close`, `CLOSING_S`.
-        `keys` are keys of Dask tasks. The next `step` takes the messages.
+        The next `step` takes the messages.
         """
         if self.stages.closed:
-            self._messages += self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
-        else:
-            seconds = max(seconds, WAIT_S)
-            keys = [*self.workers.pending, *keys]
-            # Small jobs and batches come in dozens, and while there are many, nobody waits for a
-            # single one. Each step costs a millisecond or two, however few messages came.
-            burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
-            many_in_flight = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
-            linger_s = LINGER_S * min(burst, MAX_LINGERS if many_in_flight else 1)
-            self._messages += self.stages.wait(
-                seconds, keys, scans=self._wants_scans, linger_s=linger_s
-            )
+            self._messages += self.stages.wait(CLOSING_S, [], scans=False)
+            return
+        # Small jobs and batches come in dozens, and while there are many, nobody waits for a single
+        # one. Each step costs a millisecond or two, however few messages came.
+        burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
+        many_in_flight = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
+        self._messages += self.stages.wait(
+            WAIT_S,
+            [*self.workers.pending, *keys],
+            scans=self._wants_scans,
+            linger_s=LINGER_S * min(burst, MAX_LINGERS if many_in_flight else 1),
+        )
 
     def _handle(self, message: Message) -> None:
         """Handle a message of a stage, except for receipts (`_commit`)."""
