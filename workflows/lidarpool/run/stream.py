@@ -54,7 +54,7 @@ from .pipeline.stage_messages import CollectOrder, ColumnsLost, Receipt
 from .pipeline.stage_names import GPU
 from .progress import Screen
 
-LONGEST_PAUSE_S = 0.02  # while nothing moves
+PAUSE_S = 0.005  # while the next sweep is being cast
 _READER = "reader"  # the stream, as the only collector of the dispatcher
 
 logger = logging.getLogger(__name__)
@@ -195,19 +195,17 @@ class _Casting:
 
     def sweeps(self) -> Generator[Sweep]:
         """Yield the sweeps in order."""
-        pause_s = 0.0
         while not (self._maker.ended and self._next is None and not self._in_flight):
-            moved = self._step()
+            self._step()
             streamed, number = self._in_flight[0] if self._in_flight else (None, 0)
-            if streamed is not None and (sweep := streamed.pop(number)) is not None:
-                self._in_flight.popleft()
-                if number + 1 == len(streamed.job.sweeps):
-                    self._end(streamed)
-                    self._warn_if_empty(streamed)
-                moved = True
-                yield sweep
-            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            time.sleep(pause_s)
+            if streamed is None or (sweep := streamed.pop(number)) is None:
+                time.sleep(PAUSE_S)
+                continue
+            self._in_flight.popleft()
+            if number + 1 == len(streamed.job.sweeps):
+                self._end(streamed)
+                self._warn_if_empty(streamed)
+            yield sweep
 
     def close(self) -> None:
         """Stop casting, and release the workers."""
@@ -218,10 +216,10 @@ class _Casting:
             self._client.cancel(self._casting.futures)
             self._casting.release()
 
-    def _step(self) -> bool:
-        """Step the dispatcher once, and return True if there were changes."""
-        moved = self._begin_sweeps()
-        moved |= self._dispatcher.check()
+    def _step(self) -> None:
+        """Begin, cast and fetch sweeps, as far as possible without waiting."""
+        self._begin_sweeps()
+        self._dispatcher.check()
         if (locations := self._casting.refresh()) is not None:
             scan_count = sum(map(len, self._dispatcher.batches.values()))
             self._casting.request_slots(self._dispatcher.slots_wanted(scan_count))
@@ -233,14 +231,12 @@ class _Casting:
             self._next = None if self._next is failed else self._next
             self._warn_of_failure(failed.job.name, error)
         orders = self._dispatcher.assign({_READER: ""})
-        moved |= self._fetch(orders.get(_READER, ()))
-        moved |= self._dispatcher.offer()
+        self._fetch(orders.get(_READER, ()))
+        self._dispatcher.offer()
         self._watch.look()
-        return moved
 
-    def _begin_sweeps(self) -> bool:
-        """Begin further sweeps, at most `ahead` of the reader, and return True if any was begun."""
-        begun_before = len(self._in_flight)
+    def _begin_sweeps(self) -> None:
+        """Begin further sweeps, at most `ahead` of the reader."""
         while len(self._in_flight) < self._stream.ahead and (self._next or self._begin_job()):
             if (streamed := self._next) is not None:  # else the job has failed
                 number = streamed.sweeps_begun
@@ -252,7 +248,6 @@ class _Casting:
                 streamed.sweeps_begun += 1
                 if streamed.sweeps_begun == len(sweeps):
                     self._next = None
-        return len(self._in_flight) > begun_before
 
     def _begin_job(self) -> bool:
         """Take the next job, which may fail, and return False if no job is ready."""
@@ -283,8 +278,8 @@ class _Casting:
         self._jobs[job.number] = self._next
         return True
 
-    def _fetch(self, orders: Sequence[CollectOrder]) -> bool:
-        """Fetch the columns of casting tasks, and return True if any columns were ordered."""
+    def _fetch(self, orders: Sequence[CollectOrder]) -> None:
+        """Fetch the columns of casting tasks from their workers."""
         for order in orders:
             results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
@@ -299,7 +294,6 @@ class _Casting:
                 receipt = Receipt.from_part(batch.part, job, name, 0, batch.record)
                 receipts.append((streamed.casting, receipt))
             self._dispatcher.release(receipts)
-        return bool(orders)
 
     def _end(self, streamed: _StreamedSweeps) -> None:
         del self._jobs[streamed.job.number]

@@ -145,13 +145,13 @@ class Dispatcher:
                 self.batches[job.number, start] = Batch(job, start, batch_stop, number, number)
                 self._batch_count += 1
 
-    def offer(self) -> bool:
-        """Offer waiting batches to workers that have room, and return True if any was offered."""
+    def offer(self) -> None:
+        """Offer waiting batches to workers that have room."""
         waiting = sorted(
             self.in_states(BatchState.WAITING), key=lambda batch: (batch.order, batch.first)
         )
         if not waiting:
-            return False
+            return
         batches = [
             *waiting,
             *self.in_states(BatchState.CASTING, BatchState.CAST, BatchState.COLLECTING),
@@ -167,17 +167,15 @@ class Dispatcher:
                 batch.collector = ""
                 batch.move(BatchState.CASTING)
                 batch.job.trace("submit", INTERSECT, batch.scans)
-        return bool(chosen)
 
-    def check(self) -> bool:
-        """Update the batches of casting tasks that have ended, and return True if there are any.
+    def check(self) -> None:
+        """Update the batches of casting tasks that have ended.
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
         casting has failed, and the task had batches of several jobs, they are offered again, too,
         each in a task with batches of one job only (`Outcome.SEPARATE_JOBS`). With batches of a
         single job, the job fails.
         """
-        moved = False
         for key, task_batches in [*self._tasks.items()]:
             if task_batches[0].state is not BatchState.CASTING:
                 continue
@@ -189,14 +187,12 @@ class Dispatcher:
             if outcome is Outcome.PENDING:
                 continue
             for batch in [*task_batches]:
-                moved = True
                 if outcome is Outcome.DONE:
                     batch.move(BatchState.CAST)
                     batch.job.cast += len(batch)
                 else:
                     self._offer_again(batch, outcome.value)
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
-        return moved
 
     def reclaim_lost(self, locations: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent or late, or take no tasks."""
