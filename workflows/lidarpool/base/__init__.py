@@ -1,1 +1,1 @@
-"""Errors, interrupts and words for all rooms."""
+"""Helpers that all packages of lidarpool use, such as fingerprints, shards and the timeline."""

@@ -1,7 +1,8 @@
-"""Fields of content in words: which fields of two runs differ, where fingerprints tell only that.
+"""Readable descriptions of field values, which show how the settings of two runs differ.
 
-The words are stored with a run, {path of a field: its value}. A long list is its length and a mark
-of its content. Every value counts, except in longer lists: a thousand entries of a list count.
+Fingerprints only show that two runs differ. A run therefore also stores a dictionary that maps the
+path of each field to its value as text. Long lists are represented by their length and a short
+fingerprint. The fingerprint of a list with more than about 1,000 entries covers only a sample.
 """
 
 from __future__ import annotations
@@ -17,22 +18,24 @@ from lidarsim.base.errors import LidarError
 from .fingerprint import fingerprint
 
 _PLAIN = (bool, int, float, str)
-_MAX_ENTRIES = 8  # entries of a list or mapping whose entries are separate fields
-_MAX_NUMBERS = 16  # numbers of a list that is written out
-_MAX_LOOKED_AT = 1000  # entries of a longer list
-_MAX_LETTERS = 80
-_MARK = " #"  # before the mark of content that words do not show
+_MAX_ENTRIES = 8  # longest nested list whose entries are described as separate fields
+_MAX_NUMBERS = 16  # longest list of plain values that is written in full
+_MAX_LOOKED_AT = 1000  # number of entries that are sampled from a longer list
+_MAX_LETTERS = 80  # longest text that is written in full
+_MARK = " #"  # separates a description from the fingerprint of its content
 
 
 def fields_in_words(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the value in words of each field in a value that is not None.
+    """Yield the path and a readable description of each field in a value.
+
+    Fields that are None are skipped.
 
     Parameters
     ----------
     value
         A dataclass, mapping, list, array, number or text.
     path
-        Path of the value itself: noise.
+        Path of the value itself, for example ``noise``.
 
     Examples
     --------
@@ -63,7 +66,7 @@ def fields_in_words(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _text(value: Any) -> str:
-    """Return a plain value as in a scenario."""
+    """Return a plain value as it is written in a scenario file."""
     if isinstance(value, bool):
         return str(value).lower()
     text = f"{value:.12g}" if isinstance(value, float) else str(value)
@@ -71,18 +74,29 @@ def _text(value: Any) -> str:
 
 
 def _marked(value: Any) -> str:
-    """Return the length of a value, and a mark of its content."""
+    """Describe a value by its length or type, followed by a short fingerprint of its content."""
     size = f"{len(value):,} entries" if hasattr(value, "__len__") else type(value).__name__
     if isinstance(value, Sequence):
         value = value[:: 1 + len(value) // _MAX_LOOKED_AT]
     try:
         return f"{size}{_MARK}{fingerprint(value)[:8]}"
-    except LidarError:  # an object of the user without a fingerprint
+    except LidarError:  # an object from user code that has no fingerprint
         return size
 
 
 def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: int = 4) -> str:
-    """Return the fields that differ, with both values, or an empty string if none is known.
+    """Describe the fields that changed between two descriptions of a run.
+
+    Parameters
+    ----------
+    earlier, now
+        Descriptions by field path, as returned by `fields_in_words`.
+    max_fields
+        Number of changed fields to describe. Further changes are only counted.
+
+    Returns
+    -------
+    Clauses separated by semicolons, or an empty string if no described field changed.
 
     Examples
     --------
@@ -99,7 +113,7 @@ def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: 
 
 
 def _change(name: str, earlier_text: str | None, text: str | None) -> str:
-    """Return a clause on the change of a field, which is None where it is not set."""
+    """Return a clause that describes the change of a field. A text is None if it is not set."""
     earlier_value = earlier_text and earlier_text.partition(_MARK)[0]
     value = text and text.partition(_MARK)[0]
     if earlier_value is None:

@@ -1,8 +1,8 @@
-"""Fingerprints of content: values with the same fingerprint give the same result.
+"""Content fingerprints, which are equal only for values that lead to the same result.
 
-A fingerprint depends on class and fields, and for classes and functions outside the package also on
-their code, so that a subclass with another method has another fingerprint. Fields that do not
-compare (`dataclasses.field(compare=False)`) are not part of it.
+The fingerprint of an object depends on its class and its fields. Classes and functions that are
+defined outside lidarpool also contribute their code, so that a subclass with a modified method has
+a different fingerprint. Fields declared with `dataclasses.field(compare=False)` are ignored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _GENERATED = {
 }  # fmt: skip
 _PLAIN = (bool, int, float, complex, str, bytes, Fraction, PurePath, type(None), type(Ellipsis))
 
-# Types of attributes of classes that count.
+# Types of class attributes that contribute to a fingerprint.
 _CONSTANTS = (*_PLAIN, np.generic, np.ndarray, list, tuple, Mapping, Set, partial)
 _CODE = (
     partial, types.FunctionType, types.MethodType, type, types.BuiltinFunctionType, np.ufunc,
@@ -41,13 +41,13 @@ _CODE = (
 
 
 def fingerprint(*values: Any) -> str:
-    """Return the SHA-256 of the content of values, in hexadecimal.
+    """Return the SHA-256 hash of the content of one or more values, in hexadecimal.
 
     Parameters
     ----------
     values
-        Numbers, text, arrays, containers, dataclasses, functions, and objects whose fields are
-        such values.
+        Numbers, text, arrays, containers, dataclasses and functions, and any objects whose fields
+        contain such values.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def fingerprint(*values: Any) -> str:
 
 @lru_cache(1024)
 def _of_word(word: str) -> str:
-    """Return the cached fingerprint of the name of a field: there are few names."""
+    """Return the fingerprint of a field name. It is cached, because the same names recur."""
     return fingerprint(word)
 
 
@@ -75,30 +75,31 @@ def _of_key(key: Any) -> str:
     return _of_word(key) if type(key) is str else fingerprint(key)
 
 
-# {id of a read-only array: (array, hash)}: jobs of a campaign share large scenes.
+# {id of a read-only array: (array, hash)}. The jobs of a campaign share large scenes.
 _hashes: dict[int, tuple[weakref.ref[Any], bytes]] = {}
 _MIN_CACHED_BYTES = 1 << 16  # smaller arrays are hashed each time
 
 
 def _content(array: np.ndarray[Any, Any]) -> bytes:
-    """Return the hash of the values of an array."""
+    """Return the hash of an array's values. Hashes of large read-only arrays are cached."""
     cached = _hashes.get(id(array))
     if cached is not None and cached[0]() is array:
         return cached[1]
     data = np.ascontiguousarray(array).view(np.uint8).data
     digest = hashlib.sha256(data).digest()
-    if array.nbytes >= _MIN_CACHED_BYTES and not array.flags.writeable:  # so are arrays of a Scene
+    # The arrays of a Scene are read-only.
+    if array.nbytes >= _MIN_CACHED_BYTES and not array.flags.writeable:
         key = id(array)
         _hashes[key] = weakref.ref(array, lambda _: _hashes.pop(key, None)), digest
     return digest
 
 
 class _Digest:
-    """Hash of added values."""
+    """Accumulates a hash from values of any supported type."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
-        self._open: list[int] = []  # ids of the values being added, to end cycles
+        self._open: list[int] = []  # ids of the values being added, to detect cycles
 
     def hexdigest(self) -> str:
         return self._hash.hexdigest()
@@ -111,7 +112,7 @@ class _Digest:
     def add(self, value: Any) -> None:
         """Add a value.
 
-        An outer value that contains itself is marked as a circle.
+        A reference to an enclosing value is recorded as a cycle instead of being followed.
         """
         if id(value) in self._open:
             self._mark("circle")
@@ -126,7 +127,7 @@ class _Digest:
         if isinstance(value, np.generic):
             value = value.item()
         if isinstance(value, _PLAIN):
-            # repr writes each float with enough digits to identify it.
+            # repr writes a float with enough digits to identify it.
             self._mark(type(value).__name__, repr(value))
         elif isinstance(value, datetime):
             self._mark("datetime", value.isoformat())
@@ -168,7 +169,7 @@ class _Digest:
         elif isinstance(value, type):
             self._add_class(value)
         elif isinstance(value, types.ModuleType):
-            self._mark("module", value.__name__)  # without its content
+            self._mark("module", value.__name__)  # the content of the module is ignored
         else:
             self._mark("builtin", getattr(value, "__module__", ""), value.__name__)
 
@@ -199,7 +200,7 @@ class _Digest:
                 function = getattr(function, "__func__", function)
                 special = name.startswith("__")
                 if isinstance(function, types.FunctionType):
-                    # Protocols add hooks of typing to their subclasses.
+                    # Protocols add special methods from `typing` to their subclasses.
                     is_defined = not special or function.__module__ == base.__module__
                     counts = is_defined and name not in _GENERATED
                 else:
@@ -233,13 +234,13 @@ class _Digest:
 
 
 def _names(code: types.CodeType) -> list[str]:
-    """Return the names that code uses, including nested code."""
+    """Return the sorted global and attribute names that code uses, including nested code."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return sorted({*code.co_names, *(name for c in inner for name in _names(c))})
 
 
 def _is_cached(kind: type, name: str) -> bool:
-    """Return True if a field is the value of a cached property, which depends on further fields."""
+    """Return True if a name belongs to a cached property, which is derived from other fields."""
     return isinstance(getattr(kind, name, None), cached_property)
 
 

@@ -1,8 +1,8 @@
-"""The process that forks the workers of a local cluster.
+"""Start and stop the process that forks the workers of a local cluster.
 
-A spawned worker imports Dask, NumPy and the packages of lidarpool, which takes a second of a core.
-The fork server imports them once, in parallel to the driver, and forks each worker in 20 ms, also
-after a restart.
+A spawned worker imports Dask, NumPy and lidarpool, which takes about one second of CPU time. The
+fork server imports them once, while the driver continues. It then forks each worker in about
+20 ms, including workers that are restarted.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from typing import Any
 
 from lidarsim.base.interrupts import children_spared
 
-# Numerical libraries get one thread: workers share the cores, and threads cannot be forked.
+# Numerical libraries are limited to one thread, because workers share the cores and threads do not
+# survive a fork.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-# glibc's numbers of M_TRIM_THRESHOLD and M_MMAP_THRESHOLD.
+# Values of M_TRIM_THRESHOLD (-1) and M_MMAP_THRESHOLD (-3), the options of glibc's mallopt.
 _THRESHOLDS = {-1: 256 << 20, -3: 256 << 20}
 
 
 def start_fork_server() -> bool:
-    """Start the fork server, which ends when this process and all workers have ended.
+    """Start the fork server and return True, or return False if forking is not supported.
 
-    Returns False on systems whose libraries cannot be forked, such as macOS.
+    The fork server exits after this process and all workers have exited. Forking is only supported
+    on Linux, because the system libraries of macOS do not work in forked processes.
     """
     if sys.platform != "linux":
         return False
@@ -47,10 +49,10 @@ def start_fork_server() -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Let this process and its forks keep the memory of freed large arrays.
+    """Let this process and its forks keep the memory of large arrays after they are freed.
 
-    Pages that were returned to the system have to be faulted in again. That took one of the eight
-    seconds of the pictures.
+    By default, glibc returns this memory to the system, and the next large array causes page
+    faults. Rendering pictures spent an eighth of its time on such page faults.
     """
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # only in glibc
         for option, size in _THRESHOLDS.items():
@@ -58,11 +60,13 @@ def keep_freed_memory() -> None:
 
 
 def stop_fork_server() -> None:
-    """Kill the fork server and wait for its end.
+    """Kill the fork server and wait until it has exited.
 
-    The processor time of the server and its workers counts for this process afterwards.
+    The CPU time of the server and its workers is then included in the CPU time that the system
+    reports for the children of this process.
     """
     server: Any = forkserver._forkserver
     if server._forkserver_pid is not None:
-        os.kill(server._forkserver_pid, signal.SIGKILL)  # it would wait for the last worker
+        # Without the signal, the server would wait until the last worker exits.
+        os.kill(server._forkserver_pid, signal.SIGKILL)
         server._stop()

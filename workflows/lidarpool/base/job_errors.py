@@ -1,4 +1,4 @@
-"""Errors of jobs as lines: one for each different error, with its jobs."""
+"""Summaries of job errors, in which jobs with the same error share one line."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Iterable
 
 from lidarsim.base.words import listed
 
-_NUMBER = re.compile(r"\bjob \d+: ")  # names the job in its error
-_VALUES = "\nThe values of the job are "  # before the values of the job, in its error
+_NUMBER = re.compile(r"\bjob \d+: ")  # prefix with which an error message names its job
+_VALUES = "\nThe values of the job are "  # text that introduces the varied values in a message
 
 
 def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> list[str]:
-    """Return a line for each different error, with the jobs that have the error.
+    """Return one line for each distinct error, which lists the jobs that failed with it.
 
     Parameters
     ----------
     errors
-        Words that name a job, and the message of its error. The number and the values of the job
-        in the message make no difference.
+        Name and error message of each failed job. Messages that differ only in the job number or
+        in the values of the job are treated as the same error.
     max_jobs
-        Jobs that a line names; it counts the others.
+        Number of jobs to list in a line. Further jobs are only counted.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Logs and warnings of libraries, of a command and of its workers."""
+"""Log messages and warnings from libraries, in the driver and in its workers."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import warnings
 
 
 def set_logs(shown: bool) -> None:
-    """Show or drop log messages and warnings of libraries in this process.
+    """Show or suppress log messages and warnings from libraries in this process.
 
-    The command itself tells users what matters. For a log file, redirect the output of `-v`. This
-    is also called in workers that share the terminal: the driver reports a failed task once, and
-    Dask's worker would log the task as well, with a traceback.
+    They are suppressed by default, because the command reports everything that matters to users.
+    To get a log file, redirect the output of a command with `-v`. The function is also called in
+    workers that share the terminal, because a Dask worker would otherwise log a traceback for each
+    failed task, which the driver already reports.
     """
     logging.disable(logging.NOTSET if shown else logging.CRITICAL)
     if shown:
         for handler in logging.getLogger("distributed").handlers:
-            handler.setLevel(logging.INFO)  # a local cluster has raised the level
+            handler.setLevel(logging.INFO)  # starting a local cluster raises the level
     elif not sys.warnoptions:
         warnings.simplefilter("ignore")

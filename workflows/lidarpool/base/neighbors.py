@@ -1,4 +1,4 @@
-"""Nearest points, found by Open3D."""
+"""Nearest neighbor search with Open3D."""
 
 from __future__ import annotations
 
@@ -10,9 +10,22 @@ from .open3d_module import load_open3d
 
 
 def nearest(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
-    """Return distances (n,) to the nearest points of a reference, meters, and indices (n,)."""
+    """Find the nearest point in a reference cloud for each point.
+
+    Parameters
+    ----------
+    points
+        Query points in meters, shape (n, 3).
+    reference
+        Points of the reference cloud in meters, shape (m, 3).
+
+    Returns
+    -------
+    The distances in meters and the indices of the nearest reference points, each of shape (n,).
+    """
     core = load_open3d().core
-    origin = reference.mean(axis=0)  # far from zero, squares would lose their digits
+    # Squared distances between coordinates far from zero would lose precision.
+    origin = reference.mean(axis=0)
     tree = core.nns.NearestNeighborSearch(core.Tensor(reference - origin))
     tree.knn_index()
     index, square = tree.knn_search(core.Tensor(points - origin), 1)

@@ -1,4 +1,4 @@
-"""Open3D without its viewers."""
+"""Import Open3D without its viewers."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
 from lidarsim.base.interrupts import deferred_interrupts
 
-_LOCK = Lock()  # a second thread would find the temporary package
+_LOCK = Lock()  # keeps other threads from finding the temporary package
 
 
 def load_open3d() -> Any:
-    """Return the extension module of Open3D, which has `core`, `t`, `io` and `utility`.
+    """Return Open3D's extension module, which contains `core`, `t`, `io` and `utility`.
 
-    Importing the package takes more than twice the time: it brings Dash and Plotly for viewers in a
-    browser. So the extension is loaded below a temporary package without code, which is removed
-    again: `import open3d`, before or after, gives the full package.
+    Importing the full package takes more than twice as long, because it also imports Dash and
+    Plotly for its browser viewers. The extension module is therefore loaded inside a temporary,
+    empty package, which is removed afterwards. A later `import open3d` still imports the full
+    package.
 
-    LidarError if Open3D is not installed, or lacks a library of the system.
+    Raises
+    ------
+    LidarError
+        If Open3D is not installed, or if a system library that it requires is missing.
     """
-    # Interrupted while it loads, an extension module cannot be loaded again.
+    # An extension module whose import was interrupted cannot be imported again.
     with deferred_interrupts(), _LOCK:
         try:
             return _extension("open3d.pybind")

@@ -1,4 +1,4 @@
-"""Values that each process creates for itself, such as open files."""
+"""Values, such as open files, that each process creates for itself."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ Value = TypeVar("Value")
 
 
 class PerProcess(Generic[Value]):
-    """A value that each process creates when it first calls this object.
+    """A value that each process creates when it calls the object for the first time.
 
-    Use it for open files and locks that a forked process must not share with its parent: both
-    processes would move the position of the same file.
+    Use it for open files and locks that a forked process must not share with its parent. If two
+    processes share an open file, each read moves the file position of both.
 
     Parameters
     ----------
@@ -23,12 +23,13 @@ class PerProcess(Generic[Value]):
 
     def __init__(self, create: Callable[[], Value]) -> None:
         self._create = create
-        # The value of the parent is kept, because closing it could affect the parent.
+        # A fork keeps its parent's value, because closing it could affect the parent.
         self._values: dict[int, Value] = {}  # {process: value}
 
     def __call__(self) -> Value:
         """Return the value of this process."""
         process = os.getpid()
         if process not in self._values:
-            self._values.setdefault(process, self._create())  # another thread may be faster
+            # Another thread may have created the value in the meantime.
+            self._values.setdefault(process, self._create())
         return self._values[process]

@@ -1,4 +1,4 @@
-"""Processors that this process may use."""
+"""Number of processors available to this process."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ import os
 
 def processors() -> int:
     """Return the number of processors that this process may use."""
-    known = hasattr(os, "sched_getaffinity")  # not on macOS
+    known = hasattr(os, "sched_getaffinity")  # macOS does not have it
     return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1

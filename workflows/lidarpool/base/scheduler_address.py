@@ -1,6 +1,6 @@
-"""Addresses of running Dask schedulers, as users give them.
+"""Validation of the Dask scheduler addresses and certificates that users specify.
 
-They are checked before anything else is read or computed.
+A command checks them before it reads or computes anything else.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from lidarsim.base.input_files import read_input_text
 
 from .tls_files import TlsFiles
 
-_LOOK_EVERY_S = 0.5  # between looks for a scheduler file that does not exist yet
-_WRITING_S = 2.0  # longest time in which a scheduler writes its file
+_LOOK_EVERY_S = 0.5  # interval between checks for a scheduler file
+_WRITING_S = 2.0  # maximum time that a scheduler takes to write its file
 _ENCRYPTED = ("tls://", "wss://")
-_SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")  # of Dask, between processes
+_SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")  # Dask's schemes for inter-process traffic
 _NEEDED = {  # {option: key in Dask's configuration}
     "--tls-ca": "distributed.comm.tls.ca-file",
     "--tls-cert": "distributed.comm.tls.client.cert",
@@ -28,28 +28,28 @@ _NEEDED = {  # {option: key in Dask's configuration}
 
 
 def is_scheduler_file(given: str) -> bool:
-    """Return whether `given` is the path of a scheduler file, and no address."""
+    """Return whether `given` is the path of a scheduler file rather than an address."""
     return "://" not in given and (given.endswith(".json") or Path(given).is_file())
 
 
 def read_scheduler_file(
     path: Path, wait_s: float = 0.0, tell: Callable[[str], None] = lambda text: None
 ) -> str:
-    """Return the address in a file that ``dask scheduler --scheduler-file`` writes.
+    """Read the address from a file written by ``dask scheduler --scheduler-file``.
 
     Parameters
     ----------
     path
-        The file.
+        Path of the scheduler file.
     wait_s
-        How long to wait for a file that does not exist yet, in seconds.
+        Maximum time to wait for a file that does not exist yet, in seconds.
     tell
-        Called with a note before a wait.
+        Function that is called with a message for the user before waiting.
 
     Raises
     ------
     LidarError
-        If the file does not exist in time, or is not a scheduler file.
+        If the file does not exist after `wait_s` seconds, or is not a scheduler file.
     """
     deadline = time.monotonic() + wait_s
     if wait_s and not path.exists():
@@ -60,7 +60,7 @@ def read_scheduler_file(
         try:
             return _read(path)
         except LidarError:
-            if found and not was_found:  # perhaps the scheduler is writing the file
+            if found and not was_found:  # the scheduler may still be writing the file
                 deadline = min(deadline, time.monotonic() + _WRITING_S)
                 was_found = True
             if time.monotonic() >= deadline:
@@ -69,7 +69,7 @@ def read_scheduler_file(
 
 
 def _read(path: Path) -> str:
-    """Return the address in a scheduler file, or raise LidarError."""
+    """Read the address from a scheduler file. Raises LidarError if that is not possible."""
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "
@@ -85,14 +85,14 @@ def _read(path: Path) -> str:
 
 
 def check_address(address: str) -> None:
-    """Raise LidarError if an address has an unknown scheme, no host or no valid port."""
+    """Raise LidarError if an address has an unknown scheme, no host, or no valid port."""
     scheme, separator, _ = address.partition("://")
     if separator and scheme not in _SCHEMES:
         raise LidarError(
             f"The address {address!r} has the unknown scheme {scheme!r}. Use an address such as "
             "tcp://host:8786 or, for a TLS cluster, tls://host:8786."
         )
-    with suppress(ValueError):  # ValueError if the port is not a number, or out of range
+    with suppress(ValueError):  # the port is not a number or out of range
         parts = urlsplit(f"//{address.rpartition('//')[2]}")
         if parts.hostname and parts.port:
             return
@@ -103,9 +103,10 @@ def check_address(address: str) -> None:
 
 
 def check_certificates(address: str, files: TlsFiles) -> None:
-    """Raise LidarError if an encrypted cluster lacks certificates, or another has some.
+    """Raise LidarError if the TLS files do not match the scheme of the cluster's address.
 
-    Certificates may also be in Dask's configuration.
+    An encrypted cluster requires certificates, which may also be set in Dask's configuration. An
+    unencrypted cluster must not have any.
     """
     if not address.startswith(_ENCRYPTED):
         if any(files):

@@ -1,4 +1,4 @@
-"""JSON files that end with the CRC-32 of their text, so that damage and edits are noticed."""
+"""JSON files that end with a CRC-32 checksum, which reveals damage and manual edits."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _SEAL = re.compile(rb',\n"crc": (\d{1,10})\}\n\Z')
 
 
 class SealedWriter:
-    """Writes the text of a JSON object piece by piece.
+    """Writes a JSON object in pieces and completes it with a checksum.
 
-    `seal` ends the object with its CRC-32.
+    Call `write` for each piece, and `seal` at the end.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -22,18 +22,18 @@ class SealedWriter:
         self._crc = 0
 
     def write(self, text: str) -> None:
-        """Write text of the object, without its last brace."""
+        """Write a piece of the object's text, which must not include the closing brace."""
         data = text.encode()
         self._crc = zlib.crc32(data, self._crc)
         self._file.write(data)
 
     def seal(self) -> None:
-        """Write the CRC-32 of all text and the last brace."""
+        """Write the checksum of the text and the closing brace."""
         self._file.write(f',\n"crc": {self._crc}}}\n'.encode())
 
 
 def sealed(content: Mapping[str, Any]) -> bytes:
-    r"""Return the text of a JSON object that is not empty, with its CRC-32 at the end.
+    r"""Serialize a non-empty mapping as a JSON object with a checksum at the end.
 
     Examples
     --------
@@ -47,9 +47,12 @@ def sealed(content: Mapping[str, Any]) -> bytes:
 
 
 def unsealed(data: bytes) -> dict[str, Any]:
-    """Return the object that `sealed` or `SealedWriter` has written.
+    """Return the content of a JSON object written by `sealed` or `SealedWriter`.
 
-    ValueError if the text does not fit its CRC-32.
+    Raises
+    ------
+    ValueError
+        If the checksum is missing or does not match the text.
     """
     seal = _SEAL.search(data)
     if seal is None:

@@ -1,4 +1,4 @@
-"""Shards: equal shares of a run, for clusters that work independently."""
+"""Shards, which divide a run into equal shares for clusters that work independently."""
 
 from __future__ import annotations
 
@@ -14,19 +14,25 @@ _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
 def shard_in_words(text: str) -> str:
-    """Return the text of a shard in words: «shard 3/10», or «the whole run»."""
+    """Return the name of a shard in messages.
+
+    Examples
+    --------
+    >>> shard_in_words("3/10"), shard_in_words("1/1")
+    ('shard 3/10', 'the whole run')
+    """
     return "the whole run" if text == "1/1" else f"shard {text}"
 
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """Share `number` of `total` shares, counted from 1.
+    """One of several equal shares of a run.
 
-    Raises LidarError if the number is too large.
+    Raises LidarError if the number is not between 1 and the total.
     """
 
-    number: int
-    total: int
+    number: int  # number of this shard, starting at 1
+    total: int  # number of shards
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.total:
@@ -39,9 +45,20 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
-        """Read ``3/10``, ``auto`` for the task of a Slurm array, or ``auto/10`` for a pod's index.
+        """Parse the value of `--shard`.
 
-        LidarError for any further text, or without such a shard, array or index.
+        Parameters
+        ----------
+        text
+            ``3/10``, ``auto`` to use the index of the task in a Slurm job array, or ``auto/10`` to
+            use the completion index of the pod in a Kubernetes job with 10 pods.
+        environment
+            Environment variables, which contain these indices.
+
+        Raises
+        ------
+        LidarError
+            If the text is invalid, the shard does not exist, or an index is not available.
         """
         if not (match := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
             raise LidarError(
@@ -64,14 +81,14 @@ class Shard:
             ) from error
 
     def jobs(self, count: int) -> range:
-        """Return the jobs of the share out of `count`.
+        """Return the indices of this shard's jobs in a campaign with `count` jobs.
 
-        Neighbors are in different shares.
+        Consecutive jobs belong to different shards, because their run times are often similar.
         """
         return range(self.number - 1, count, self.total)
 
     def scans(self, count: int) -> range:
-        """Return the scans of the share out of `count`, which are consecutive."""
+        """Return the indices of this shard's scans, which are consecutive, out of `count` scans."""
         return range(count * (self.number - 1) // self.total, count * self.number // self.total)
 
 

@@ -1,9 +1,9 @@
-"""Pickled values, and memory of this process that other processes of this machine map.
+"""Pickled values in memory that all processes on a machine can share.
 
-A large value that is sent through Dask is copied several times, and each process has a separate
-copy. Shared memory is a file without a name in any folder (`memfd_create`, Linux), which processes
-of the same user open at ``/proc/PID/fd/NUMBER``. The system frees the memory with the last process
-that uses it, however that process ends.
+A large value that is sent through Dask is copied several times, and each process keeps its own
+copy. Shared memory avoids these copies. It is an anonymous file (`memfd_create`, Linux only), which
+processes of the same user can open at ``/proc/PID/fd/NUMBER``. The system frees the memory when the
+last process that uses it exits, even if that process crashes.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ _ALIGNMENT = 64  # alignment of each array, bytes
 
 
 class Pickled(NamedTuple):
-    """A pickled value: its bytes, and the contents of its arrays beside them."""
+    """A pickled value whose arrays are stored separately (pickle protocol 5)."""
 
-    head: bytes
-    buffers: tuple[memoryview | bytearray, ...]
+    head: bytes  # pickle stream without the contents of arrays
+    buffers: tuple[memoryview | bytearray, ...]  # contents of the arrays
 
     @classmethod
     def from_value(cls, value: object) -> Pickled:
-        """Pickle a value, with `buffers` for views of its arrays."""
+        """Pickle a value. The buffers are views of its arrays, which are not copied."""
         buffers: list[pickle.PickleBuffer] = []
         head = cloudpickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         return cls(head, tuple(buffer.raw() for buffer in buffers))
 
     @property
     def nbytes(self) -> int:
-        """Size of the value, bytes."""
+        """Size of the pickled value in bytes, including its arrays."""
         return len(self.head) + sum(len(buffer) for buffer in self.buffers)
 
     def copy(self) -> Pickled:
-        """Return a copy that can be sent, and whose arrays can be written to."""
+        """Return a copy that can be sent to other processes, with writable arrays."""
         return Pickled(self.head, tuple(bytearray(buffer) for buffer in self.buffers))
 
     def load(self) -> Any:
-        """Return the value."""
-        return pickle.loads(self.head, buffers=self.buffers)  # noqa: S301 - of the run's own driver
+        """Unpickle the value."""
+        return pickle.loads(self.head, buffers=self.buffers)  # noqa: S301 - from the run's driver
 
 
 class SharedHandle(NamedTuple):
@@ -52,14 +52,18 @@ class SharedHandle(NamedTuple):
 
     path: str
     name: str  # unique name of the memory
-    spans: tuple[tuple[int, int], ...]  # start and end of the head and of each buffer
+    spans: tuple[tuple[int, int], ...]  # start and end of the head and of each buffer, in bytes
 
     def load(self) -> Any:
-        """Return the value.
+        """Load the value.
 
-        Its arrays lie in the shared memory, and are copied when written to.
+        The arrays of the value are views of the shared memory. The system copies a page when the
+        process writes to it.
 
-        OSError if this process does not see the memory, as on another machine.
+        Raises
+        ------
+        OSError
+            If this process cannot access the memory, for example on another machine.
         """
         target = str(Path(self.path).readlink())
         if target.partition(" ")[0] != f"/memfd:{self.name}":
@@ -71,9 +75,12 @@ class SharedHandle(NamedTuple):
 
 
 class SharedValue:
-    """A pickled value in shared memory, as long as this object or a loaded copy exists.
+    """A pickled value in shared memory, which exists as long as this object or a loaded copy.
 
-    OSError if the system has no such memory, or not enough.
+    Raises
+    ------
+    OSError
+        If the system does not support shared memory, or does not have enough of it.
     """
 
     def __init__(self, pickled: Pickled) -> None:
@@ -86,12 +93,12 @@ class SharedValue:
             start = -(-self._file.tell() // _ALIGNMENT) * _ALIGNMENT
             self._file.seek(start)
             remaining = memoryview(content)
-            while remaining:  # the system writes 2 GiB at a time
+            while remaining:  # Linux writes at most 2 GiB in one call
                 remaining = remaining[self._file.write(remaining) :]
             spans.append((start, start + len(content)))
         path = f"/proc/{os.getpid()}/fd/{self._file.fileno()}"
         self.handle = SharedHandle(path, name, tuple(spans))
 
     def close(self) -> None:
-        """Release the memory, except for processes that have loaded the value."""
+        """Release the memory. Processes that have already loaded the value keep it."""
         self._file.close()

@@ -1,4 +1,7 @@
-"""The software of a process, as far as the bytes of a result depend on it."""
+"""Software versions that determine the bytes of a result.
+
+A run records the versions of its driver, and refuses workers that have different versions.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +25,31 @@ from raybeam.registry import backend_build
 T = TypeVar("T")
 
 PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
-# Files beside a package in a checkout, which an installed package lacks.
+# Files next to a package in a checkout, which an installed package does not contain.
 _DISTRIBUTION_FILES = ("pyproject.toml", "README.md", "LICENSE")
-IMPORTED = time.time()  # a forked worker has the time of the fork server's import
-CLOCK_TOLERANCE_S = 5.0  # largest difference of the clocks of a file server and of this machine
+IMPORTED = time.time()  # in a forked worker, the time of the import in the fork server
+CLOCK_TOLERANCE_S = 5.0  # maximum clock difference between a file server and this machine
 
 
 def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str]:
-    """Return the software of this process by name: equal software gives equal bytes.
+    """Return the versions of the software in this process, by name.
 
-    ``lidarpool`` is its version and a hash of the installed sources. For casting with a ray-casting
-    `backend`, ``numpy`` and ``backend`` are versions. Each of the used `plugins` has its
-    distribution, with version and sources, unless this process lacks the plug-in. Processors do not
-    matter: no byte comes from a function whose last bits depend on them (`elementary`,
-    `vectors`).
+    Processes with the same versions produce the same bytes. This does not depend on the processor,
+    because no result comes from a function whose last bits differ between processors (see
+    `lidarsim.base.elementary` and `lidarsim.base.vectors`).
+
+    Parameters
+    ----------
+    backend
+        Name of the ray-casting backend, or an empty string for processes that do not cast rays.
+    plugins
+        Plug-ins that the run uses. Plug-ins that are not installed in this process are skipped.
+
+    Returns
+    -------
+    ``lidarpool`` is the version of lidarpool and the hash of its sources. ``numpy`` and ``backend``
+    are included if a backend is given. Each plug-in has an entry with the version and the source
+    hash of its distribution.
     """
     described = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
@@ -49,21 +63,25 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
 
 @cache
 def sources() -> str:
-    """Return the hash of the installed sources: eight hexadecimal digits.
+    """Return the hash of the installed sources, as eight hexadecimal digits.
 
-    "changed" if files have changed since this process started: it may run older code.
+    If files have changed since this process started, it may be running older code. The function
+    then returns a text that says so instead of a hash.
     """
     return _hash_of(PACKAGES)
 
 
 @cache
 def _version_of(plugin: Plugin) -> str:
-    """Return the version of a plug-in's distribution, and the hash of its package."""
+    """Return the version and the source hash of a plug-in's distribution."""
     return f"{plugin.version} (sources {_hash_of((_package_of(plugin.module),))})"
 
 
 def _package_of(module: str) -> str:
-    """Return the name of the outermost regular package of a module, or of the module itself."""
+    """Return the outermost regular package of a module, or the module if it has no package.
+
+    Namespace packages are skipped, because several distributions can share them.
+    """
     parts = module.split(".")
     for count in range(1, len(parts)):
         name = ".".join(parts[:count])
@@ -74,7 +92,7 @@ def _package_of(module: str) -> str:
 
 
 def _hash_of(packages: Iterable[str]) -> str:
-    """Return the hash of the files of packages or modules (`sources`)."""
+    """Return the hash of the files in packages or modules, as described in `sources`."""
     digest = hashlib.sha256()
     newest_s = 0.0
     for package in packages:
@@ -88,10 +106,10 @@ def _hash_of(packages: Iterable[str]) -> str:
 
 
 def _files_of(package: str) -> Iterator[tuple[str, Path]]:
-    """Yield the files of a package or module, with names that start with the package's."""
+    """Yield the name and path of each file in a package. Names start with the package name."""
     try:
         spec = find_spec(package)
-    except ModuleNotFoundError:  # its outer package is missing
+    except ModuleNotFoundError:  # the parent package is missing
         spec = None
     if spec is None:
         return
@@ -109,12 +127,13 @@ def _files_of(package: str) -> Iterator[tuple[str, Path]]:
 def software_query(
     backend: str = "", plugins: Sequence[Plugin] = ()
 ) -> Callable[[], dict[str, str]]:
-    """Return a function that describes a worker's software.
+    """Return a function that calls `software` on a worker.
 
-    It is nested, so that it is sent by value: a worker without the package, or with another
-    version, can run it too. Without the package it returns an empty dictionary.
+    The returned function is nested, so that it is pickled by value. Workers that lack lidarpool, or
+    have a different version, can therefore run it, too. If lidarpool is not installed, it returns
+    an empty dictionary.
     """
-    # As tuples, which are sent by value: classes of this package are sent by name.
+    # Tuples are pickled by value, whereas instances of `Plugin` require its class on the worker.
     named = [
         (plugin.group, plugin.name, plugin.value, plugin.distribution, plugin.version)
         for plugin in plugins
@@ -137,15 +156,24 @@ def software_query(
 
 
 def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
-    """Return the version and sources of plug-ins that this process uses."""
+    """Return the version and the source hash of each plug-in, as installed in this process."""
     return {plugin: _version_of(plugin) for plugin in plugins}
 
 
 def call_with_same_sources(required: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function in a task, if its worker has the sources of the run.
+    """Call a function in a task after checking that the worker has the same sources as the driver.
 
-    `required` is ``lidarpool`` in the `software` of the run's driver. LidarError for different
-    sources.
+    Parameters
+    ----------
+    required
+        Value of ``lidarpool`` that `software` returned in the driver.
+    function, arguments
+        Function to call, and its arguments.
+
+    Raises
+    ------
+    LidarError
+        If the worker has different sources.
     """
     return _call(software(), {"lidarpool": required}, function, *arguments)
 
@@ -153,9 +181,19 @@ def call_with_same_sources(required: str, function: Callable[..., T], *arguments
 def call_with_plugins(
     versions: Mapping[Plugin, str], function: Callable[..., T], *arguments: Any
 ) -> T:
-    """Call a function in a task, if its worker has the plug-ins of the run's driver.
+    """Call a function in a task after checking that the worker has the driver's plug-ins.
 
-    `versions` as of `plugin_versions`. LidarError if a plug-in differs or is missing.
+    Parameters
+    ----------
+    versions
+        Versions of the plug-ins, which `plugin_versions` returned in the driver.
+    function, arguments
+        Function to call, and its arguments.
+
+    Raises
+    ------
+    LidarError
+        If a plug-in is missing, or has a different version or different sources.
     """
     required = {_entry_of(plugin): version for plugin, version in versions.items()}
     return _call(software(plugins=versions), required, function, *arguments)
@@ -182,7 +220,9 @@ def _entry_of(plugin: Plugin) -> str:
 
 
 def difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
-    """Return a clause on software that differs, or "" if all software is the same.
+    """Describe the first difference between installed and required software.
+
+    Returns an empty string if all required entries are the same.
 
     Examples
     --------

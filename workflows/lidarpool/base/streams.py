@@ -1,4 +1,4 @@
-"""Output whose reader may have gone."""
+"""Output streams that tolerate a closed pipe."""
 
 from __future__ import annotations
 
@@ -8,10 +8,17 @@ from typing import Any, TextIO
 
 
 class TolerantStream:
-    """A stream whose writes succeed after its reader has gone, so that a run goes on.
+    """A text stream that discards output once its reader has closed the pipe.
 
-    `reader_gone` is the kind of error of such writes. Each write is flushed; other errors are
-    raised.
+    A run therefore continues, for example, after ``lidarpool run ... | head``. Each write is
+    flushed.
+
+    Parameters
+    ----------
+    stream
+        Stream to write to.
+    reader_gone
+        Type of the error that indicates a closed pipe. Other errors are raised.
     """
 
     def __init__(self, stream: TextIO, reader_gone: type[OSError] = OSError) -> None:
@@ -22,14 +29,15 @@ class TolerantStream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write and flush."""
+        """Write and flush a text."""
         try:
             self._stream.write(text)
             self._stream.flush()
-        except self._reader_gone:  # the stream's buffer would fail again when Python exits
+        except self._reader_gone:
+            # Without the redirection, flushing the buffer would fail again when Python exits.
             with suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
         return len(text)
 
     def flush(self) -> None:
-        """Skip flushing, since `write` flushes."""
+        """Do nothing, because `write` has already flushed the stream."""

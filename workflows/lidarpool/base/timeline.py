@@ -1,6 +1,7 @@
-"""When the steps of a command end, from the start of its process to its exit.
+"""Timeline of a command, which records when each of its steps ends.
 
-`mark` costs a microsecond, so that steps are marked whether the timeline is shown or not.
+Steps are always recorded, even if the timeline is not shown, because `mark` takes only about one
+microsecond.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import psutil
 
-# Names of steps, which the documentation explains.
+# Names of the steps, which the documentation explains.
 COMMAND = "command imported"
 SCENE = "scene read"
 WORKERS = "workers started"
@@ -61,7 +62,7 @@ _ROW = (
 
 
 class Step(NamedTuple):
-    """A step of a command: it starts when the step before ends."""
+    """A step of a command, which starts when the previous step ends."""
 
     name: str
     end_s: float  # seconds since the start of the process
@@ -71,29 +72,28 @@ def _age_s() -> float:
     """Return the seconds since the start of this process."""
     if not hasattr(time, "CLOCK_BOOTTIME"):  # a system other than Linux
         return time.time() - psutil.Process().create_time()
-    # psutil adds to the time of the boot, which was a second off where clocks had been set since.
+    # psutil derives the start from the boot time, which was off by a second on machines whose clock
+    # had been adjusted after booting.
     stat = Path("/proc/self/stat").read_text("ascii", errors="replace")
     start_ticks = int(stat.rpartition(")")[2].split()[19])
     return time.clock_gettime(time.CLOCK_BOOTTIME) - start_ticks / os.sysconf("SC_CLK_TCK")
 
 
 class Timeline:
-    """Steps of this process in the order of their ends."""
+    """Steps of this process, in the order in which they ended."""
 
     def __init__(self) -> None:
-        self._started = time.time() - _age_s()  # seconds since 1970, in steps of 10 ms
+        # Start of the process in seconds since 1970, with a resolution of 10 ms.
+        self._started = time.time() - _age_s()
         self.steps: list[Step] = []
 
     def mark(self, name: str) -> None:
-        """Note that a step ends now.
-
-        A step that has ended before is not noted again.
-        """
+        """Record that a step ends now, unless a step with this name has already been recorded."""
         if all(step.name != name for step in self.steps):
             self.steps.append(Step(name, time.time() - self._started))
 
     def table(self) -> str:
-        """Return a line for each step: its name, its duration and its end, in seconds."""
+        """Return a text table with the name of each step, and its duration and end in seconds."""
         lines = [f"{'step':<22}{'duration':>9}{'end':>9}"]
         start_s = 0.0
         for step in self.steps:
@@ -102,7 +102,7 @@ class Timeline:
         return "\n".join(lines) + "\n"
 
     def page(self, command: str) -> str:
-        """Return the steps of a command as an HTML page with a bar for each."""
+        """Return an HTML page that shows the steps of a command as bars."""
         total_s = max(self.steps[-1].end_s, 1e-9) if self.steps else 1.0
         rows = []
         start_s = 0.0
@@ -123,9 +123,10 @@ class Timeline:
         return _PAGE.format(command=escape(command), begun=begun, rows="\n".join(rows))
 
     def show_at_exit(self, path: Path) -> None:
-        """When the process ends, write the page to a file and print the table on stderr.
+        """Write the page to a file and print the table to stderr when the process exits.
 
-        Functions that are registered later are called earlier: call this first.
+        Call this before other functions are registered with `atexit`, so that their time is
+        included. Functions that are registered later are called earlier.
 
         Raises
         ------

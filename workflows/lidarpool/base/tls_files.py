@@ -1,4 +1,4 @@
-"""Certificates of an encrypted cluster."""
+"""Certificate files for a TLS cluster."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 
 class TlsFiles(NamedTuple):
-    """PEM files for an encrypted cluster: certificates of authority and client, and a key."""
+    """PEM files that a client requires to connect to a TLS cluster."""
 
-    ca: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
+    ca: Path | None = None  # certificate of the certificate authority
+    cert: Path | None = None  # certificate of the client
+    key: Path | None = None  # private key of the client

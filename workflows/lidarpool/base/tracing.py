@@ -1,4 +1,4 @@
-"""Trace points of a run, for tests."""
+"""Trace points, with which tests observe and interrupt a run."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ _sink: Sink | None = None  # sink of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:
-    """Report that a run has reached a point, ``stage.event``, with values for its trace.
+    """Report that a run has reached a trace point, unless no sink is set.
 
-    Does nothing without a listener.
+    Parameters
+    ----------
+    point
+        Name of the trace point in the form ``stage.event``.
+    fields
+        Values to report.
     """
     if _sink is not None:
         _sink(point, fields)
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Call `sink(point, fields)` at each point of this process, until `sink` is None.
+    """Set the function that is called at each trace point in this process, or None for no function.
 
-    It is called in the thread that reaches the point, before that thread continues: it can log the
-    point, hold the thread, or end the process.
+    The function is called as ``sink(point, fields)`` in the thread that reaches the trace point,
+    before the thread continues. It can log the trace point, block the thread, or end the process.
     """
     global _sink
     _sink = sink

@@ -1,4 +1,4 @@
-"""Boxes of actors in single sweeps, for labels of data sets and markers."""
+"""Bounding boxes of actors in a sweep, which are used for data set labels and markers."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of all actors in a sweep, at its start, which is the stamp of the sweep.
+    """Bounding boxes of all actors at the start of a sweep, which is its timestamp.
 
-    Points are at their own times, so that they lie outside the box of an actor that moves. The size
-    of a box is the same in all sweeps: the box of an actor that deforms contains all its poses, in
-    the actor's axes. An actor that appears during the sweep has the box that it would have if it
-    had come at the speed of its appearance. If a frozen sensor repeats points of an actor that
-    has left, the box is missing.
+    Each point is measured at its own time, so points of a moving actor can lie outside its box. The
+    size of a box is the same in all sweeps. The box of an actor that deforms contains the actor in
+    all its shapes.
+
+    The box of an actor that appears during the sweep is extrapolated back to the start of the
+    sweep, using the actor's velocity when it appears. There is no box for an actor that has left
+    the scene, even if a frozen sensor still repeats its points.
     """
 
     centers: Floats  # (a, 3): meters, world coordinates, or the sensor frame after `inward`
-    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to that frame
-    sizes: Floats  # (a, 3): length, width and height, meters, along the actor's axes
-    points: Ints  # (a,): number of points of the sweep that belong to the actor
-    present: Bools  # (a,): True if the actor is in the scene, or appears later and has points
+    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor to the same frame
+    sizes: Floats  # (a, 3): length, width and height in meters, along the actor's axes
+    points: Ints  # (a,): number of points in the sweep that belong to the actor
+    # (a,): True if the actor is in the scene at the start, or appears later and has points.
+    present: Bools
 
     @classmethod
     def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:
-        """Return the boxes of a sweep with its points."""
+        """Compute the boxes of a sweep, given the points of the sweep."""
         actor = points["object"].astype(np.int64) - len(sweeps.objects)
         counts = np.bincount(actor[actor >= 0], minlength=len(sweeps.actors))
         position = sweeps.actor_poses.positions[:, sweep]
@@ -44,34 +47,43 @@ class Boxes:
         return cls(position + middle, quaternion, upper - lower, counts, present)
 
     def inward(self, pose: SweepPoses, index: int | slice) -> Boxes:
-        """Return boxes of a sweep or several, (n, a), in the sensor frame at the start of each."""
+        """Transform the boxes from world coordinates to the sensor frame at the start of a sweep.
+
+        If `index` is a slice of sweeps, arrays have a leading axis for the sweep.
+        """
         quaternions = self.quaternions @ pose.quaternion_matrices[index]
-        quaternions *= np.where(quaternions[..., 3:] < 0, -1, 1)  # w is at least 0
+        quaternions *= np.where(quaternions[..., 3:] < 0, -1, 1)  # such that w >= 0
         centers = (self.centers - pose.positions[index][..., None, :]) @ pose.rotations[index]
         return Boxes(centers, quaternions, self.sizes, self.points, self.present)
 
 
 @dataclass(frozen=True, eq=False)
 class SweepBoxes:
-    """Boxes of the actors present during a sweep, k in number, at its start, as in `Boxes`."""
+    """Bounding boxes of the k actors that are present in a sweep, at its start (see `Boxes`)."""
 
     names: tuple[str, ...]
-    types: tuple[str, ...]  # "Car" of "Car 1"
+    types: tuple[str, ...]  # names without numbers, for example "Car" for "Car 1"
     objects: Ints32  # (k,): numbers of the actors in the column `object`
     centers: Floats  # (k, 3): meters, sensor frame
-    quaternions: (
-        Floats  # (k, 4): x, y, z, w of the rotation from the box's axes to the sensor frame
-    )
-    sizes: Floats  # (k, 3): length, width and height, meters
-    points: Ints  # (k,): number of points of the sweep that belong to the actor
+    quaternions: Floats  # (k, 4): x, y, z, w of the rotation from the box to the sensor frame
+    sizes: Floats  # (k, 3): length, width and height in meters
+    points: Ints  # (k,): number of points in the sweep that belong to the actor
 
     @classmethod
     def select(
         cls, sweeps: Sweeps, boxes: Boxes | None, index: int | EllipsisType = ...
     ) -> SweepBoxes:
-        """Return the boxes of the actors present during a sweep, in the sensor frame.
+        """Select the boxes of the actors that are present in a sweep.
 
-        `boxes` are of a sweep, or of several with the `index` of a sweep; None gives no boxes.
+        Parameters
+        ----------
+        sweeps
+            Sweeps of the survey, which contain the names and types of the actors.
+        boxes
+            Boxes in the sensor frame, for a single sweep or with a leading axis for the sweep. None
+            if there are no boxes.
+        index
+            Index of the sweep, if `boxes` has an axis for it.
         """
         rows = np.empty(0, np.intp) if boxes is None else boxes.present[index].nonzero()[0]
         if boxes is None or not len(rows):
@@ -101,12 +113,12 @@ class SweepBoxes:
 
     @property
     def yaw(self) -> Floats:
-        """Angles about the sensor's z axis, from x to y, float64 (k,), radians."""
+        """Yaw angles about the z axis of the sensor in radians, from x to y. Shape (k,)."""
         rotations = matrices(self.quaternions)
         angles: Floats = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
         return angles
 
     @property
     def rows(self) -> Floats32:
-        """Center, length, width, height and yaw, float32 (k, 7)."""
+        """Center, length, width, height and yaw of each box, as float32 of shape (k, 7)."""
         return np.column_stack([self.centers, self.sizes, self.yaw]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Base class of the cloud formats, which states what a format can store and how it is accessed."""
+"""Base class for cloud formats, which declares what a format can store and how to access it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from .writing import ExportSpec
 
 # Frame in which a format stores points:
-# - cloud: frame of the cloud
-# - world: frame of the cloud, although readers expect all points in a single coordinate system
+# - cloud: same frame as the cloud
+# - world: same frame as the cloud, but readers expect all points in a single coordinate system
 # - sweep: sensor frame at the start of the sweep, with motion compensation
 # - firing: sensor frame at the firing of each point, or like sweep with the option `compensated`
 # - none: the format stores measurements such as ranges instead of positions
 Frame = Literal["cloud", "world", "sweep", "firing", "none"]
-# Points in the sensor frame in meters, of shape (n, 3), and {column: array of shape (n,)}, as they
-# are stored in the format.
+# Points in the sensor frame in meters, with shape (n, 3), and the columns that the format stores,
+# as {column: array with shape (n,)}.
 PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 
@@ -148,7 +148,7 @@ class CloudFormat(ABC):
 
     @classmethod
     def renamed(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if the format stores sensors under other names.
+        """Return notes for the user about sensors that the format stores under different names.
 
         The name of an unnamed sensor is an empty string.
         """
@@ -161,7 +161,7 @@ class CloudFormat(ABC):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the names of the files of a sweep in a data set, starting with its points."""
+        """Return the names of a sweep's files in a data set, starting with the point file."""
         return [cls.path_of_job(job.entry)]
 
     @classmethod
@@ -174,22 +174,22 @@ class CloudFormat(ABC):
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> Mapping[str, bytes]:
-        """Return files of a data set that contain the class names of all jobs, {name: content}."""
+        """Return data set files with the class names of all jobs, as {name: content}."""
         return {}
 
     @classmethod
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write files that the jobs of a data set share, from the manifests of the jobs.
+        """Write the files that the jobs of a data set share, using the manifests of the jobs.
 
         Implementations must iterate over all manifests, because the iteration writes the index of
         the data set.
 
         Returns
         -------
-        {name of a job: classes that its labels must number}, for jobs whose labels must be
-        renumbered (`renumbered`). Jobs can have different classes.
+        The jobs whose labels must be renumbered (see `renumbered`), because jobs can have different
+        classes. Maps the name of a job to the new list of classes.
         """
         deque(manifests, maxlen=0)
         return {}
@@ -209,6 +209,9 @@ class CloudFormat(ABC):
     def open(cls, source: RecordingSource) -> Recording:
         """Open a file or folder as a recording.
 
-        Raises LidarError if it is damaged, or if the user must choose, for example, a sensor.
+        Raises
+        ------
+        LidarError
+            If it is damaged, or if the user must make a choice, for example of a sensor.
         """
         raise LidarError(f"{source.name} is in a format that can be written, but not read.")

@@ -1,4 +1,4 @@
-"""E57, a scan for each sweep, through pye57."""
+"""Read and write E57 files with pye57, with one E57 scan per sweep."""
 
 from __future__ import annotations
 
@@ -40,28 +40,32 @@ _COORDINATES = {
     "spherical": ("sphericalRange", "sphericalAzimuth", "sphericalElevation"),
 }
 _COLORS = ("Red", "Green", "Blue")
-# Columns of the fields that are read.
+# Fields that are read, and the columns in which they are stored.
 _COLUMNS = {
     "intensity": "intensity",
     **{f"color{color}": name for color, name in zip(_COLORS, COLORS, strict=True)},
     "rowIndex": "row",
     "columnIndex": "column",
 }
-# Columns whose values the flags mark as invalid.
+# Flags that mark points as invalid, and the columns to which they apply.
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
-_MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
-_MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
+_MOVING = ", motion compensated"  # suffix of the scan name if the sensor moves
+_MIN_QUATERNION = 1e-6  # norm below which a quaternion is considered zero
 NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 class E57(CloudFormat):
-    """A file with a scan for each sweep that has points: pose, intensity, colors and normals.
+    """An E57 file with one scan per sweep, except for sweeps without points.
 
-    Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
-    stored as WKT. Normals are in the extension for surface normals; 0, 0, 0 without a surface. The
-    intensity limits of all scans are 0 and the highest intensity of the cloud. Acquisition times
-    are GPS times of the first and the last firing, and the creation time is the start of the
-    survey.
+    A scan contains its pose, and the points with intensity, colors and normals:
+
+    - Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
+      stored as WKT.
+    - Normals use the extension for surface normals. They are (0, 0, 0) if a point does not lie on a
+      surface.
+    - The intensity limits of all scans are 0 and the highest intensity in the cloud.
+    - The acquisition start and end are the GPS times of the first and the last firing. The creation
+      time is the start of the survey.
     """
 
     title = "E57"
@@ -97,12 +101,12 @@ class E57(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans of an E57 file, each in the axes of its scanner, with its pose."""
+        """Open the scans of an E57 file. Points are in the scanner frame, with a pose per scan."""
         return _open_e57(source)
 
 
 def _highest_intensity(cloud: CloudLike) -> float:
-    """Return the highest intensity of a cloud, or 0 without intensities."""
+    """Return the highest intensity in a cloud, or 0 if the cloud has no intensities."""
     if all(column.name != "intensity" for column in cloud.table):
         return 0.0
     chunks = cloud.chunks()
@@ -125,8 +129,8 @@ def _write_scan(
     quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     position = sweeps.pose.positions[sweep]
     start_s = gps_start_s(sweeps)
-    # Fields that pye57 would fill with zeros, with the limits of each scan, or with corners of the
-    # bounds in world coordinates, which the format has in the frame of the points.
+    # Without these fields, pye57 writes zeros, the limits of each scan, and bounds in world
+    # coordinates. The format requires bounds in the frame of the points.
     header: dict[str, Any] = {
         "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
         "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
@@ -164,14 +168,13 @@ def _scan_name(sweeps: Sweeps, sweep: int) -> str:
 
 
 class _Scale(NamedTuple):
-    """How the intensities of the scans of a file are brought to the same scale."""
+    """Intensity limits with which the intensities of all scans are converted to the same scale."""
 
-    limits: Sequence[Limits | None]  # None for scans whose intensities stay as they are
-    notes: tuple[str, ...] = ()  # clauses that follow the name of the file
+    limits: Sequence[Limits | None]  # None for scans whose intensities are used as stored
+    notes: tuple[str, ...] = ()  # notes for the user, which continue the name of the file
 
 
 def _open_e57(source: RecordingSource) -> Recording:
-    """Open the scans of an E57, each in the axes of its scanner, with its pose."""
     import pye57
 
     with reading(source.name):
@@ -179,7 +182,7 @@ def _open_e57(source: RecordingSource) -> Recording:
         files = PerProcess(partial(pye57.E57, str(source.path)))
         file = files()
         headers = [file.get_header(number) for number in range(file.scan_count)]
-        # A column of equal values takes no bytes, whatever the number of points.
+        # A column of equal values takes no space in the file, regardless of the number of points.
         total = Allowance(size, _THIN, in_parts=True)
         for header in headers:
             total.take(_bytes_of_scan(header))
@@ -198,7 +201,7 @@ def _open_e57(source: RecordingSource) -> Recording:
         system = _system(file)
         if system is not None and headers and not source.as_stored:
             notes += check_metric_format(system, read(0).in_world())
-            # Else the points are in no such system.
+            # E57 coordinates are in meters. They cannot be in a system that uses another unit.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
         names = [_stated_name(header) for header in headers]
         stations = [] if any(name.endswith(_MOVING) for name in names) else names
@@ -215,10 +218,10 @@ def _open_e57(source: RecordingSource) -> Recording:
 
 
 def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
-    """Read a scan of an open `pye57.E57` in the axes of its scanner, without invalid points.
+    """Read the valid points of a scan from an open `pye57.E57`, in the scanner frame.
 
-    Colors and intensities that are marked as invalid are NaN, and columns of these alone are left
-    out. Other colors are from 0 to 255.
+    Colors and intensities that are marked as invalid are NaN, and a column is omitted if all its
+    values are invalid. Other colors range from 0 to 255.
     """
     scan_name = _name(header, number)
     pose, _ = _pose(header, scan_name)
@@ -251,9 +254,10 @@ def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
 
 
 def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
-    """Read the fields of a scan that have a meaning here, {name: (n,)}.
+    """Read the supported fields of a scan as {name: array with shape (n,)}.
 
-    pye57 would read into types that do not hold every value: bytes of colors, 16 bits of rows.
+    This does not use the reading function of pye57, because its types are too small for some
+    values: 8 bits for colors and 16 bits for row numbers.
     """
     from pye57 import libe57
 
@@ -268,7 +272,7 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
             continue
         letter = "d"
         if isinstance(node, libe57.IntegerNode):
-            letter = "q"  # pye57 takes "l", the letter of np.int64, for 32 bits
+            letter = "q"  # pye57 interprets "l", the letter of np.int64, as 32 bits
         elif isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE:
             letter = "f"
         columns[field] = np.zeros(header.point_count, letter)
@@ -280,12 +284,12 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
 
 
 def _states(kind: str) -> list[str]:
-    """Return the fields that mark points as invalid, that of the coordinates' kind first."""
+    """Return the fields that mark points as invalid, starting with the given coordinate kind."""
     return [f"{of}InvalidState" for of in sorted(_COORDINATES, key=lambda of: of != kind)]
 
 
 def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
-    """Return the Cartesian positions (n, 3) of a scan with coordinates of a kind."""
+    """Return the positions in a scan as Cartesian coordinates of shape (n, 3)."""
     first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
     if kind == "cartesian":
         return np.stack([first, second, third], axis=1)
@@ -296,7 +300,7 @@ def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
 
 
 def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return the colors of a scan from 0 to 255, as bytes or, with NaN, as real numbers."""
+    """Scale the colors of a scan to the range 0 to 255. They are uint8, or float32 with NaN."""
     values = [columns[name] for name in COLORS]
     full = _full_color(header, max(float(np.nanmax(color, initial=0)) for color in values))
     scaled = [np.rint(np.clip(color * (255 / full), 0, 255)) for color in values]
@@ -306,7 +310,11 @@ def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, An
 
 
 def _full_color(header: Any, highest: float) -> float:
-    """Return the value of full color of a scan, by its limits and its highest color."""
+    """Return the color value that represents full intensity in a scan.
+
+    It is the limit that the scan declares, if this limit is plausible for 8 to 32 bits and not
+    below the highest color in the scan. Otherwise it is derived from the highest color.
+    """
     from pye57 import libe57
 
     prototype = libe57.StructureNode(header.points.prototype())
@@ -325,7 +333,10 @@ def _full_color(header: Any, highest: float) -> float:
 
 
 def _scale(headers: Sequence[Any]) -> _Scale:
-    """Return how the intensities of scans are brought to the same scale, by their limits."""
+    """Return how to convert the intensities of all scans to the same scale.
+
+    Intensities are used as stored unless all scans that have them declare limits.
+    """
     limits: list[Limits | None] = []
     for header in headers:
         low, high = (
@@ -349,7 +360,7 @@ def _scale(headers: Sequence[Any]) -> _Scale:
 
 
 def _limit(header: Any, group: str, name: str) -> float | None:
-    """Return a limit that a scan states, or None."""
+    """Return a limit that a scan declares, or None if there is no finite limit."""
     if not header.node.isDefined(f"{group}/{name}"):
         return None
     value = _number(header.node[group][name])
@@ -357,7 +368,7 @@ def _limit(header: Any, group: str, name: str) -> float | None:
 
 
 def _number(node: Any) -> float:
-    """Return the value of a node that is a number."""
+    """Return the value of a numeric node."""
     from pye57 import libe57
 
     is_scaled = isinstance(node, libe57.ScaledIntegerNode)
@@ -365,20 +376,20 @@ def _number(node: Any) -> float:
 
 
 def _name(header: Any, number: int) -> str:
-    """Return the name of a scan in messages."""
+    """Return the name by which messages refer to a scan."""
     name = _stated_name(header)
     return f"scan {number + 1}" + (f" ({name!r})" if name else "")
 
 
 def _stated_name(header: Any) -> str:
-    """Return the name that a scan states, or an empty string."""
+    """Return the name that is stored in a scan, or an empty string."""
     return printable(str(header.node["name"].value())) if header.node.isDefined("name") else ""
 
 
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the pose (4, 4) of a scan, and notes on it, or None for a scan without a pose.
+    """Return the pose of a scan with shape (4, 4), or None if it has none, and notes about it.
 
-    ValueError if the pose is not finite.
+    Raises ValueError if the pose is not finite.
     """
     node = header.node
     if not node.isDefined("pose"):
@@ -415,12 +426,12 @@ def _listed(numbers: Floats) -> str:
 
 
 def _bytes_of_scan(header: Any) -> int:
-    """Return the memory of the columns of a scan of an E57, of 8 bytes a number."""
+    """Return the memory that the columns of a scan require, with 8 bytes per value."""
     return 8 * int(header.point_count) * len(header.point_fields)
 
 
 def _system(file: Any) -> StatedSystem | None:
-    """Return the coordinate system that an open `pye57.E57` states (ASTM E2807, 8.4.2), or None."""
+    """Return the coordinate system that an open `pye57.E57` declares (ASTM E2807, 8.4.2)."""
     root = file.root
     if not root.isDefined("coordinateMetadata"):
         return None

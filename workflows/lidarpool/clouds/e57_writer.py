@@ -1,4 +1,4 @@
-"""Files of pye57 with what it leaves out: coordinate systems, times, normals, and fixed GUIDs."""
+"""Extensions of pye57 that write coordinate systems, times, normals and reproducible GUIDs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .gps_time import gps_start_s
 
 
 class E57Writer(pye57.E57):
-    """A new file whose header states coordinate system and time, which pye57 leaves empty."""
+    """A new E57 file with a coordinate system and a creation time, which pye57 leaves empty."""
 
     def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
         self._system = system
@@ -29,18 +29,18 @@ class E57Writer(pye57.E57):
         super().__init__(str(path), mode="w")
 
     def write_default_header(self) -> None:
-        """Write the header, with the system as coordinateMetadata, and the creation time."""
+        """Write the header, with the coordinate system and the creation time."""
         self._in_header = True
         super().write_default_header()
         self._in_header = False
 
     @property
     def root(self) -> Any:
-        """Root of the file, or an object that takes its fields while the header is written."""
+        """Root node of the file, or an object that intercepts fields while writing the header."""
         return SimpleNamespace(set=self._set_field) if self._in_header else super().root
 
     def _set_field(self, name: str, node: Any) -> None:
-        if name == "coordinateMetadata":  # no field can be set twice
+        if name == "coordinateMetadata":  # replaced here, because a field can only be set once
             node = libe57.StringNode(self.image_file, self._system)
         if name == "creationDateTime":
             has_start = self._sweeps.start_ns is not None
@@ -52,16 +52,16 @@ class E57Writer(pye57.E57):
 
 
 class E57WriterWithNormals(E57Writer):
-    """A file whose scans have normals, which pye57 leaves out."""
+    """A new E57 file whose scans have normals, which pye57 does not support."""
 
     def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
-        """Return buffers with the fields of normals added."""
+        """Return the buffers of pye57, with normals added."""
         return super().make_buffers([*field_names, *NORMAL_FIELDS], *arguments, **options)
 
 
 @contextmanager
 def normal_fields() -> Iterator[None]:
-    """Have pye57 write fields of normals."""
+    """Patch pye57 so that it writes normals."""
     supported = pye57.e57.SUPPORTED_POINT_FIELDS
     library = pye57.e57.libe57
 
@@ -82,7 +82,7 @@ def normal_fields() -> Iterator[None]:
 
 @contextmanager
 def named_by(content: str) -> Iterator[None]:
-    """Derive the GUIDs of a file and its scans from a text, where pye57 draws random GUIDs."""
+    """Patch pye57 so that it derives GUIDs from a text, instead of generating random GUIDs."""
     numbers = count()
     uuid_module = pye57.e57.uuid
     pye57.e57.uuid = SimpleNamespace(

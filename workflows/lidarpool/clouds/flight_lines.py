@@ -1,4 +1,4 @@
-"""Scan angles, lines of mirrors and flight lines, as LAS 1.4 (R15) defines them."""
+"""Scan angles, scan lines and flight lines of airborne surveys, as defined by LAS 1.4 (R15)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from lidarsim.sensor.sensor import LineSensor, Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
-_MAX_SOURCE = 65_535  # largest number of a source in the format
-_MIN_STEP_M = 1e-6  # a carrier that moves by more in 2 ms, or a sweep, counts as moving
-_SAMPLE_S = 0.05  # of trajectories, to find flight lines
+_MAX_SOURCE = 65_535  # largest point source ID in the format
+_MIN_STEP_M = 1e-6  # distance in 2 ms, or in a sweep, above which a platform is moving
+_SAMPLE_S = 0.05  # interval at which trajectories are sampled to find flight lines
 _MAX_SAMPLES = 200_000
-_LINES = 1 << 40  # numbers reserved for the lines of a station
+_LINES = 1 << 40  # number of line numbers that are reserved for each station
 
 
 def flight_lines(survey: Survey) -> StraightLines | None:
-    """Return the flight lines of an airborne survey, None without any."""
+    """Return the flight lines of an airborne survey, or None if there are none."""
     airborne = any(isinstance(mounted.sensor, LineSensor) for mounted in survey.carried)
     if not (airborne and survey.path.moves):
         return None
@@ -36,9 +36,12 @@ def flight_lines(survey: Survey) -> StraightLines | None:
 
 
 def scanned_lines(survey: Survey) -> dict[str, float] | None:
-    """Return number, duration and length of the flight lines on which a scanner fires.
+    """Summarize the flight lines on which at least one scanner fires, or return None.
 
-    `seconds` and `length_m` are those while a scanner fires. None if no scanner fires on a line.
+    Returns
+    -------
+    ``count`` is the number of lines. ``seconds`` and ``length_m`` are the total duration and length
+    of the parts of these lines on which a scanner fires.
     """
     lines = flight_lines(survey)
     if lines is None:
@@ -59,25 +62,26 @@ def scanned_lines(survey: Survey) -> dict[str, float] | None:
 
 
 def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
-    """Return the start and the end of the firings of a sensor in a number of time steps."""
+    """Return when a sensor starts and stops firing in a survey of `steps` time steps, in seconds."""
     _, firings = sensor.firings(steps - 1)
     return sensor.start_ns / 1e9, sensor.begins_ns(np.array([firings])).item() / 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class LineFields:
-    """Fields of points that depend on mirrors and flight lines."""
+    """LAS fields of k points that depend on scan lines and flight lines."""
 
-    # (k,): degrees about the direction of flight from straight down, negative to the left.
+    # (k,): degrees from straight down, about the direction of flight, negative to the left.
     scan_angle_deg: Floats
-    direction: Bytes  # (k,): 1 while a mirror sweeps from left to right, else 0
-    edge: Bools  # (k,): True if the pulse is the last of its line with a return
-    source: Ints  # (k,): number of flight line or station, and sensor, from 1; 0 if too large
-    line: Ints  # (k,): number of a mirror's line, unique in the survey; -1 without a mirror
+    direction: Bytes  # (k,): 1 while the mirror moves from left to right, otherwise 0
+    edge: Bools  # (k,): True if the pulse is the last pulse in its scan line that has a return
+    # (k,): number of the flight line or station and of the sensor, from 1. 0 if it is too large.
+    source: Ints
+    line: Ints  # (k,): scan line number, unique in the survey, or -1 if there is no mirror
 
     @classmethod
     def empty(cls, count: int) -> LineFields:
-        """Return the fields of points of an unknown survey."""
+        """Return default values for points whose survey is unknown."""
         return cls(
             np.zeros(count),
             np.zeros(count, np.uint8),
@@ -88,24 +92,25 @@ class LineFields:
 
 
 class FlightLines:
-    """Computes the line fields of the points of a survey.
+    """Computes the `LineFields` of the points in a survey.
 
-    The direction of flight is the direction of the sensor's movement, or the x axis of a static
-    sensor. Sources are numbered by flight line or station, and with several sensors by sensor.
+    The direction of flight is the direction in which the sensor moves, or the x axis of a static
+    sensor. Point sources are numbered by flight line or station, and by sensor if there are several
+    sensors.
     """
 
     def __init__(self, sweeps: Sweeps) -> None:
         self.sweeps = sweeps
 
     def with_fields(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
-        """Yield consecutive points with their fields.
+        """Yield chunks of points with their fields.
 
-        Points that are not in the order of their scans have no edges of lines.
+        Points that are not sorted by scan are not marked as the edge of a scan line.
 
         Raises
         ------
         LidarError
-            If the points are of another survey.
+            If the points do not belong to the survey.
         """
         held: tuple[Cloud, LineFields] | None = None
         for chunk in chunks:
@@ -114,7 +119,7 @@ class FlightLines:
             fields = self._fields(chunk)
             if held is not None:
                 _, held_fields = held
-                if held_fields.line[-1] == fields.line[0]:  # the line goes on in this chunk
+                if held_fields.line[-1] == fields.line[0]:  # the line continues in this chunk
                     held_fields.edge[held_fields.line == held_fields.line[-1]] = False
                 yield held
             held = chunk, fields
@@ -122,7 +127,7 @@ class FlightLines:
             yield held
 
     def _fields(self, chunk: Cloud) -> LineFields:
-        """Return the fields of a chunk, whose end counts as the end of a line."""
+        """Return the fields of a chunk, assuming that its last line does not continue."""
         fields = LineFields.empty(len(chunk))
         if not len(self.sweeps) or "scan" not in chunk.columns:
             return fields
@@ -135,7 +140,8 @@ class FlightLines:
         line = fields.line
         if (np.diff(sweep) < 0).any():
             return fields
-        # Index of the last point of each line; a pulse has one time, or without times one ray.
+        # Find the last point in each line. Points with the same time, or without times, with the
+        # same ray, belong to the same pulse.
         last_rows = np.append(np.flatnonzero(np.diff(line)), len(line) - 1)
         last = last_rows[np.searchsorted(last_rows, np.arange(len(line)))]
         pulse = next((chunk[name] for name in ("time", "ray") if name in chunk.columns), None)
@@ -144,10 +150,11 @@ class FlightLines:
         return fields
 
     def _fill(self, fields: LineFields, row_indices: Indices, sweep: int, points: Cloud) -> None:
-        """Fill in the fields of the points of a sweep, without edges."""
+        """Set the fields of the points in a sweep, except `edge`."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
-        # Rounded as in files: parts and cloud.ply have other digits behind the precision.
+        # Positions are rounded as in files, because those in parts and in cloud.ply differ in the
+        # digits beyond the precision.
         exact = np.rint(points.positions.astype(np.float64) / sweeps.precision_m)
         exact *= sweeps.precision_m
         in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
@@ -165,14 +172,14 @@ class FlightLines:
         station = int(self._stations[sweep])
         begin_ns = sweeps.begins_ns[sweep] - station * sweeps.station_ns
         line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
-        # The sensor looks backwards.
+        # A sensor that points backward sees the mirror move in the opposite direction.
         against = sweeps.pose.rotations[sweep][:, 0] @ self._directions[sweep] < 0
         fields.direction[row_indices] = mirror.leftwards(line) == int(against)
         fields.line[row_indices] = (sensor * sweeps.stations + station) * _LINES + line
 
     @cached_property
     def _directions(self) -> Floats:
-        """Direction of flight in each sweep, level unit vectors (n, 3)."""
+        """Direction of flight in each sweep, as horizontal unit vectors of shape (n, 3)."""
         axes = self.sweeps.pose.rotations[:, :, 0]
         knots = self.sweeps.knots
         moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
@@ -180,14 +187,14 @@ class FlightLines:
 
     @cached_property
     def _stations(self) -> Ints:
-        """Station of each sweep: (n,)."""
+        """Station of each sweep, with shape (n,)."""
         sweeps = self.sweeps
         per_station = np.bincount(sweeps.sensor) // sweeps.stations
         return sweeps.numbers // np.maximum(per_station[sweeps.sensor], 1)
 
     @cached_property
     def _sources(self) -> Ints:
-        """Number of the source of each sweep, from 1: (n,)."""
+        """Point source ID of each sweep, starting at 1, with shape (n,)."""
         sweeps = self.sweeps
         source = self._stations.copy()
         for sensor, lidar in enumerate(sweeps.lidars):
@@ -195,16 +202,22 @@ class FlightLines:
             if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:
                 begins_s = sweeps.begins_ns[rows] / 1e9
                 lines = StraightLines.find(begins_s, sweeps.pose.positions[rows])
-                # Sweeps in a turn belong to the line before.
+                # Sweeps in a turn belong to the previous line.
                 line = np.searchsorted(lines.starts_s, begins_s, "right") - 1
                 source[rows] = np.maximum(line, 0)
         return source * max(len(sweeps.sensors), 1) + sweeps.sensor + 1
 
 
 def _level(moves: Floats, axes: Floats) -> Floats:
-    """Return level unit vectors (k, 3) along movements (k, 3), or along axes without a movement.
+    """Return horizontal unit vectors of shape (k, 3) in the direction of movement.
 
-    `axes` are (k, 3) or (3,); where they point straight up or down, the direction is x.
+    Parameters
+    ----------
+    moves
+        Movements, with shape (k, 3).
+    axes
+        Directions to use for rows without a movement, with shape (k, 3) or (3,). Vertical axes are
+        replaced by the x axis.
     """
     stands = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
     ahead = np.where(stands[:, None], axes, moves) * (1.0, 1.0, 0.0)

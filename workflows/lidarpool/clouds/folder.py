@@ -1,4 +1,4 @@
-"""The folder of results and exports: one writer at a time, no partial files."""
+"""Output folders for results and exports, with one writer at a time and without partial files."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from pathlib import Path
 from lidarsim.base.errors import LidarError, MissingFileError, as_sentence, explained
 from lidarsim.base.storage import WRITING, Storage, is_url
 
-LAST_FILE = "report.json"  # a result with this file is complete
+LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 
 
 def output_place(text: str | Path) -> Path | Storage:
-    """Return the destination of a result: a folder, or storage for a URL."""
+    """Return the destination for a result, which is remote storage if the text is a URL."""
     return Storage.at(text) if is_url(text) else Path(text)
 
 
 @contextmanager
 def result_folder(output: Path | Storage) -> Iterator[Path]:
-    """Lock a folder for a result or export: created if missing, writable, exclusive.
+    """Create and lock the folder for a result or export.
 
-    Leftovers of a killed run or export are removed; and, if the body ends without leaving files,
-    folders that were created for it. For storage it is a temporary folder, whose files the caller
-    puts into the storage.
+    Temporary files of a killed run or export are removed. Folders that were created on entry are
+    removed on exit if they are still empty. If the output is storage, the context manager yields a
+    temporary folder, and the caller must copy its files to the storage.
 
     Raises
     ------
     LidarError
-        If it is a file, cannot be created or written to, or another run or export uses it.
+        If the path is a file, if the folder cannot be created or written to, or if another run or
+        export is using it.
     """
     if isinstance(output, Storage):
         output.claim()
@@ -68,7 +69,7 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
 
 
 def refuse_missing(place: Path | Storage, advice: str) -> None:
-    """Raise LidarError with advice if a path, of a folder or file, does not exist."""
+    """Raise LidarError with advice for the user if a local file or folder does not exist."""
     local = place if isinstance(place, Path) else Path(place.url) if place.is_local else None
     if local is not None and not local.exists():
         raise MissingFileError(f"{place} does not exist. {as_sentence(advice)}")
@@ -76,9 +77,20 @@ def refuse_missing(place: Path | Storage, advice: str) -> None:
 
 @contextmanager
 def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
-    """Yield the folder of a result: for storage, a temporary copy of the files `names`.
+    """Yield the folder of a result, or a temporary local copy if the result is in storage.
 
-    LidarError if the folder does not exist, the storage cannot be read, or has no complete result.
+    Parameters
+    ----------
+    output
+        Folder or storage that contains the result.
+    names
+        Files to copy from storage, in addition to the report. Missing files are skipped.
+
+    Raises
+    ------
+    LidarError
+        If the folder does not exist, or if the storage cannot be read or does not contain a
+        complete result.
     """
     refuse_missing(output, "specify the output folder of a finished run")
     with local_folder(output) as folder:
@@ -100,10 +112,18 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
 
 
 def send(path: Path, output: Path | Storage) -> str:
-    """Copy a file or folder of `result_folder` to storage, unless the destination is local.
+    """Copy a file or folder from `result_folder` to storage, unless the output is local.
 
-    Files of that name in the storage are replaced. Returns the path or URL, for messages.
-    LidarError if the storage cannot be written to.
+    An existing file or folder with the same name is replaced.
+
+    Returns
+    -------
+    The path or URL of the file or folder, for messages.
+
+    Raises
+    ------
+    LidarError
+        If the storage cannot be written to.
     """
     if not isinstance(output, Storage):
         return str(path)
@@ -116,7 +136,7 @@ def send(path: Path, output: Path | Storage) -> str:
 
 @contextmanager
 def local_folder(output: Path | Storage) -> Iterator[Path]:
-    """Yield a folder itself, or for storage a temporary folder with the last name of its URL."""
+    """Yield the output folder, or for storage a temporary folder named like the end of its URL."""
     if not isinstance(output, Storage):
         yield output
         return
@@ -128,9 +148,9 @@ def local_folder(output: Path | Storage) -> Iterator[Path]:
 
 @contextmanager
 def staging(folder: Path, shown: object = None) -> Iterator[Path]:
-    """Temporary folder in a folder, for files that are moved into place once they are complete.
+    """Create a temporary subfolder for files that are moved into place once they are complete.
 
-    Errors name `shown`, by default `folder`, instead of the temporary folder.
+    Error messages mention `shown` instead of the temporary folder (default: `folder`).
     """
     staged = folder / f"{WRITING}{secrets.token_hex(4)}"
     try:
@@ -143,7 +163,7 @@ def staging(folder: Path, shown: object = None) -> Iterator[Path]:
 
 
 def _lock(folder: Path) -> int:
-    """Lock a folder until the returned handle is closed, or this process ends."""
+    """Lock a folder until the returned file descriptor is closed or this process exits."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

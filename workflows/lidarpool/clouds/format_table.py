@@ -118,7 +118,7 @@ FORMATS = {
         "packets", "lidarpool.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
     ),
     "rrd": FormatRow("cloud.rrd", "lidarpool.clouds.rrd:Rerun", packages=("rerun",), extra="rerun"),
-    # Readers take the type of messages from the part «sd» of the file's name.
+    # Readers derive the message type from the suffix "_sd" in the file name.
     "osi": FormatRow("cloud_sd.osi", "lidarpool.clouds.osi:OSI", **_OSI),
     "osi_mcap": FormatRow("cloud_osi.mcap", "lidarpool.clouds.osi:OSIInMCAP", **_OSI),
     "mcap": FormatRow("cloud.mcap", "lidarpool.clouds.ros.bags:MCAP", (".mcap",), **_ROS),
@@ -146,7 +146,7 @@ LAYOUTS = ("velodyne", "autoware", "ouster", "images", "livox", "hesai", "robose
 
 
 def data_set_title(data_set: str) -> str:
-    """Return the proper name of the format of a data set's jobs, such as KITTI."""
+    """Return the proper name of a data set format, for example KITTI."""
     return format_named(DATA_SETS[data_set]).title if data_set in DATA_SETS else data_set
 
 

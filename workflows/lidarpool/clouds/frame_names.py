@@ -1,4 +1,4 @@
-"""Names of frames and topics of sweeps, alike in bags of ROS and in live views."""
+"""Names of frames and topics, which are the same in ROS bags and in live views."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ INSTRUMENTS = "imu", "gnss"
 
 
 def frame_names(sensors: Sequence[str], actors: Sequence[str]) -> list[str]:
-    """Return the frames of sensors, then of actors, the IMU and the GNSS receiver, by names."""
+    """Return unique frame names for the sensors, the actors, the IMU and the GNSS receiver.
+
+    The frames are in this order. The name of an unnamed sensor is an empty string.
+    """
     named = (*(name or "lidar" for name in sensors), *actors)
     return plain_names((WORLD, CARRIER, *named, *INSTRUMENTS))[2:]
 
 
 def points_topic(name: str, frame: str) -> str:
-    """Return the topic of the points of a sensor with a name, which may be empty, and a frame."""
+    """Return the topic for the points of a sensor, given its name and its frame.
+
+    The name of an unnamed sensor is an empty string.
+    """
     return f"/{frame}/points" if name else "/points"
 
 
 def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey, ns since 1970-01-01 UTC, or `START_NS` without a date.
+    """Return the start of a survey in ns since 1970-01-01 UTC, or `START_NS` if it is unknown.
 
-    Not 0: at time 0, tf2 would take the newest frames for all times.
+    The default is not 0, because tf2 interprets time 0 as a request for the latest transform.
     """
     return START_NS if sweeps.start_ns is None else sweeps.start_ns

@@ -1,4 +1,4 @@
-"""Range images: the rays of a sweep as a table of channels and firings, also without a return."""
+"""Range images, which contain all rays of a sweep by channel and firing, even without returns."""
 
 from __future__ import annotations
 
@@ -27,21 +27,26 @@ from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat
 from .recording import Recording, RecordingSource
 
-_NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are not images
+_NO_IMAGES = ("pose", "scan", "frame")  # arrays in a file that are not images
 
-# Columns of points that images have for every ray, or that follow from the pixel.
+# Columns that are stored for every ray, or that follow from the position in the image.
 _RAY_COLUMNS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")
 
 
 class ImageFolder(MultiFileFormat):
-    """A NumPy archive for each sweep: `NAME/000000.npz`, NAME from the sensor, or `lidar`.
+    """A folder of range images, with one NumPy archive per sweep.
 
-    In a data set, `images/JOB/NAME/000000.npz`. Arrays are images, (channels, firings): `range` and
-    all columns of the points of first returns, and with the number of the return behind the name
-    (`range2`) of later returns; of all rays `time`, `azimuth` and `elevation`; `x`, `y` and `z` in
-    meters in the sensor frame at the start of the sweep. In addition, `scan` of each firing, `pose`
-    (4, 4), from the sensor frame at the start of the sweep to the world frame, and `frame`, the
-    frame of the points in words.
+    The archives are `NAME/000000.npz`, or `images/JOB/NAME/000000.npz` in a data set, where NAME is
+    the name of the sensor or `lidar`. An archive contains images of shape (channels, firings):
+
+    - `range` and all other columns of the points. Images without a number contain the first
+      returns, and images with a number the later returns, for example `range2`.
+    - `time`, `azimuth` and `elevation` of all rays, including rays without a return.
+    - `x`, `y` and `z` in meters, in the sensor frame at the start of the sweep.
+
+    It also contains `scan` for each firing, `pose` of shape (4, 4), which transforms from the
+    sensor frame at the start of the sweep to the world frame, and `frame`, a description of the
+    frame of the points.
     """
 
     title = "range images"
@@ -57,7 +62,7 @@ class ImageFolder(MultiFileFormat):
         self.folders = self._folders_of(sweeps, entry)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
-        """Return the file of a sweep, and its boxes where there are actors."""
+        """Return the file of a sweep, and its boxes if there are actors."""
         sweeps = self.sweeps
         image = Image.from_points(sweeps, number, points)
         positions = sweeps.in_sensor(number, points.positions).astype(np.float32)
@@ -80,33 +85,36 @@ class ImageFolder(MultiFileFormat):
 
     @classmethod
     def _folders_of(cls, sweeps: Sweeps, entry: Entry | None) -> list[str]:
-        """Return the folders of the sensors."""
+        """Return the folder of each sensor."""
         names = plain_names(name or "lidar" for name in sweeps.sensors)
         return names if entry is None else [f"{cls.path_of_job(entry)}/{name}" for name in names]
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the name of the file of the images."""
+        """Return the name of the archive with the images."""
         folders = job.cached("folders", lambda: cls._folders_of(job.sweeps, job.entry))
         return [_file(job.sweeps, folders, sweep)]
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return points with all columns, and time and angles of each ray, in the order of rays."""
+        """Read points with all columns, including the time and angles of their rays.
+
+        Points are sorted by ray.
+        """
         (file,) = cls.sweep_files(job, sweep)
         with open_archive(job.storage.path(file), partial(job.storage.read, file)) as images:
             return points_of_images(images)
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the range images in a folder, whose folders are sensors."""
+        """Open the range images in a folder that has one subfolder per sensor."""
         with reading(source.name):
             sensors = _sensors(source)
         return source.of_sensors(sensors)
 
 
 def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
-    """Return the points of the images of a sweep, in the order of their rays."""
+    """Convert the images of a sweep to points, sorted by ray."""
     images = {name: image for name, image in images.items() if name not in _NO_IMAGES}
     planes = next(n for n in count(1) if _key("range", n) not in images)
     keys_of_later_returns = {_key(name, plane) for name in images for plane in range(1, planes)}
@@ -123,7 +131,7 @@ def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
 
 
 def _key(name: str, plane: int) -> str:
-    """Return the name of a column's array in the image of a return, numbered from 0."""
+    """Return the name of the image that contains a column for a return, numbered from 0."""
     return f"{name}{plane + 1}" if plane else name
 
 
@@ -132,7 +140,7 @@ def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
 
 
 def _sensors(source: RecordingSource) -> dict[str, Recording]:
-    """Open range images in folders of .npz files, {sensor: recording}."""
+    """Open the range images of each sensor, as {sensor: recording}."""
     files_of_sensor = {
         inner.name: sort_by_number(inner.glob("*.npz"))
         for inner in sorted(source.path.iterdir())

@@ -1,4 +1,4 @@
-"""Full scale of the intensities of a cloud, for formats that store them as integers."""
+"""Full scale of the intensities in a cloud, for formats that store them as integers."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from lidarsim.columns.cloud import CloudLike
 
-_SATURATED_SHARE = 0.01  # greatest share of points whose intensity is the highest integer
-_HIGHEST = 65_535  # integer that stands for the full scale
-_MIN_EXPONENT = -149  # of the smallest number of float32
-_EXPONENTS = 300  # numbers of exponents that are counted
+_SATURATED_SHARE = 0.01  # maximum share of points that are stored as the highest integer
+_HIGHEST = 65_535  # integer that represents the full scale
+_MIN_EXPONENT = -149  # exponent of the smallest float32
+_EXPONENTS = 300  # number of exponents that are counted
 
 
 def full_scale_of(cloud: CloudLike) -> float | None:
-    """Return the full scale of the intensities of a cloud.
+    """Return the full scale of the intensities in a cloud.
 
     The full scale is the smallest power of two at which at most 1 % of the points are stored as
     65,535. It depends on the points only, not on their order or on how they are divided into

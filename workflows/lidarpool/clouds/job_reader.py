@@ -1,4 +1,4 @@
-"""The files of a job in a data set, from which formats read single sweeps."""
+"""Access to the files of a data set job, from which formats read single sweeps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class JobReader:
-    """Reads the files of one job of a data set, in any order, in a single thread."""
+    """Reads the files of one data set job, in any order, from a single thread."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class JobReader:
         self.entry = entry
         self.layout = layout  # point layout in mcap
         self.classes = classes  # names of the classes of all jobs
-        self.last_file = ""  # the file that `read_rows` read last, for error messages
+        self.last_file = ""  # the file that `read_rows` has read last, for error messages
         self.opened = ExitStack()  # open files, which `close` closes
         self._cache: dict[str, Any] = {}
         self._copies: Path | None = None

@@ -1,4 +1,4 @@
-"""KITTI: folders of binary files with the labels of SemanticKITTI, and boxes of actors."""
+"""Read and write KITTI folders with the labels of SemanticKITTI and bounding boxes of actors."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class KITTI(MultiFileFormat):
     - `times.txt`: times in seconds.
     - `calib.txt`: calibration.
 
-    `label_02/00.txt` contains the boxes of all sweeps in the layout of KITTI tracking, in which the
-    number of a track is that of the instance.
+    `label_02/00.txt` contains the boxes of all sweeps in the layout of KITTI tracking. The track
+    IDs are the instance numbers.
 
-    Poses and boxes are in the frame of a KITTI camera at the position of the sensor, to which `Tr`
-    transforms. The camera is level on average, even if the sensor is tilted, because KITTI rotates
-    boxes only about the vertical axis of the camera. KITTI's own tools expect the poses in
-    `poses/00.txt`.
+    Poses and boxes are in the frame of a virtual KITTI camera at the position of the sensor. `Tr`
+    in the calibration transforms points to this frame. The camera is level on average, even if the
+    sensor is tilted, because KITTI only rotates boxes about the vertical axis of the camera.
+    KITTI's own tools expect poses in `poses/00.txt`, so they are stored there, too.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
@@ -117,7 +117,7 @@ class KITTI(MultiFileFormat):
         return files, boxes
 
     def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
-        """Return poses, times, calibrations and tracks."""
+        """Return the files with poses, times, calibrations and tracks."""
         sweeps = self.sweeps
         files: dict[str, bytes] = {}
         for sensor, (folder, camera) in enumerate(zip(self.sequences, self.cameras, strict=True)):
@@ -144,7 +144,7 @@ class KITTI(MultiFileFormat):
         return files
 
     def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
-        """Return the boxes of a sensor's sweeps in the layout of KITTI tracking."""
+        """Return the boxes of all sweeps of a sensor in the layout of KITTI tracking."""
         sweeps = self.sweeps
         lines = []
         for frame, number in enumerate(numbers):
@@ -166,7 +166,7 @@ class KITTI(MultiFileFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Read points with intensity (reflectivity from 0 to 1), class and object."""
+        """Read points with intensity (the reflectivity from 0 to 1), class and object."""
         file, labels_file = cls.sweep_files(job, sweep)
         rows = job.read_rows(file, np.dtype("<f4")).reshape(-1, 4)
         labels = job.read_rows(labels_file, np.dtype("<u4"), len(rows))
@@ -177,7 +177,7 @@ class KITTI(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .bin file of KITTI or nuScenes, or a sequence of KITTI or SemanticKITTI."""
+        """Open a KITTI or nuScenes .bin file, or a KITTI or SemanticKITTI sequence."""
         path = source.path
         if not path.is_dir():
             labels = path.parent.parent / "labels" / f"{path.stem}.label"
@@ -188,7 +188,7 @@ class KITTI(MultiFileFormat):
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> dict[str, bytes]:
-        """Return the names and colors (blue, green, red) of classes, for semantic-kitti-api."""
+        """Return the class file for semantic-kitti-api, with names and BGR colors."""
         labels = {0: "unlabeled", **classes}
         colors = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
         content = {"labels": labels, "color_map": colors}
@@ -196,12 +196,12 @@ class KITTI(MultiFileFormat):
 
 
 def intensity_of(points: Cloud) -> Floats32:
-    """Return the reflectivity of points (n,) from 0 to 1, which KITTI stores as intensity."""
+    """Return the reflectivity of points scaled to 0 to 1, which KITTI stores as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
-    """Return the names of the sequences of all sensors."""
+    """Return the name of each sensor's sequence."""
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
     first = f"{entry.number:02}"
@@ -216,12 +216,12 @@ def _table(matrix: Floats) -> bytes:
 
 
 def _row(rotation: Floats) -> str:
-    """Return a rotation (3, 3) as the text of a 3 x 4 matrix."""
+    """Format a rotation of shape (3, 3) as a 3 x 4 matrix without translation."""
     return " ".join(f"{value:.9e}" for value in np.column_stack([rotation, np.zeros(3)]).ravel())
 
 
 def _camera(sweeps: Sweeps, sensor: int) -> Floats:
-    """Return the rotation (3, 3) from a sensor's frame to a level camera with the same heading."""
+    """Return the rotation from the sensor frame to a level camera frame with the same heading."""
     up = matrices(sweeps.pose.quaternions[sweeps.sensor == sensor])[:, 2].sum(axis=0)
     leftward = np.cross(up, [1, 0, 0])
     if not leftward.any():  # the sensor looks straight up or down, or is upside down
@@ -235,9 +235,9 @@ def _labels(
 ) -> Iterator[tuple[int, str, str]]:
     """Yield the number, the type and the label values of each actor that has points.
 
-    The values are those that follow the truncation. There are no images, so the occlusion is 3
-    (unknown) and the image box is zero. The position is the center of the bottom face, and boxes
-    are only rotated about the y axis of the camera.
+    The label values start with the occlusion. There are no images, so the occlusion is 3 (unknown)
+    and the image box is zero. The position is the center of the bottom face, and boxes are only
+    rotated about the y axis of the camera.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
@@ -273,13 +273,13 @@ def _sequences(source: RecordingSource) -> dict[str, Recording]:
 
 
 def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "") -> Recording:
-    """Open the sweeps in a folder, with labels, poses and times if they exist."""
+    """Open a folder of sweeps, with labels, poses and times if they exist."""
     files = sort_by_number((folder / inner).glob("*.bin"))
     calibration = folder / CALIBRATION_FILE
     notes = []
 
     def of_frames(rows: Floats, table: str) -> Floats:
-        """Return the rows that belong to the files, and add a note on any other rows."""
+        """Return the rows that belong to point files, and add a note about any other rows."""
         indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
             notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
@@ -317,17 +317,17 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:
-    """Return the poses (n, 4, 4) of the lidar, given the rows (n, 3, 4) of `poses.txt`.
+    """Convert the matrices in `poses.txt`, of shape (n, 3, 4), to lidar poses of shape (n, 4, 4).
 
-    The rows are poses of a camera, whose position relative to the lidar is in the file
-    `calibration`. If this file does not exist, they are poses of the lidar.
+    The matrices are camera poses. The file `calibration` contains the transformation from the lidar
+    to the camera. If this file does not exist, they are assumed to be lidar poses.
     """
     camera = _calibration(calibration)
     return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
 
 
 def _matrices(path: Path) -> Floats:
-    """Read the matrices (n, 3, 4) in a file, one per line.
+    """Read a file with one 3 x 4 matrix per line, as an array of shape (n, 3, 4).
 
     Raises ValueError with the line number if a line is invalid.
     """
@@ -339,9 +339,9 @@ def _matrices(path: Path) -> Floats:
 
 
 def _calibration(path: Path) -> Floats:
-    """Read the transformation (4, 4) from the lidar to the camera.
+    """Read the transformation from the lidar to the camera, with shape (4, 4).
 
-    If the file does not exist, this is the identity.
+    Returns the identity if the file does not exist.
     """
     if not path.exists():
         return np.eye(4)
@@ -360,7 +360,7 @@ def _calibration(path: Path) -> Floats:
 
 
 def _square(matrix_rows: Floats) -> Floats:
-    """Return a matrix (3, 4) as (4, 4)."""
+    """Extend a matrix of shape (3, 4) to shape (4, 4)."""
     return np.vstack([matrix_rows, [0, 0, 0, 1]])
 
 
