@@ -83,7 +83,7 @@ class Shard:
     def jobs(self, count: int) -> range:
         """Return the indices of this shard's jobs in a campaign with `count` jobs.
 
-        Consecutive jobs belong to different shards, because their run times are often similar.
+        Consecutive jobs belong to different shards.
         """
         return range(self.number - 1, count, self.total)
 

@@ -62,7 +62,7 @@ def scanned_lines(survey: Survey) -> dict[str, float] | None:
 
 
 def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
-    """Return when a sensor starts and stops firing in a survey of `steps` time steps, in seconds."""
+    """Return when a sensor starts and stops firing in a survey of `steps` steps, in seconds."""
     _, firings = sensor.firings(steps - 1)
     return sensor.start_ns / 1e9, sensor.begins_ns(np.array([firings])).item() / 1e9
 

@@ -1,4 +1,4 @@
-"""LAS and LAZ 1.4, point formats 6 and 7, with waveforms 9 and 10, through laspy."""
+"""Read and write LAS and LAZ with laspy. Written files are version 1.4, point formats 6 to 10."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _MAX_VLR_BYTES = 65_535  # limit for a variable length record
 _TEXT_AREA = 3  # ID of the record with a description
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
 _ON_GRID = 0.1  # tolerated distance from the grid as a fraction of the precision
-_STEPS = ("X", "Y", "Z")  # dimensions that contain the coordinates as integers
+_STEPS = ("X", "Y", "Z")  # dimensions that contain coordinates as integers
 _MAX_STEPS = 2**31 - 1  # maximum distance from the offset in steps of the precision
 
 
@@ -120,7 +120,7 @@ class LAS(CloudFormat):
         options = {"header": header, "do_compress": self.is_compressed, "closefd": False}
         try:
             with (
-                path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
+                path.open("wb+") as file,  # laspy would not close the file after an error
                 TemporaryFile(dir=path.parent) as packet_file,
             ):
                 with laspy.open(file, "w", **options) as writer:
@@ -146,7 +146,7 @@ class LAS(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the points of a .las or .laz file, in parts."""
+        """Open a .las or .laz file, whose points are read in parts."""
         return _open_las(source)
 
 
@@ -322,7 +322,7 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
 
 
 def _name(name: str) -> str:
-    """Return the name in the extra bytes of a column, given its name in other files."""
+    """Return the name of a column in the extra bytes, given its name in other files."""
     return _NAMES.get(name, name[:32])
 
 
@@ -330,7 +330,7 @@ def _name(name: str) -> str:
 
 
 def _open_las(source: RecordingSource) -> Recording:
-    """Open the points of a .las or .laz file in parts, with a function that samples them."""
+    """Open a .las or .laz file, whose points are read in parts or as an evenly spread sample."""
     path = source.path
     with reading(source.name):
         system = las_system(path)
@@ -376,7 +376,7 @@ def _open_las(source: RecordingSource) -> Recording:
 
 
 def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
-    """Return the positions (k, 3) of a few points that are evenly distributed in a file."""
+    """Return the positions of a few points that are evenly distributed in a file."""
     positions = []
     for number in np.unique(np.linspace(0, count - 1, _SYSTEM_POINTS).astype(int)).tolist():
         if 0 <= number < count:

@@ -1,4 +1,8 @@
-"""LAS and LAZ through laspy: files opened after a check of their headers, and their systems."""
+"""Open LAS and LAZ files safely with laspy, and read their coordinate systems.
+
+Headers are checked first, because damaged headers can make laspy allocate all memory or loop for
+hours.
+"""
 
 from __future__ import annotations
 
@@ -15,32 +19,33 @@ from lidarsim.base.input_files import open_input
 from lidarsim.scene.files.noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
 from lidarsim.scene.files.stated_system import StatedSystem
 
-# Offsets within the header, by ASPRS LAS 1.4 R15, table 3.
-_HEADER_BYTES = 375  # bytes of LAS 1.4; 1.2 has 227
+# Fields of the header and their offsets, according to ASPRS LAS 1.4 R15, table 3.
+_HEADER_BYTES = 375  # header size in LAS 1.4 (LAS 1.2: 227)
 _ENCODING = struct.Struct("<H"), 6
-_LAYOUT = struct.Struct("<HII"), 94  # bytes of the header, offset of the points, number of VLRs
-_EXTENDED = struct.Struct("<QI"), 235  # offset and number of extended VLRs, of LAS 1.4
-_VLR = struct.Struct("<2x16sHH32x")  # user, record, bytes
+_LAYOUT = struct.Struct("<HII"), 94  # header size, offset of the points, number of VLRs
+_EXTENDED = struct.Struct("<QI"), 235  # offset and number of extended VLRs (LAS 1.4 only)
+_VLR = struct.Struct("<2x16sHH32x")  # user ID, record ID, number of bytes
 _EXTENDED_VLR = struct.Struct("<2x16sHQ32x")
 _PROJECTION = b"LASF_Projection"
-_MAX_EXTENDED = 1_000  # extended records that are searched for a coordinate system
-_MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
-_WKT_BIT = 16  # bit of the global encoding: the coordinate system is WKT
-_SIGNATURE = b"LASF"  # first bytes
-_EARLY_END = "failed to fill whole buffer"  # part of the error of lazrs at the end of a file
+_MAX_EXTENDED = 1_000  # maximum number of extended VLRs that are searched
+_MAX_RECORD = 1 << 20  # maximum size of a coordinate system record in bytes
+_WKT_BIT = 16  # bit of the global encoding that marks WKT coordinate systems
+_SIGNATURE = b"LASF"  # first bytes of a file
+_EARLY_END = "failed to fill whole buffer"  # part of the lazrs error message for truncated files
 _SMALLER = "convert it to .las, or downsample it first"
 
 
 @contextmanager
 def open_las(path: Path) -> Iterator[Any]:
-    """Open a .las or .laz file for the body, as a `laspy.LasReader`.
+    """Open a .las or .laz file as a `laspy.LasReader`, after checking its header.
 
     Raises
     ------
     LidarError
-        If the points would take far more memory than the file has bytes.
+        If the points require far more memory than the size of the file suggests.
     ValueError
-        If the header announces more than the file holds; laspy raises further errors.
+        If the header declares more points or records than the file contains. laspy raises further
+        types of errors.
     OSError
         If the file cannot be read.
     """
@@ -60,24 +65,24 @@ def open_las(path: Path) -> Iterator[Any]:
             Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
             try:
                 yield reader
-            except Exception as error:  # the text of the error of lazrs tells its kind
+            except Exception as error:  # only the message of a lazrs error identifies its cause
                 if _EARLY_END not in str(error):
                     raise
                 raise CutShortError("its compressed points are truncated") from error
 
 
 def noise_classes(header: Any) -> tuple[int, ...]:
-    """Return the classes of noise of a file, by the header of laspy."""
+    """Return the classification codes for noise in a file, given its laspy header."""
     return NOISE_CLASSES if header.point_format.id >= 6 else LEGACY_NOISE_CLASSES
 
 
 def las_system(path: Path) -> StatedSystem | None:
-    """Return the coordinate system that a file states, or None.
+    """Return the coordinate system that a file declares, or None if it declares none.
 
     Raises
     ------
     ValueError
-        If the records of the coordinate system are broken.
+        If the coordinate system records are damaged.
     OSError
         If the file cannot be read.
     """
@@ -88,7 +93,7 @@ def las_system(path: Path) -> StatedSystem | None:
 
 
 def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the numbers and contents of the records of a coordinate system."""
+    """Yield the IDs and contents of the coordinate system records in a file."""
     header_size, _, count = _layout(file)
     yield from _records(file, header_size, count, _VLR)
     if header_size >= _HEADER_BYTES:
@@ -99,7 +104,10 @@ def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _records(
     file: BinaryIO, start: int, count: int, head: struct.Struct
 ) -> Iterator[tuple[int, bytes]]:
-    """Yield the numbers and contents of records of `_PROJECTION` among records from `start` on."""
+    """Search `count` records, beginning at byte `start`, for coordinate system records.
+
+    Yields the record ID and content of each record found. `head` is the layout of a record header.
+    """
     for _ in range(count):
         file.seek(start)
         data = file.read(head.size)
@@ -112,10 +120,10 @@ def _records(
 
 
 def _layout(file: BinaryIO) -> tuple[int, int, int]:
-    """Return the size of the header, the offset of the points, and the number of VLRs.
+    """Return the header size, the offset of the points and the number of VLRs.
 
-    ValueError if the numbers contradict each other or the size of the file: laspy would go through
-    four thousand million records.
+    Raises ValueError if these numbers are inconsistent with each other or with the file size.
+    Without this check, laspy would try to read up to four billion records.
     """
     header_size, points_start, records = _unpacked(file, *_LAYOUT)
     file.seek(0)
@@ -135,10 +143,7 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
 
 
 def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, ...]:
-    """Unpack numbers at an offset of a file.
-
-    Raises ValueError if the file is shorter.
-    """
+    """Unpack numbers at an offset in a file. Raises CutShortError if the file is too short."""
     file.seek(offset)
     data = file.read(layout.size)
     if len(data) < layout.size:

@@ -1,4 +1,4 @@
-"""Sweeps of 2D scanners as LaserScan messages of ROS (sensor_msgs)."""
+"""Conversion of sweeps from 2D scanners to the fields of ROS LaserScan messages."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
 
-COLUMNS = "ray", "range"  # columns that a LaserScan needs, with every return
-_MAX_STEP_DIFFERENCE = 1e-6  # largest difference between steps of rays, radians
+COLUMNS = "ray", "range"  # columns that a LaserScan requires, in addition to all returns
+_MAX_STEP_DIFFERENCE = 1e-6  # tolerated difference between angle steps in radians
 
 
 def is_planar(sensor: Sensor) -> bool:
-    """Return True if a sensor is a 2D scanner: a beam that turns in the plane of x and y.
+    """Return True if a sensor is a 2D scanner, whose only beam rotates in its x-y plane.
 
-    Its rays start at its center, and follow each other in even steps.
+    The rays of a 2D scanner start at its origin.
     """
     if sensor.channels != 1 or sensor.spins(np.zeros(1, np.int64)) is None:
         return False
@@ -31,29 +31,34 @@ def is_planar(sensor: Sensor) -> bool:
 
 
 def has_planar_sensors(survey: Survey) -> bool:
-    """Return True if a survey has 2D scanners."""
+    """Return True if a survey has at least one 2D scanner."""
     return any(is_planar(carried.sensor) for carried in survey.carried)
 
 
 def has_laser_scans(sweeps: Sweeps) -> bool:
-    """Return True if bags of a survey have LaserScan messages, provided its cloud has ranges."""
+    """Return True if a bag can contain LaserScan messages, provided that the cloud has ranges."""
     return sweeps.fired is not None and any(map(is_planar, sweeps.fired.sensors))
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRays:
-    """The rays of a sweep of a 2D scanner, with the fields of a LaserScan."""
+    """Rays in a sweep of a 2D scanner, as required for the fields of a LaserScan."""
 
-    angles: Floats  # (n,): radians, continuous, in even steps
-    time_increment_s: float  # between rays
-    scan_time_s: float  # between sweeps
-    range_limits_m: tuple[float, float]
-    ranges: Floats32  # (n,): of the first return, meters; infinite where there is none (REP 117)
-    intensities: Floats32  # (n,): of the first return; 0 where there is none
+    angles: Floats  # (n,): radians, evenly spaced and without jumps at ±pi
+    time_increment_s: float  # time between consecutive rays
+    scan_time_s: float  # time between consecutive sweeps
+    range_limits_m: tuple[float, float]  # minimum and maximum range
+    # (n,): range of the first return in meters, or infinity if there is no return (REP 117).
+    ranges: Floats32
+    intensities: Floats32  # (n,): intensity of the first return, or 0 if there is no return
 
     @classmethod
     def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> ScanRays | None:
-        """Return the rays of a sweep, or None without a 2D scanner or with unknown rays."""
+        """Return the rays of a sweep.
+
+        Returns None if the sensor is not a 2D scanner, if its rays are unknown or not evenly
+        spaced, or if the points have no ranges.
+        """
         fired = sweeps.fired
         if fired is None or "range" not in points.columns:
             return None

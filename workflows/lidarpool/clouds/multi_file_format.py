@@ -1,4 +1,4 @@
-"""Formats with many files, which threads or the workers of a cluster write in parallel."""
+"""Base class for formats with many files, which threads or workers can write in parallel."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 # NumPy, pyarrow and disk I/O hold the GIL for at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
-# Limits of a range, which is lost if its worker is killed.
+# Maximum size of a range. If a worker is killed, its whole range must be written again.
 RANGE_POINTS = 1_000_000
 RANGE_PIECES = 100
-_MARK = ".writing"  # file that exists while ranges are written
+_MARK = ".writing"  # file that exists only while ranges are being written
 
 
 Data = bytes | memoryview
@@ -55,21 +55,27 @@ class MultiFileFormat(CloudFormat):
         return self.sweeps.points(self.cloud, first, stop)
 
     def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
-        """Return the files of a piece as {name: content}, and its details for `shared_files`."""
+        """Return the files of a piece as {name: content}, and details for `shared_files`.
+
+        The type of the details depends on the format.
+        """
         raise NotImplementedError
 
     def shared_files(self, details: Sequence[Any]) -> Mapping[str, bytes]:
-        """Return the files that all pieces share as {name: content}, given all details."""
+        """Return the files that all pieces share as {name: content}.
+
+        `details` are the details that `files` returned for each piece.
+        """
         return {}
 
     def summary(self, details: Sequence[Any]) -> dict[str, Any]:
-        """Return a summary of this job for the manifest of a data set, which must support JSON."""
+        """Return a JSON-serializable summary of this job for the manifest of a data set."""
         return {}
 
     def write(
         self, path: Path, spec: ExportSpec, workers: RangeWorkers | None = None
     ) -> float | None:
-        """Write all files to a new folder; see `write_to`."""
+        """Write all files to a new folder, as described in `write_to`."""
         self.write_to(Storage(str(path), durable=False), spec, workers)
         return None
 
@@ -93,7 +99,7 @@ class MultiFileFormat(CloudFormat):
         writer.start()
         written = workers(writer, spans) if workers else {}
         remaining = [span for span in spans if span not in written]
-        with ThreadPoolExecutor(THREADS, "write") as pool:  # waits for its threads
+        with ThreadPoolExecutor(THREADS, "write") as pool:  # exiting waits for the threads
             results = zip(remaining, pool.map(writer, remaining), strict=True)
             written |= {span: result for span, result in results if result}
         writer.stop()

@@ -1,7 +1,7 @@
-"""Files of a carrier's IMU and GNSS receiver, beside the cloud: imu.csv and gnss.csv.
+"""Measurement files for the IMU and GNSS receiver of a vehicle: imu.csv and gnss.csv.
 
-A row for each sample, in order of time. They are written once, and bags are made from them, so that
-all formats have the same numbers, however long the survey.
+The files are stored next to the cloud and contain one row per sample, sorted by time. Bags are
+created from these files, so that all formats contain the same values.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _IMU = (
 _POSITION = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
-# Largest sizes of a sample.
-_ROW_BYTES = 120  # bytes of a row in its file
-_MESSAGE_BYTES = 500  # bytes of a message in a bag
+# Maximum sizes of a sample in bytes.
+_ROW_BYTES = 120  # row in a CSV file
+_MESSAGE_BYTES = 500  # message in a bag
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:
-    """Return the largest size of a survey's instrument files and their bags, in bytes."""
+    """Return the maximum size of the instrument files and of `bags` bags with their data."""
     navigation = survey.navigation
     if navigation is None:
         return 0
@@ -45,9 +45,21 @@ def instrument_bytes(survey: Survey, bags: int) -> int:
 
 
 def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
-    """Write the files of a survey's instruments, a block of samples at a time.
+    """Write the files for the instruments of a survey, in blocks to limit memory use.
 
-    `origin` is the origin of the scene, (3,). OSError if a file cannot be written.
+    Parameters
+    ----------
+    folder
+        Folder in which the files are created.
+    survey
+        Survey with the instruments.
+    origin
+        Scene origin in world coordinates, in meters. Shape (3,).
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
     """
     instruments = Instruments.from_survey(survey)
     for name in () if instruments is None else instruments.files:
@@ -77,9 +89,10 @@ def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
 
 
 def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
-    """Return a function from world coordinates to latitude, longitude and height, or None.
+    """Return a function that converts world coordinates to latitude, longitude and height.
 
-    Heights are taken for ellipsoidal heights.
+    Returns None if the coordinate system of the world is unknown. Heights are assumed to be
+    ellipsoidal.
     """
     gnss = survey.navigation and survey.navigation.gnss
     if gnss and gnss.origin is not None:

@@ -1,4 +1,4 @@
-"""nuScenes: binary files of points, and the tables that nuscenes-devkit reads."""
+"""Read and write nuScenes data sets, with point files and the tables of nuscenes-devkit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ VERSION = "v1.0-lidarpool"
 FIRST_SENSOR = "LIDAR_TOP"
 _SCENE = "scene-0001"
 _LOG = "survey"
-_DATE = "1980-01-06"  # surveys begin at time 0 of no date
+_DATE = "1980-01-06"  # date of the log, because timestamps start at 0
 _DAY_US = 86_400_000_000
 _MAP = "maps/none.png"
 _TABLES = (
@@ -50,27 +50,31 @@ _FILE_PATTERN = (
     r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png|"
     r"lidarseg/v1\.0-lidarpool/[^/]+\.pcd\.bin"
 )
-_MAX_CLASSES = 255  # labels are bytes, and 0 is for points without a class
+_MAX_CLASSES = 255  # labels are bytes, and 0 represents points without a class
 _NO_CLASS = "none"
 _SWEEP_TABLE = "sample_data.json"
-_Row = Mapping[str, Any]  # of a table
-_SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
+_Row = Mapping[str, Any]  # row of a table
+_SHARED = ("category", "log", "map", "sensor")  # tables whose rows are shared by all jobs
 
 
 class NuScenes(MultiFileFormat):
     """A data set that nuscenes-devkit opens with `NuScenes("v1.0-lidarpool", path)`.
 
-    Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor frame at the start of
-    the sweep, intensity (0 to 255), ring. NAME is LIDAR_TOP for the first sensor, which functions
-    of the devkit expect, and the name of each further sensor. The first sensor's sweeps are the
-    samples; of another sensor, the first sweep that begins in a sample is its key frame, and
-    further sweeps are in `sweeps/NAME`. The ego vehicle's pose is the sensor's, at each sweep.
-    Actors are annotated in each sample, at their poses at its time. Classes with names are labels
-    of nuScenes-lidarseg: indices of rows of `category.json`, which nuscenes-devkit requires to have
-    no gaps. They are numbered by class from 1 on; 0 is for points without a named class.
+    - Points: each sweep is stored in `samples/NAME/000000.pcd.bin` as float32 x, y and z in the
+      sensor frame at the start of the sweep, intensity (0 to 255), and ring. NAME is LIDAR_TOP for
+      the first sensor, because the devkit expects this name, and otherwise the name of the sensor.
+    - Samples: each sweep of the first sensor is a sample. The first sweep of another sensor that
+      starts during a sample is a key frame of this sample. All other sweeps are stored in
+      `sweeps/NAME`.
+    - Poses: the ego pose of a sweep is the pose of its sensor.
+    - Annotations: each sample contains the boxes of the actors at the time of the sample.
+    - Labels: named classes are stored as nuScenes-lidarseg labels, which are row indices in
+      `category.json`. The devkit requires indices without gaps, so the classes are numbered from 1
+      in ascending order. Points without a named class have the label 0.
 
-    In a data set each job is a scene with its name, on a separate day, its files are in folders
-    of that name in `samples/NAME` and `sweeps/NAME`, and `merge_jobs` writes the tables.
+    In a data set, each job is a scene with the name of the job. Scenes are dated to different days.
+    The files of a job are in subfolders of `samples/NAME` and `sweeps/NAME` with the same name, and
+    `merge_jobs` writes the tables.
 
     Caesar et al., nuScenes, 2020.
     """
@@ -98,7 +102,7 @@ class NuScenes(MultiFileFormat):
         self.label_of_class = _labels_of_classes(sweeps.classes)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
-        """Return the file of a sweep, and its boxes."""
+        """Return the point file and the label file of a sweep, and its boxes."""
         inside = self.sweeps.compensated(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
@@ -111,7 +115,7 @@ class NuScenes(MultiFileFormat):
         return files, Boxes.from_points(self.sweeps, number, points)
 
     def shared_files(self, boxes: Sequence[Boxes]) -> dict[str, bytes]:
-        """Return the tables of a survey by itself, and its map."""
+        """Return the tables and the map of a survey that is not part of a data set."""
         if self.entry is not None:
             return {}
         files = {
@@ -121,7 +125,7 @@ class NuScenes(MultiFileFormat):
         return files | {_MAP: _no_map()}
 
     def summary(self, boxes: Sequence[Boxes]) -> dict[str, Any]:
-        """Return the tables of a job, and the classes that its labels number, for `merge_jobs`."""
+        """Return the tables of a job and the classes in its labels, for `merge_jobs`."""
         labeled = {"lidarseg": sorted(self.sweeps.classes)} if self.labels else {}
         return {"tables": self._tables(boxes), **labeled}
 
@@ -144,7 +148,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def renamed(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if the first sensor has another name, because readers expect its name."""
+        """Return a note if the first sensor is renamed, because readers expect a certain name."""
         if not sensors or sensors[0] in ("", FIRST_SENSOR):
             return []
         note = (
@@ -157,7 +161,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the names of the files of points and, with names, classes."""
+        """Return the name of the point file and, if classes have names, the label file."""
         sweeps = job.sweeps
         names = job.cached(
             "names",
@@ -168,7 +172,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return points with intensity, channel and, with names, class."""
+        """Read points with intensity, channel and, if classes have names, class."""
         file, *labels = cls.sweep_files(job, sweep)
         rows = job.read_rows(file, np.dtype("<f4")).reshape(-1, 5)
         intensity, channel = np.ascontiguousarray(rows[:, 3:].T)
@@ -181,7 +185,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a lidar in a nuScenes data set."""
+        """Open the sweeps of a lidar in a nuScenes data set."""
         return _open_data_set(source)
 
     @classmethod
@@ -189,7 +193,7 @@ class NuScenes(MultiFileFormat):
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
         """Write the tables of a data set, and return the jobs whose labels must be renumbered."""
-        shared: set[str] = set()  # tokens of rows that several jobs have
+        shared: set[str] = set()  # tokens of rows that are shared by several jobs
         with ExitStack() as stack:
             files = {
                 name: stack.enter_context(storage.writing(f"{VERSION}/{name}.json"))
@@ -229,7 +233,7 @@ class NuScenes(MultiFileFormat):
     def renumbered(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Return a file of nuScenes-lidarseg with labels that number the classes `after`."""
+        """Return the content of a nuScenes-lidarseg file with labels for the classes `after`."""
         if not name.startswith(LABELS):
             return None
         table = _labels_of_classes(after)[[0, *before]]
@@ -237,19 +241,22 @@ class NuScenes(MultiFileFormat):
 
 
 def _channels(sweeps: Sweeps) -> list[str]:
-    """Return the names of the channels of all sensors."""
+    """Return the nuScenes channel name of each sensor."""
     return plain_names([FIRST_SENSOR, *(name or FIRST_SENSOR for name in sweeps.sensors[1:])])
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
-    """Return the sample of each sweep, and whether the sweep is its sensor's first in there."""
+    """Return the sample of each sweep, and a mask of key frames.
+
+    A key frame is the first sweep of a sensor in a sample.
+    """
     sample_starts = sweeps.begins_ns[sweeps.sensor == 0]
     sample = np.clip(np.searchsorted(sample_starts, sweeps.begins_ns, "right") - 1, 0, None)
     return sample, np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
 
 
 def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry | None) -> list[str]:
-    """Return the names of the files of all sweeps."""
+    """Return the name of each sweep's point file."""
     below = "" if entry is None else f"{entry.name}/"
     return [
         f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
@@ -258,7 +265,16 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
 
 
 def _labels_of_classes(classes: Collection[int]) -> Bytes:
-    """Return the labels of all class numbers, uint8 (65536,): 0 for classes without a name.
+    """Return the label of each class number, which is 0 for classes without a name.
+
+    Parameters
+    ----------
+    classes
+        Numbers of the classes that have names.
+
+    Returns
+    -------
+    A uint8 array with shape (65536,).
 
     Raises
     ------
@@ -277,11 +293,11 @@ def _labels_of_classes(classes: Collection[int]) -> Bytes:
 
 
 def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Return the rows of all named classes and categories of actors, each name once.
+    """Return the rows of `category.json`, which contains named classes and actor categories.
 
-    Rows of classes are in the order of their labels. If jobs give one name to several numbers,
-    the number is appended to the name. The field `class`, beside those of nuScenes, is the number
-    of a class.
+    The rows of the classes come first, sorted by label. Names are unique: if jobs use the same name
+    for several classes, the class number is appended to the name. Rows of classes have an
+    additional field `class` with the class number, which is not part of nuScenes.
     """
     rows_by_name = {row["name"]: row for row in kinds}
     numbers: dict[str, int | None] = {_NO_CLASS: 0}
@@ -299,28 +315,29 @@ def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[s
 
 
 def _actor_categories(sweeps: Sweeps) -> list[str]:
-    """Return the category of each actor: its type, in the spelling of the class of that name.
+    """Return the category of each actor, which is its type.
 
-    Points and boxes share the categories, so "Car 1" is a `car` if a class has this name.
+    If a class has the same name except for spelling, its spelling is used, because points and boxes
+    share the categories. The actor "Car 1", for example, is a `car` if there is a class `car`.
     """
     spellings = {_spelled_alike(name): name for name in sweeps.classes.values()}
     return [spellings.get(_spelled_alike(kind), kind) for kind in sweeps.actor_types]
 
 
 def _spelled_alike(name: str) -> str:
-    """Return what names have in common that differ in case or in spaces alone."""
+    """Normalize a name, so that names that differ only in case or underscores are equal."""
     return name.casefold().replace("_", " ")
 
 
 class _JobClasses:
-    """The classes of the jobs of a data set."""
+    """Collects the classes of all jobs in a data set."""
 
     def __init__(self) -> None:
         self._names: dict[int, dict[str, None]] = {}  # {class: its names in the jobs, in order}
         self._labeled: dict[tuple[int, ...], list[str]] = {}  # {labeled classes: jobs}
 
     def add(self, job: Mapping[str, Any]) -> None:
-        """Add the classes of a job from its manifest."""
+        """Add the classes of a job, given its manifest."""
         for number, name in job.get("classes", {}).items():
             self._names.setdefault(int(number), {})[name] = None
         if "lidarseg" in job:
@@ -328,28 +345,31 @@ class _JobClasses:
 
     @property
     def names(self) -> dict[int, str]:
-        """Names of the classes of all jobs."""
+        """Class names by number. Different names for the same number are joined by semicolons."""
         return {number: "; ".join(names) for number, names in self._names.items()}
 
     def relabeled_jobs(self) -> dict[str, list[int]]:
-        """Return the classes of all jobs, for each job whose labels number others."""
+        """Return the jobs whose labels must be renumbered, as {name of the job: all classes}.
+
+        These are the jobs that do not have all classes of the data set.
+        """
         numbers = sorted(self._names)
-        _labels_of_classes(numbers)  # raises LidarError if these are too many
+        _labels_of_classes(numbers)  # raises LidarError if there are too many
         others = (jobs for labeled, jobs in self._labeled.items() if [*labeled] != numbers)
         return dict.fromkeys(chain.from_iterable(others), numbers)
 
 
 def _no_map() -> bytes:
-    """Return an empty picture, because the devkit requires a map."""
+    """Return an empty image in PNG format, because the devkit requires a map."""
     image = io.BytesIO()
     Image.new("L", (1, 1)).save(image, "png")
     return image.getvalue()
 
 
 class _Tables:
-    """Tables of a survey.
+    """Builds the nuScenes tables of a survey.
 
-    Tokens of rows are derived from the survey and the job.
+    The tokens of the rows are derived from the survey and the job, so they are reproducible.
     """
 
     def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
@@ -370,12 +390,12 @@ class _Tables:
         self.rows.setdefault(table, []).append({"token": self._token(table, key), **fields})
 
     def _chain(self, table: str, keys: list[Any]) -> list[dict[str, str]]:
-        """Return the tokens of the rows before and after each row."""
+        """Return the fields `prev` and `next` for each row in a sequence."""
         tokens = ["", *(self._token(table, key) for key in keys), ""]
         return [{"prev": a, "next": b} for a, b in zip(tokens, tokens[2:], strict=False)]
 
     def add_frames(self, channels: list[str], sample: Any, names: list[str]) -> None:
-        """Add the survey, its samples and sensors, and all sweeps."""
+        """Add the rows for the scene, its samples and sensors, and all sweeps."""
         sweeps = self.sweeps
         count = int((sweeps.sensor == 0).sum())
         self._add(
@@ -388,7 +408,7 @@ class _Tables:
             first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
         )
-        # nuscenes-devkit sorts scenes by time, and fails where two have the same.
+        # nuscenes-devkit sorts scenes by time, and fails if two scenes have the same time.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
         for number, neighbors in enumerate(self._chain("sample", list(range(count)))):
@@ -412,8 +432,8 @@ class _Tables:
                 position = sweeps.pose.positions[sweep].tolist()
                 timestamp = times[sweep]
                 is_key_frame = names[sweep].startswith("samples/")
-                # A sweep between samples points to the sample that follows, from whose boxes and
-                # those before nuscenes-devkit interpolates.
+                # A sweep between samples refers to the following sample. nuscenes-devkit
+                # interpolates between the boxes of this sample and of the previous sample.
                 number = min(sample[sweep] + (not is_key_frame), count - 1)
                 self._add(
                     "ego_pose",
@@ -438,7 +458,10 @@ class _Tables:
                 )
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
-        """Add the actors, and their boxes in the key frames of each sample."""
+        """Add the rows for the actors and their boxes.
+
+        `boxes` are the boxes in all key frames of each sample, starting with the first sensor.
+        """
         kinds = _actor_categories(self.sweeps)
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
         for kind in dict.fromkeys(kinds):
@@ -481,9 +504,9 @@ class _Tables:
 
 
 def _open_data_set(source: RecordingSource) -> Recording:
-    """Open a lidar of a nuScenes data set, by its root or the folder of its tables.
+    """Open a lidar in a nuScenes data set, given its root folder or the folder with its tables.
 
-    LidarError for a root with the tables of several versions.
+    Raises LidarError if the root folder contains several versions of the tables.
     """
     tables = source.path
     if not (tables / _SWEEP_TABLE).is_file():
@@ -501,18 +524,22 @@ def _open_data_set(source: RecordingSource) -> Recording:
 
 
 class _DataSet:
-    """The lidars in the tables of a data set, whose files are below the folder above the tables."""
+    """Tables of a nuScenes data set, from which the sweeps of its lidars are read.
+
+    File names in the tables are relative to the parent of the folder that contains the tables.
+    """
 
     def __init__(self, source: RecordingSource, tables: Path) -> None:
         self._source = source
         self._tables = tables
         self._poses = self._table("ego_pose")
         self._calibrated = self._table("calibrated_sensor")
-        self._labels: dict[str, str] = {}  # {token of a sweep: file of its classes}
+        self._labels: dict[str, str] = {}  # {token of a sweep: its label file}
         if (tables / "lidarseg.json").exists():
             rows = self._table("lidarseg").values()
             self._labels = {row["sample_data_token"]: row["filename"] for row in rows}
-        self._classes = np.arange(256, dtype=np.uint16)  # of labels; their numbers in our own sets
+        # Class number of each label. Data sets from other sources have no class numbers.
+        self._classes = np.arange(256, dtype=np.uint16)
         known = self._labels and (tables / "category.json").exists()
         for row in self._table("category").values() if known else ():
             if "class" in row:
@@ -523,9 +550,9 @@ class _DataSet:
         return {row["token"]: row for row in rows}
 
     def lidars(self) -> dict[str, Recording]:
-        """Return the lidars, {channel: sweeps in order of time}.
+        """Return a recording for each lidar channel, whose sweeps are sorted by time.
 
-        The names of channels begin with the name of their scene if there are several scenes.
+        If there are several scenes, the name of the scene precedes the name of the channel.
         """
         sensors = self._table("sensor")
         scenes = self._table("scene")
@@ -549,7 +576,10 @@ class _DataSet:
         }
 
     def _named_files(self, row: _Row) -> list[tuple[str, str]]:
-        """Return the names of the file of a sweep and of its classes, and the entries of both."""
+        """Return the point file and the label file of a sweep, if it exists.
+
+        Each file name is accompanied by a description of the table entry that contains it.
+        """
         token = row["token"]
         folder = self._tables.name
         names = [(row["filename"], f"{folder}/{_SWEEP_TABLE}, token {token},")]
@@ -583,6 +613,6 @@ class _DataSet:
 
 
 def _pose_of(row: _Row) -> Floats:
-    """Return the pose (4, 4) of a row with a rotation and a translation."""
+    """Return the pose in a row with a rotation and a translation, with shape (4, 4)."""
     w, x, y, z = row["rotation"]
     return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))

@@ -1,4 +1,4 @@
-"""Clouds as Open3D's point clouds."""
+"""Conversion of clouds to Open3D."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from ..base.open3d_module import load_open3d
 
 @checked
 def to_open3d(cloud: Cloud) -> Any:
-    """Return a cloud as an `open3d.t.geometry.PointCloud` with all columns, named as in files.
+    """Convert a cloud to an `open3d.t.geometry.PointCloud` with all columns.
+
+    Attributes have the names that the columns have in files.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Open Simulation Interface (ASAM OSI): a SensorData message for each sweep, through betterosi.
+"""Write traces of the Open Simulation Interface (ASAM OSI), with one SensorData per sweep.
 
-A million detections as objects of the library take 17 s to make and encode. Detections are
-therefore encoded here, by the wire format of Protocol Buffers: all of a sweep have the same fields,
-and thus the same bytes but for the values.
+Messages are created with betterosi, except for detections, because creating and encoding a million
+detection objects takes 17 s. Detections are encoded here, in the wire format of Protocol Buffers.
+All detections in a sweep have the same fields, so their bytes only differ in the values.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from .gps_time import GPS_NS
 from .writing import ExportSpec
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
-# Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.
+# Field numbers in osi_sensordata.proto and osi_featuredata.proto of OSI 3.
 _FEATURE_DATA = 26
 _LIDAR_SENSOR = 3
 _HEADER = 1
 _DETECTION = 2
 _DOUBLES = {"intensity": 7, "reflectivity": 10, "radial_velocity": 12}
 _VARINT, _FIXED64, _LENGTH = range(3)  # wire types
-# Types of OSI by the names of actors or words in them, in lower case.
+# OSI types of actors, by lowercase words in their names.
 _PERSONS = {"pedestrian", "person", "walker", "child"}
 _VEHICLES = {
     **dict.fromkeys(("delivery_van", "van"), "DELIVERY_VAN"),
@@ -56,7 +56,7 @@ _VEHICLES = {
 
 
 class OSI(CloudFormat):
-    """An .osi trace: a message for each sweep, in the order of their starts."""
+    """An .osi trace with one message per sweep, sorted by the start of the sweep."""
 
     title = "OSI"
     by_sweep = True
@@ -64,11 +64,11 @@ class OSI(CloudFormat):
     required = ("object", "channel", "intensity")
     stored = (*required, "reflectance", "radial_velocity", "sensor")
     actor_boxes = True
-    suffix: ClassVar[str] = ".osi"  # by which the library chooses the kind of the trace
+    suffix: ClassVar[str] = ".osi"  # extension by which betterosi selects the type of trace
 
     def write(self, path: Path, spec: ExportSpec) -> None:
         """Write the trace."""
-        osi: Any = import_module("betterosi")  # an extra
+        osi: Any = import_module("betterosi")  # optional dependency
         messages = _OSIMessages(osi, self.sweeps)
         options: dict[str, Any] = {}
         if self.suffix == ".mcap":
@@ -80,7 +80,7 @@ class OSI(CloudFormat):
             with writer:
                 self._write_messages(writer, messages)
         finally:
-            writer.file.close()  # the library leaves the file open if its end cannot be written
+            writer.file.close()  # betterosi does not close the file after an error
         suffixed.replace(path)
 
     def _write_messages(self, writer: Any, messages: _OSIMessages) -> None:
@@ -98,9 +98,9 @@ class OSI(CloudFormat):
 
 
 class OSIInMCAP(OSI):
-    """The messages of an .osi trace as MCAP.
+    """An MCAP file with the messages of an .osi trace.
 
-    Each sensor has a topic; the ground truth is on `GROUND_TRUTH_TOPIC` as well.
+    Each sensor has its own topic. The ground truth is also available on `GROUND_TRUTH_TOPIC`.
     """
 
     title = "OSI in MCAP"
@@ -108,15 +108,15 @@ class OSIInMCAP(OSI):
 
 
 def _names(sweeps: Sweeps) -> list[str]:
-    """Return the names of the sensors for topics, "" for a single sensor without a name."""
+    """Return unique names of the sensors for topics, or empty strings if no sensor has a name."""
     return plain_names(sweeps.sensors) if any(sweeps.sensors) else ["" for _ in sweeps.sensors]
 
 
 @dataclass(frozen=True)
 class _EncodedMessage:
-    """A message with further fields that are encoded already.
+    """A betterosi message with additional fields that are already encoded.
 
-    The library writes both.
+    It has the attributes of a message that the betterosi writer uses.
     """
 
     message: Any
@@ -124,12 +124,12 @@ class _EncodedMessage:
 
     @property
     def timestamp(self) -> Any:
-        """Timestamp of the message."""
+        """Timestamp in the message."""
         return self.message.timestamp
 
     @property
     def version(self) -> Any:
-        """Version of OSI."""
+        """OSI version in the message."""
         return self.message.version
 
     def has_field(self, name: str) -> bool:
@@ -141,16 +141,16 @@ class _EncodedMessage:
         return self.message.desc()
 
     def to_binary(self) -> bytes:
-        """Return all fields in the wire format, whose order of fields is free."""
+        """Encode all fields. Their order does not matter in the wire format."""
         data: bytes = self.message.to_binary()
         return data + self.encoded_fields
 
 
 class _OSIMessages:
-    """Makes the messages of sweeps.
+    """Creates the messages for sweeps.
 
-    Identifiers are the numbers of objects in the column `object`; the host vehicle, which is the
-    carrier, has the next number. Its frame is the carrier's.
+    Object identifiers are the numbers in the column `object`. The host vehicle is the vehicle that
+    carries the sensors. Its identifier is the next number.
     """
 
     def __init__(self, osi: Any, sweeps: Sweeps) -> None:
@@ -165,7 +165,10 @@ class _OSIMessages:
         self._types = [_type_fields(osi, name) for name in sweeps.actor_types]
 
     def time_ns(self, sweep: int) -> int:
-        """Return the start of a sweep by the sensor's clock, ns from 1970 or the survey's start."""
+        """Return the start of a sweep in nanoseconds, according to the clock of the sensor.
+
+        Times are relative to 1970, or to the start of a survey without a date.
+        """
         return max(0, (self._sweeps.start_ns or 0) + self._sweeps.stamp_ns(sweep))
 
     def _timestamp(self, sweep: int) -> Any:
@@ -173,7 +176,7 @@ class _OSIMessages:
         return self._osi.Timestamp(seconds=seconds, nanos=nanos)
 
     def _base(self, position: Floats, quaternion: Floats, size: Floats | None = None) -> Any:
-        """Return position (3,), orientation and size (3,) of a moving object."""
+        """Return a BaseMoving message with a position, an orientation and optionally a size."""
         osi = self._osi
         base = osi.BaseMoving(
             position=_vector(osi, position), orientation=_orientation(osi, quaternion)
@@ -184,7 +187,7 @@ class _OSIMessages:
         return base
 
     def ground_truth(self, sweep: int, boxes: Boxes) -> Any:
-        """Return the host vehicle and the actors at the start of a sweep, in the world."""
+        """Return the host vehicle and the actors in world coordinates at the start of a sweep."""
         osi = self._osi
         sweeps = self._sweeps
         carrier = sweeps.carrier
@@ -216,7 +219,7 @@ class _OSIMessages:
         )
 
     def sensor_data(self, sweep: int, points: Cloud, boxes: Boxes, truth: Any) -> _EncodedMessage:
-        """Return the detections and detected actors of a sweep, with the ground truth."""
+        """Return the detections, the detected actors and the ground truth of a sweep."""
         osi = self._osi
         sweeps = self._sweeps
         number = int(sweeps.sensor[sweep])
@@ -248,7 +251,7 @@ class _OSIMessages:
         return _EncodedMessage(message, _field(_FEATURE_DATA, _field(_LIDAR_SENSOR, detections)))
 
     def _detected(self, sweep: int, boxes: Boxes) -> list[Any]:
-        """Return the actors that have points in a sweep, in the sensor frame."""
+        """Return the actors that have points in a sweep, in sensor coordinates."""
         osi = self._osi
         sweeps = self._sweeps
         in_sensor = SweepBoxes.select(sweeps, boxes.inward(sweeps.pose, sweep))
@@ -275,7 +278,7 @@ class _OSIMessages:
 
 
 def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
-    """Return the fields of a moving object's type, by the type in the name of an actor."""
+    """Return the type fields of a moving object, which are derived from the name of an actor."""
     kind = osi.MovingObject.Type
     words = [name.lower(), *re.findall("[a-z]+", name.lower())]
     if not _PERSONS.isdisjoint(words):
@@ -289,13 +292,13 @@ def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
 
 
 def _vector(osi: Any, vector: Floats) -> Any:
-    """Return a vector (3,) as a message."""
+    """Convert a vector to a message."""
     x, y, z = vector.tolist()
     return osi.Vector3d(x=x, y=y, z=z)
 
 
 def _orientation(osi: Any, quaternion: Floats) -> Any:
-    """Return roll, pitch and yaw of a rotation x, y, z, w as a message, radians."""
+    """Convert a quaternion (x, y, z, w) to a message with roll, pitch and yaw in radians."""
     rotation = matrices(quaternion[None])[0]
     level = np.hypot(rotation[0, 0], rotation[1, 0])
     roll, pitch, yaw = arctan2(
@@ -306,18 +309,18 @@ def _orientation(osi: Any, quaternion: Floats) -> Any:
 
 
 def encoded_detections(positions: Floats, points: Cloud) -> bytes:
-    """Return the detections of points as fields of LidarDetectionData.
+    """Encode the detections of points as fields of LidarDetectionData.
 
-    Azimuth and elevation are rotations about z and the turned y axis by the right-hand rule, as
-    Spherical3d of OSI defines them: points above the sensor have a negative elevation.
+    As defined by Spherical3d in OSI, azimuth and elevation are right-handed rotations about the z
+    axis and the rotated y axis. Points above the sensor therefore have a negative elevation.
 
     Parameters
     ----------
     positions
-        float64 (n, 3), meters, sensor frame.
+        Positions in the sensor frame in meters, as float64 with shape (n, 3).
     points
-        The columns `object` and `channel`; `intensity`, `reflectance` and `radial_velocity` if
-        present.
+        Points with the columns `object` and `channel`, and optionally `intensity`, `reflectance`
+        and `radial_velocity`.
     """
     x, y, z = positions.T
     across = np.sqrt(x * x + y * y)
@@ -345,20 +348,22 @@ def encoded_detections(positions: Floats, points: Cloud) -> bytes:
 
 
 class _Record:
-    """Messages of the same fields and lengths, encoded column by column."""
+    """Encodes many messages with the same fields and lengths at once, field by field."""
 
     def __init__(self) -> None:
-        self._parts: list[AnyArray | bytes] = []  # uint8 (n, k), or bytes of all messages
+        # Bytes that differ between messages, as uint8 with shape (n, k), or common bytes.
+        self._parts: list[AnyArray | bytes] = []
 
     def add_double(self, number: int, values: Floats) -> None:
-        """Add a field of real numbers (n,)."""
+        """Add a field with one floating-point number per message."""
         self._parts.append(_key(number, _FIXED64))
         self._parts.append(np.ascontiguousarray(values, "<f8").view(np.uint8).reshape(-1, 8))
 
     def add_varint(self, number: int, values: Ints) -> None:
-        """Add a field of integers (n,), not negative, each in as many bytes as the largest.
+        """Add a field with one non-negative integer per message.
 
-        The wire format allows groups of zeros above the highest bit.
+        All values are encoded with the number of bytes that the largest value requires. The wire
+        format allows leading zeros.
         """
         largest = int(values.max()) if len(values) else 0
         size = max(1, -(-largest.bit_length() // 7))
@@ -368,13 +373,13 @@ class _Record:
         self._parts.append(groups.astype(np.uint8))
 
     def add_record(self, number: int, record: _Record) -> None:
-        """Add a field of messages."""
+        """Add a field with one submessage per message."""
         rows = record.rows()
         self._parts.append(_key(number, _LENGTH) + _varint(rows.shape[1]))
         self._parts.append(rows)
 
     def rows(self) -> AnyArray:
-        """Return the bytes of the messages, uint8 (n, k)."""
+        """Return the encoded messages as uint8 with shape (n, k)."""
         count = next(len(part) for part in self._parts if not isinstance(part, bytes))
         columns = [
             np.tile(np.frombuffer(part, np.uint8), (count, 1)) if isinstance(part, bytes) else part
@@ -384,24 +389,24 @@ class _Record:
 
 
 def _identifiers(values: Ints) -> _Record:
-    """Return messages Identifier."""
+    """Encode numbers as Identifier messages."""
     record = _Record()
     record.add_varint(1, values)
     return record
 
 
 def _key(number: int, wire_type: int) -> bytes:
-    """Return the bytes that start a field."""
+    """Encode the tag with which a field starts."""
     return _varint(number << 3 | wire_type)
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """Return a field that contains a message."""
+    """Encode a field that contains a message."""
     return _key(number, _LENGTH) + _varint(len(content)) + content
 
 
 def _varint(value: int) -> bytes:
-    """Return an integer in groups of seven bits, the lowest first."""
+    """Encode an integer in groups of seven bits, starting with the lowest."""
     groups = bytearray()
     while value > 127:
         groups.append(value & 127 | 128)

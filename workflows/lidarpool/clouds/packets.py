@@ -1,4 +1,4 @@
-"""Packets of sensors in their makers' protocols, as pcap files."""
+"""Read and write captures of sensor packets in the protocols of the manufacturers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from .writing import ExportSpec
 
 
 class PacketCapture(CloudFormat):
-    """A folder with the packets of each sensor: `NAME.pcap`, NAME from the sensor, or `lidar`.
+    """A folder with one packet capture per sensor.
 
-    Datagrams have the ports, order and times of the sensor; those that a fault of the survey drops
-    are left out. The maker's metadata, where a reader needs them, are beside in `NAME.json`.
+    The captures are `NAME.pcap`, where NAME is the name of the sensor or `lidar`. Packets have the
+    ports, the order and the times of the real sensor. Packets that are dropped by a simulated fault
+    are omitted. If readers require metadata from the manufacturer, it is stored in `NAME.json`.
     """
 
     title = "PCAP"
@@ -35,9 +36,9 @@ class PacketCapture(CloudFormat):
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
-        """Return the columns of the sensors' packets.
+        """Return the columns that the packets of the sensors require.
 
-        LidarError if a sensor has no packets, or its packets cannot be made.
+        Raises LidarError if packets are not supported for a sensor.
         """
         names: dict[str, None] = {}
         for carried, returns in zip(survey.carried, survey.returns_each, strict=True):
@@ -79,12 +80,11 @@ class PacketCapture(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the packets of a sensor with the decoder of its manufacturer."""
+        """Open the packets of a sensor with the decoder for its manufacturer."""
         return _open_capture(source)
 
 
 def _open_capture(source: RecordingSource) -> Recording:
-    """Open the packets of a sensor by the decoder of its maker."""
     decoder = decoder_of(source.path, source.name)
     name = source.choose("sensors", decoder.sensors)
     sensor = [*decoder.sensors].index(name)

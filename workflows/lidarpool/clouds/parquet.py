@@ -1,4 +1,4 @@
-"""Parquet, a folder of files, through pyarrow."""
+"""Read and write clouds as folders of Parquet files with pyarrow."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ _GROUP_ROWS = 65_536
 
 
 class Parquet(MultiFileFormat):
-    """A file for each million points, with units and meanings in the metadata of the fields.
+    """A folder of Parquet files with one million points each.
 
-    In a data set it is a partition, `points/job=7`, in groups of rows; readers of single sweeps
-    read one or two groups.
+    The metadata of the fields contains the units and meanings of the columns. In a data set, each
+    job is a partition such as `points/job=7`. Its files consist of small row groups, so that only
+    one or two row groups must be read to get a single sweep.
     """
 
     title = "Parquet"
@@ -53,7 +54,7 @@ class Parquet(MultiFileFormat):
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
             )
         ]
-        objects = "\n".join(sweeps.object_names)  # names that the column `object` counts
+        objects = "\n".join(sweeps.object_names)  # indexed by the column `object`
         words = {"coordinates": sweeps.coordinates, "objects": objects}
         words |= {} if sweeps.epsg is None else {"crs": f"EPSG:{sweeps.epsg}"}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
@@ -65,7 +66,7 @@ class Parquet(MultiFileFormat):
         return -(-len(self.cloud) // CHUNK_POINTS)
 
     def read(self, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield the points of pieces, a million each."""
+        """Yield the points of the pieces, each of which has one million points."""
         return islice(self.cloud.chunks(CHUNK_POINTS, first * CHUNK_POINTS), stop - first)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
@@ -78,7 +79,7 @@ class Parquet(MultiFileFormat):
         return self._file(number, pa.Table.from_arrays(filled, schema=self.schema)), None
 
     def shared_files(self, pieces: Sequence[None]) -> dict[str, bytes]:
-        """Return a file without rows for a data set without pieces."""
+        """Return an empty file if there are no pieces."""
         return {} if pieces else self._file(0, self.schema.empty_table())
 
     def _file(self, number: int, table: Any) -> dict[str, bytes]:
@@ -92,9 +93,9 @@ class Parquet(MultiFileFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return the points of a sweep in a data set, with all columns.
+        """Read the points of a sweep in a data set with all columns.
 
-        They are read from the groups of rows with its scans.
+        Only row groups that contain scans of the sweep are read.
         """
         import pyarrow as pa
         import pyarrow.dataset
@@ -120,13 +121,13 @@ class Parquet(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .parquet file or a folder of such files in their row groups."""
+        """Open a .parquet file or a folder of such files, whose row groups are read separately."""
         with reading(source.name):
             return _parts(source)
 
 
 def _dataset(storage: Storage, folder: str) -> Any:
-    """Open the partition of a job."""
+    """Open the partition of a job as a pyarrow data set."""
     import pyarrow.dataset
 
     if storage.is_local:
@@ -136,12 +137,12 @@ def _dataset(storage: Storage, folder: str) -> Any:
 
 
 def _size_of(table: Any) -> int:
-    """Return the size of the files of a partition, bytes."""
+    """Return the total size of the files in a partition in bytes."""
     return sum(info.size for info in table.filesystem.get_file_info(table.files))
 
 
 def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any]) -> Any:
-    """Read a group of rows; two are cached, because neighboring sweeps share groups."""
+    """Read a row group. The last two are cached, because neighboring sweeps share row groups."""
     key = fragment.path, fragment.row_groups[0].id
     if key not in cache:
         rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)
@@ -152,9 +153,10 @@ def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any
 
 
 def _parts(source: RecordingSource) -> Recording:
-    """Open the parts of a file or folder.
+    """Open the row groups of a file or folder.
 
-    Only columns of numbers are read: the memory of others is not known before.
+    Only numeric columns are read, because the memory that other columns require is not known in
+    advance.
     """
     import pyarrow.dataset
 
@@ -163,8 +165,8 @@ def _parts(source: RecordingSource) -> Recording:
         input_size(path)
     dataset = pyarrow.dataset.dataset(str(path), format="parquet")
     groups = []
-    files = []  # names of columns of numbers, and size in bytes, for each group
-    unread = set[str]()  # names of columns
+    files = []  # numeric columns and file size in bytes, for each row group
+    unread = set[str]()  # names of skipped columns
     for file in dataset.get_fragments():
         columns = number_columns(file.physical_schema)
         unread |= set(file.physical_schema.names) - set(columns)

@@ -1,7 +1,7 @@
-"""Groups of rows of Parquet: the memory that they take is known before they are read.
+"""Read Parquet row groups after checking how much memory they require.
 
-A column of equal values takes some bytes for any number of rows, so a small file unpacks to any
-size.
+A column of equal values takes a few bytes in a file, regardless of the number of rows. A small file
+can therefore decompress to any size.
 """
 
 from __future__ import annotations
@@ -15,52 +15,49 @@ _ADVICE = "write fewer points, or smaller row groups"
 
 
 def number_columns(schema: Any) -> list[str]:
-    """Return the names of the columns of numbers and times, whose values have a fixed size."""
+    """Return the names of the numeric and time columns, whose values have a fixed size."""
     import pyarrow as pa
 
     return [field.name for field in schema if pa.types.is_primitive(field.type)]
 
 
 def check_groups(groups: Iterable[Any], columns: Sequence[str], size: int) -> None:
-    """Check the size of groups of rows that are read one after the other.
+    """Check the total size of row groups that are read one at a time.
 
     Parameters
     ----------
     groups
-        Fragments of a data set of pyarrow, of a group of rows each.
+        Fragments of a pyarrow data set, each with a single row group.
     columns
-        Names of the columns that will be read.
+        Names of the columns to read.
     size
-        Size of the files, bytes.
+        Size of the files in bytes.
 
     Raises
     ------
     LidarError
-        If the rows take far more memory than the files have bytes.
+        If the rows require far more memory than the size of the files suggests.
     """
     Allowance(size, _ADVICE, in_parts=True).take(sum(_bytes_of(g, columns) for g in groups))
 
 
 def group_allowance(size: int) -> Allowance:
-    """Return the allowance of groups of rows that are in memory together.
+    """Return the memory allowance for row groups that are held in memory together.
 
-    `size` is in bytes.
+    `size` is the size of their files in bytes.
     """
     return Allowance(size, _ADVICE)
 
 
 def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> Any:
-    """Read columns of a group of rows.
-
-    Raises LidarError above the allowance.
-    """
+    """Read columns of a row group. Raises LidarError if they exceed the allowance."""
     allowance.take(_bytes_of(group, columns))
-    # Further threads would be many beside the workers that load data.
+    # Data loaders already use several worker processes, so more threads would not help.
     return group.to_table(columns=list(columns), use_threads=False)
 
 
 def _bytes_of(group: Any, columns: Sequence[str]) -> int:
-    """Return the memory of columns of a group of rows, as its file states it."""
+    """Return the memory that columns of a row group require, according to the file metadata."""
     (info,) = group.row_groups
     schema = group.physical_schema
     bits = sum(max(8, schema.field(column).type.bit_width) for column in columns)

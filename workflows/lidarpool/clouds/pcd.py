@@ -1,4 +1,4 @@
-"""PCD, a file for each sweep."""
+"""Read and write PCD files, with one file per sweep."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from lidarsim.sweeps.sweeps import states_compensation
 from .multi_file_format import MultiFileFormat
 from .recording import Recording, RecordingSource
 
-_COMMENT_BYTES = 1000  # of the first line that is searched
+_COMMENT_BYTES = 1000  # maximum number of bytes that are read from the first line
 
 
 class PCD(MultiFileFormat):
-    """A file for each sweep, with all columns.
+    """A folder with one PCD file per sweep, which contains all columns.
 
-    Red, green and blue are a single field `rgb`.
+    By default, each point is in the sensor frame at the time of its firing, and the field of times
+    contains seconds since the start of the sweep as float32. If points are motion-compensated, or
+    if the cloud has no times, all points are in the sensor frame at the start of the sweep and have
+    no times. A comment in the file states which of these applies.
 
-    With times, points are in the sensor frame at their own firing, and times are seconds since the
-    start of the sweep, as float32. Compensated points, and points of a cloud without times, are in
-    the sensor frame at the start of the sweep, and have no times. A comment says which. VIEWPOINT
-    is the pose of the sensor in the world at the start of the sweep. Normals and origins of rays
-    are in the frame of the points; normals have PCL's names.
+    Red, green and blue are combined in the field `rgb`. VIEWPOINT is the pose of the sensor in the
+    world frame at the start of the sweep. Normals and ray origins are in the frame of the points.
+    Normals have the field names that PCL uses.
     """
 
     title = "PCD"
@@ -53,7 +54,7 @@ class PCD(MultiFileFormat):
         return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
-        """Return names and arrays of the fields of a sweep's points, as fired or compensated."""
+        """Return the names and values of the fields of a sweep, as fired or compensated."""
         sweeps = self.sweeps
         positions_of = sweeps.as_fired if as_fired else sweeps.compensated
         columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
@@ -77,7 +78,7 @@ class PCD(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a file, or the files of a folder, as sweeps with their VIEWPOINT as pose."""
+        """Open a file, or the files in a folder, as sweeps whose pose is the VIEWPOINT."""
         files = [source.path]
         if source.path.is_dir():
             inside = source.path.iterdir()
@@ -101,10 +102,10 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return what the comment of a file of `PCD` states, or None for other files."""
+    """Return whether a file states that it is motion-compensated, or None if it states neither."""
     try:
         with open_input(path) as file:
             comment = file.readline(_COMMENT_BYTES).decode(errors="replace")
-    except OSError:  # which is raised again, with the name of the file, when points are read
+    except OSError:  # reading the points raises the error again, with the name of the file
         return None
     return states_compensation(comment)

@@ -1,4 +1,4 @@
-"""Point clouds of any size as binary PLY, written completely or not at all."""
+"""Read and write point clouds of any size as binary PLY files."""
 
 from __future__ import annotations
 
@@ -34,20 +34,23 @@ from .job_reader import JobReader
 from .recording import Recording, RecordingSource, open_cloud, sweep_from_columns
 from .writing import ExportSpec
 
-# Positions are stored in single precision if the error is below this part of the precision.
+# Positions are stored as float32 if the error is below this fraction of the precision.
 _ROUNDING_SHARE = 0.05
-FILE = "cloud.ply"  # file of a result
-FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long for a point
-_BLOCK_BYTES = 1 << 23  # moved at a time
+FILE = "cloud.ply"  # file name in a result
+# Number of points that are written by Open3D, which takes five times as long per point.
+FIRST_POINTS = 65_536
+_BLOCK_BYTES = 1 << 23  # number of bytes that are moved at a time
 
 
 class PLY(CloudFormat):
-    """A binary PLY file, which Open3D writes.
+    """A binary PLY file in the layout of Open3D.
 
-    About a million points are in memory at a time. float64 positions are stored in single precision
-    if the error is below a twentieth of the precision of the sweeps, else in double. Names of
-    classes and materials are comments: `class 40 road`, `material 0 Brick`. A comment says if
-    points are not in the world frame, and which coordinate system the world has: `crs: EPSG:25832`.
+    About one million points are held in memory at a time. Positions are stored as float32 if the
+    rounding error is below 5 % of the precision of the sweeps, and otherwise as float64.
+
+    Comments contain the names of classes and materials (`class 40 road`, `material 0 Brick`), the
+    coordinate system of the world frame (`crs: EPSG:25832`), and a note if points are not in the
+    world frame.
     """
 
     title = "PLY"
@@ -66,7 +69,7 @@ class PLY(CloudFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return the points of a sweep in a data set, with all columns."""
+        """Read the points of a sweep in a data set with all columns."""
         name = cls.path_of_job(job.entry)
         file = job.cached("cloud", lambda: CloudFile(job.local(name)))
         first, stop = (file.row_of(scan) for scan in job.sweeps.scans[sweep : sweep + 2])
@@ -78,37 +81,36 @@ class PLY(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .ply, or the cloud of a result with its sweeps."""
+        """Open a .ply file, or the folder of a result, whose cloud has sweeps."""
         if source.path.is_dir():
             source = replace(source, path=source.path / FILE)
         return _open_file(source)
 
 
 class GrowingPly:
-    """A binary PLY file that grows by appended points.
+    """A binary PLY file to which points are appended. It is complete after `finish`.
 
-    The file is complete after `finish`.
+    The bytes are the same as if Open3D wrote all points at once, but without holding all points in
+    memory. Open3D writes the first points to a temporary file. Its header and rows determine the
+    layout in which further points are appended.
 
-    Open3D writes the first points to a temporary file, whose rows and header show its layout, and
-    further points follow as such rows. The bytes are the same as if Open3D wrote all points at
-    once, which would need memory for all.
-
-    After the first points, several threads may write rows at the same time: one thread extends the
-    file in the order of its points, and any thread then writes the rows at the offset.
+    After the first points, several threads can write rows at the same time. One thread reserves
+    space with `extend`, in the order of the points, and any thread can then write the rows at the
+    returned offset.
 
     Parameters
     ----------
     path
-        The file, which must not exist.
+        Path of the file, which must not exist.
     table
-        Columns beside the positions.
+        Columns in addition to the positions.
     position_type
-        float32 or float64 (`real_type`).
+        Type of the positions, float32 or float64 (see `real_type`).
     sweeps
-        Sweeps of the points, for comments.
+        Sweeps to which the points belong, which determine the comments.
     expected_count
-        Expected number of points. If the number at the end has more or fewer digits, the rows are
-        moved within the file, because the header has another length.
+        Expected number of points. If the actual number has more or fewer digits, `finish` moves all
+        rows, because the length of the header changes.
     """
 
     def __init__(
@@ -122,13 +124,13 @@ class GrowingPly:
         check_names((*POSITION, *table))
         self.position_type = position_type
         self.row = row_type(position_type, table)
-        self.count = 0  # points in the file
+        self.count = 0  # number of points in the file
         self._path = path
         self._columns = {column.name: column for column in table}
         self._expected_count = expected_count
         self._comments = _comments(table, sweeps)
-        self._start = 0  # offset of the first row, bytes; 0 without rows
-        self._head_parts = (b"", b"")  # the header, before and after the line of the number
+        self._start = 0  # offset of the first row in bytes, or 0 if there are no rows
+        self._head_parts = (b"", b"")  # header before and after the line with the number of points
         self._file = path.open("x+b", buffering=0)
 
     def __enter__(self) -> GrowingPly:
@@ -148,11 +150,14 @@ class GrowingPly:
 
     @property
     def has_layout(self) -> bool:
-        """True after the first points, when `row` is the type of the rows in the file."""
+        """Whether the first points were written, so that `row` is the row type in the file."""
         return bool(self._start)
 
     def check_room(self, count: int) -> None:
-        """Raise LidarError unless the disk has room for `count` points, and for the first again."""
+        """Raise LidarError unless the disk has enough space for `count` points.
+
+        The first points are temporarily stored twice.
+        """
         size = len(header(self.row, count, self._comments)) + count * self.row.itemsize
         piece = min(count, FIRST_POINTS) * self.row.itemsize
         free = shutil.disk_usage(self._path.parent).free
@@ -171,14 +176,15 @@ class GrowingPly:
         count
             Number of points.
         columns
-            Names of axes and columns, with values (n,), each once; positions in float32 or float64.
+            Name and values of each axis and column. Positions must be float32 or float64.
 
         Raises
         ------
         LidarError
-            If Open3D cannot write, or a value does not fit into the file.
+            If Open3D cannot write the points, or if a value is out of range for its type in the
+            file.
         OSError
-            If the disk is full, or the file cannot be written for another reason.
+            If the disk is full, or if the file cannot be written for another reason.
         """
         first = 0
         if not self._start and count:
@@ -197,18 +203,18 @@ class GrowingPly:
         self.count += count
 
     def extend(self, count: int) -> int:
-        """Extend the file, after the first points, by rows that will be written.
+        """Reserve space for `count` rows and return their offset in bytes.
 
-        Returns the offset of the first of these rows, bytes.
+        The rows must be written with `write_rows`. The file must already contain the first points.
         """
         offset = self.size
         self.count += count
         return offset
 
     def write_rows(self, rows: memoryview, offset: int) -> None:
-        """Write the bytes of rows at an offset.
+        """Write rows at an offset in bytes.
 
-        Raises OSError if the disk is full, or the file cannot be written for another reason.
+        Raises OSError if the disk is full, or if the file cannot be written for another reason.
         """
         _write_at(self._file.fileno(), rows, offset)
 
@@ -217,7 +223,7 @@ class GrowingPly:
         os.fsync(self._file.fileno())
 
     def finish(self) -> None:
-        """Write the header with the number of points."""
+        """Write the header with the final number of points."""
         if not self._start:  # Open3D refuses to write a file without points
             self._write(header(self.row, 0, self._comments))
             return
@@ -232,11 +238,11 @@ class GrowingPly:
         return b"%s%selement vertex %d\n%s" % (before, self._comments.encode(), count, after)
 
     def _write_first(self, columns: Mapping[str, AnyArray]) -> None:
-        """Write a header and the first rows in the layout of Open3D."""
+        """Let Open3D write the first points, and copy its header and rows to the file."""
         positions = np.stack([columns[axis] for axis in AXES], axis=1)
         others = {name: columns[name] for name in self._columns}
         cloud = Cloud(positions, others, tuple(self._columns.values()))
-        # Open3D chooses the format by the ending of the name.
+        # Open3D selects the format by the file extension.
         piece = self._path.with_name(f".{self._path.name}.ply")
         write_with_open3d(piece, cloud, self.position_type)
         start, self.row = _layout(piece, self._path, len(cloud))
@@ -251,12 +257,12 @@ class GrowingPly:
     def _write(self, data: bytes | memoryview) -> None:
         """Append bytes to the file."""
         view = memoryview(data)
-        while view:  # the kernel writes 2 GiB at most at a time
+        while view:  # Linux writes at most 2 GiB in one call
             view = view[self._file.write(view) :]
 
 
 def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
-    """Return the lines of a header that lidarpool adds to Open3D's lines."""
+    """Return the comment lines that lidarpool adds to the header of Open3D."""
     comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
     if sweeps.epsg is not None and sweeps.coordinates == "world":
         comments += f"comment crs: EPSG:{sweeps.epsg}\n"
@@ -268,15 +274,15 @@ def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
 
 
 def _write_at(file: int, data: memoryview, offset: int) -> None:
-    """Write bytes at an offset of a file."""
-    while data:  # the kernel writes 2 GiB at most at a time
+    """Write bytes at an offset in a file."""
+    while data:  # Linux writes at most 2 GiB in one call
         count = os.pwrite(file, data, offset)
         data = data[count:]
         offset += count
 
 
 def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
-    """Move the bytes from `start` to `stop` of a file to `new_start`, and cut off what follows."""
+    """Move the bytes from `start` to `stop` to `new_start`, and truncate the file after them."""
     offsets = range(start, stop, _BLOCK_BYTES)
     distance = new_start - start
     for offset in reversed(offsets) if distance > 0 else offsets:
@@ -318,12 +324,20 @@ def read_cloud(path: str | Path) -> Cloud:
 
 
 def _comment(name: str) -> str:
-    """Return a name for a comment, in ASCII."""
+    """Convert a name to printable ASCII for use in a comment."""
     return printable(name).encode("ascii", "backslashreplace").decode()
 
 
 def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
-    """Return the smallest type that is precise enough for positions between these bounds."""
+    """Return the smallest floating-point type that is precise enough for positions.
+
+    Parameters
+    ----------
+    bounds
+        Minimum and maximum of the positions. If they are float32, so are the positions.
+    precision_m
+        Precision of the positions in meters.
+    """
     if bounds.dtype == np.float32:
         return bounds.dtype
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
@@ -332,14 +346,14 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
 
 
 def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
-    """Write a cloud with positions of a type.
+    """Write a cloud with Open3D, converting its positions to the type `real`.
 
     Raises LidarError if Open3D reports an error.
     """
-    o3d = load_open3d()  # here, because read_cloud does not need it
+    o3d = load_open3d()
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))
-    # Open3D reads the axes of normals one after the other, and writes other columns in any order.
+    # Open3D only supports consecutive normals. The order of other columns is arbitrary.
     normals = NORMAL if {*NORMAL} <= {*cloud.columns} else ()
     if normals:
         points.point.normals = o3d.core.Tensor(np.stack([cloud[n] for n in normals], axis=1))
@@ -362,9 +376,9 @@ def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> 
 
 
 def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
-    """Return start and type of the rows of a written chunk.
+    """Return the offset of the first row and the row type in a file written by Open3D.
 
-    LidarError if rows are missing, because Open3D ignores a full disk.
+    Raises LidarError if rows are missing, because Open3D does not report a full disk.
     """
     try:
         start, stored_count, row = layout(piece)
@@ -383,18 +397,20 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
 
 
 def _open_file(source: RecordingSource) -> Recording:
-    """Open a .ply, with the file of sweeps beside the .ply of a result."""
     if source.as_stored:
         return _open_foreign(source)
     try:
         cloud = CloudFile(source.path)
-    except LidarError:  # text, or of another program
+    except LidarError:  # a text file, or a file from another program
         return _open_foreign(source)
     return replace(_open_own(source, cloud), meters=source.chosen_meters())
 
 
 def _open_foreign(source: RecordingSource) -> Recording:
-    """Open a .ply of another program, or of text, in the units of the system that it states."""
+    """Open a .ply file that is a text file or comes from another program.
+
+    Positions are in the units of the coordinate system that the file declares.
+    """
 
     def read(_: int) -> Sweep:
         return sweep_from_columns(read_ply_columns(read_input(source.path)))
@@ -416,7 +432,7 @@ def _open_foreign(source: RecordingSource) -> Recording:
 
 
 def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
-    """Open a .ply of lidarpool, with the file of sweeps beside the .ply of a result."""
+    """Open a .ply file that lidarpool has written, with sweeps if it belongs to a result."""
     if not (sweeps_path := source.path.with_name(SWEEPS_FILE)).exists():
         return open_cloud(source.name, cloud, None, source.sensor, source.intensity)
     try:

@@ -1,4 +1,4 @@
-"""The loop that makes rows of a PLY file from the columns of a part."""
+"""Compiled loop that creates the rows of a PLY file from the columns of a part."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,21 +8,21 @@ import numpy as np
 
 from raybeam.compiled import compiled, stage
 
-TILE_ROWS = 512  # rows at a time: they stay in the first cache while all columns are written
+TILE_ROWS = 512  # rows per tile, which stays in the L1 cache while all columns are written
 
 
 @stage
 def _scatter(values, fields):
-    """Write values (n,) into a field of n rows."""
+    """Write values to a field of all rows."""
     for k in range(len(fields)):
         fields[k] = values[k]
 
 
 @stage
 def _round_positions(cells, scale, origin, positions):
-    """Write the positions of cells (n,), rounded as by `part_columns.positions_of`.
+    """Compute the positions of cells, rounded in the same way as by `part_columns.positions_of`.
 
-    Apart from `_scatter`: so several positions are computed by one instruction.
+    This is separate from `_scatter`, so that the compiler can vectorize the loop.
     """
     for k in range(len(positions)):
         position = cells[k] * scale.precision_m + origin
@@ -31,27 +31,31 @@ def _round_positions(cells, scale, origin, positions):
 
 @compiled()
 def make_rows(columns, copied, axes, scale, rows, positions, tile):
-    """Write columns and positions of points into the rows of a file.
+    """Write the columns and positions of points to the rows of a file.
 
     Parameters
     ----------
     columns
-        Memory of all columns as numbers of each size in bytes, `of_1` to `of_8`, and as `cells`.
+        Views of the memory that contains all columns, as integers of 1 to 8 bytes (`of_1` to
+        `of_8`) and as `cells`.
     copied
-        (c, 3), for each column that is copied: size of a value in bytes; index of the column's
-        first value among the numbers of this size; and offset of the field in a row, bytes.
+        One row for each column that is copied, with shape (c, 3): the size of a value in bytes, the
+        index of the column's first value in the view with this size, and the offset of the field in
+        a row in bytes.
     axes
-        (3, 2), for each axis: index of the first cell, and offset of the field in a row, bytes.
+        One row for each axis, with shape (3, 2): the index of the first cell, and the offset of the
+        field in a row in bytes.
     scale
         `Scale` of the positions.
     rows
-        Memory of the rows as numbers of each size, (rows, offsets in bytes) each: `of_4[5, 12]` are
-        the four bytes at offset 12 of row 5. They are read and written one by one, since they are
-        not aligned.
+        Views of the memory that contains the rows, as integers of 1 to 8 bytes, indexed by row and
+        byte offset. `of_4[5, 12]`, for example, is the four bytes at offset 12 in row 5. The values
+        are not aligned, so they are read and written one at a time.
     positions
-        The same memory as numbers of the type of positions in the file, (rows, offsets).
+        View of the same memory with the type of positions in the file, indexed by row and byte
+        offset.
     tile
-        (512,), memory for positions in this type.
+        Temporary array for positions of this type, with shape (512,).
     """
     for start in range(0, len(positions), len(tile)):
         stop = min(start + len(tile), len(positions))

@@ -1,4 +1,4 @@
-"""Rows of a PLY file from the columns of a part, in one compiled pass."""
+"""Conversion of the columns of a part to rows of a PLY file, in a single compiled pass."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from lidarsim.columns.table import AXES, Column
 from ..columns.part_blocks import BlockMemory
 from .ply_loops import TILE_ROWS, make_rows
 
-_SIZES = (1, 2, 4, 8)  # of numbers, bytes
+_SIZES = (1, 2, 4, 8)  # sizes of integers in bytes
 
 
 class Scale(NamedTuple):
-    """Positions of cells: `round((cell * precision_m + origin) * factor) / factor`."""
+    """Converts cells to positions: `round((cell * precision_m + origin) * factor) / factor`."""
 
-    precision_m: float  # size of a cell, meters
-    origin: Floats  # world position of the cell 0, 0, 0, (3,), meters
-    factor: float  # a power of ten
+    precision_m: float  # size of a cell in meters
+    origin: Floats  # (3,): position of the cell (0, 0, 0) in world coordinates, in meters
+    factor: float  # power of ten that determines the number of decimals
 
 
 class _Columns(NamedTuple):
-    """Memory of columns, as numbers of each size in bytes."""
+    """Views of the memory that contains columns, as integers of different sizes in bytes."""
 
     of_1: AnyArray
     of_2: AnyArray
@@ -37,7 +37,7 @@ class _Columns(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Memory of rows, as numbers of each size in bytes, (rows, offsets) each."""
+    """Views of the memory that contains rows, indexed by row and byte offset."""
 
     of_1: AnyArray
     of_2: AnyArray
@@ -46,20 +46,22 @@ class _Rows(NamedTuple):
 
 
 class RowMaker:
-    """Makes rows of a PLY file, in memory that is used again.
+    """Creates rows of a PLY file in memory that is reused.
 
-    Columns whose type in the file is another are converted by NumPy.
+    Columns that have a different type in the file are converted by NumPy.
 
     Parameters
     ----------
     row
         Type of a row.
     table
-        Columns beside the positions.
+        Columns in addition to the positions.
     memory
-        Memory of the columns.
-    precision_m, origin
-        Size of the cells of positions, and world position of the cell 0, 0, 0, (3,), meters.
+        Memory that contains the columns.
+    precision_m
+        Size of a cell in meters.
+    origin
+        Position of the cell (0, 0, 0) in world coordinates, in meters. Shape (3,).
     """
 
     def __init__(
@@ -95,23 +97,23 @@ class RowMaker:
         self._tile = np.zeros(TILE_ROWS, self._positions.dtype)
 
     def _fields_of(self, dtype: np.dtype[Any]) -> AnyArray:
-        """Return the rows as numbers of a type, (rows, offsets in bytes), which overlap."""
+        """Return an overlapping view of the rows with a type, indexed by row and byte offset."""
         row_bytes = self._rows.itemsize
         shape = (len(self._rows), row_bytes - dtype.itemsize + 1)
         return np.ndarray(shape, dtype, self._rows.view(np.uint8), strides=(row_bytes, 1))
 
     def make(self, columns: Mapping[str, AnyArray]) -> memoryview:
-        """Return the bytes of the rows of a block, until the next block.
+        """Return the rows of a block as bytes, which are valid until the next call.
 
         Parameters
         ----------
         columns
-            {name: (n,)}: the columns of the block in the memory.
+            Columns of the block by name, which are views of the memory.
 
         Raises
         ------
         LidarError
-            If a value does not fit into the file.
+            If a value is out of range for its type in the file.
         """
         count = len(columns[AXES[0].name])
         rows = self._rows[:count]
@@ -126,6 +128,6 @@ class RowMaker:
 
 
 def _offset(row: np.dtype[np.void], name: str) -> int:
-    """Return the offset of a field in a row, bytes."""
+    """Return the offset of a field in a row, in bytes."""
     assert row.fields is not None, "named fields"
     return row.fields[name][1]

@@ -1,4 +1,4 @@
-"""Unit and clock of the point times in a recording, found from the times of several sweeps."""
+"""Unit and clock of the point times in a recording, determined from a few sweeps."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class PointTimes(NamedTuple):
         return cls(unit_s, sweep_s)
 
     def of_points(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
-        """Return the times (n,) of the points of a sweep relative to its timestamp, in seconds.
+        """Return the times of a sweep's points relative to its timestamp in seconds. Shape (n,).
 
         Returns None if times are missing, or if they are too far from each other or from the
         timestamp.

@@ -1,8 +1,8 @@
-"""Recordings, which are sequences of sweeps or of parts of a large cloud in any file format.
+"""Recordings, which are sequences of sweeps, or parts of a large cloud, in any file format.
 
 When an item is read, its columns get standard names, its positions are converted to meters, the
 chosen column becomes the intensity, and withheld points are omitted. Rings and point times that a
-file does not state are determined from a few sweeps when they are first requested.
+file does not specify are determined from a few sweeps on first use.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .point_times import PointTimes
 from .rings import Rings
 
 METERS: Meters = (1.0, 1.0, 1.0)
-_REFERENCE_SWEEPS = 5  # sweeps that determine rings and point times
+_REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
@@ -62,18 +62,18 @@ class Recording:
     Parameters
     ----------
     name
-        Name in messages.
+        Name that is used in messages.
     count
         Number of sweeps or parts.
     read
-        Function that returns a sweep, given its number, with the units and column names of the
+        Function that returns a sweep, given its number, with the units and column names in the
         file.
     is_cloud
         Whether the items are parts of a cloud without sweeps.
     point_count
-        Number of points of a cloud, or None if it is not known before the points are read.
+        Number of points in a cloud, or None if it is not known before the points are read.
     intensity_column
-        Column that the user chose as intensity, or None.
+        Column that the user chose as intensity, or None for the default.
     read_stamps
         Function that returns the timestamps of all sweeps in nanoseconds, or None.
     read_poses
@@ -81,29 +81,29 @@ class Recording:
         if some are unknown. It is faster than reading every sweep.
     fired
         Function that returns a sweep as fired, with its `firing_poses`, given its number. None if
-        the firing poses are unknown, as in most recordings of real sensors.
+        the firing poses are unknown, as in most recordings from real sensors.
     sample
-        Function that returns approximately the given number of points, evenly distributed in the
-        file.
+        Function that returns approximately the given number of points, which are evenly distributed
+        in the file.
     compensated
-        Whether the file states that the points are compensated for the motion of the sensor. None
-        if it does not state this, or if the sensor does not move.
+        Whether the points are compensated for the motion of the sensor, according to the file. None
+        if this is unknown, or if the sensor does not move.
     meters
         Units of x, y and z in meters.
     system
-        Coordinate system that the file states.
+        Coordinate system that the file declares.
     epsg
-        EPSG code of the coordinates, or None if they are in no known system in meters.
+        EPSG code of the coordinates, or None if they are not in a known system with the unit meter.
     is_metric
         Whether the format defines coordinates as true meters, regardless of the coordinate system.
     sequence
-        Name of the drive in files with several drives, each of which has its own world frame.
+        Name of the drive if the file contains several drives, each with its own world frame.
         Otherwise an empty string.
     calibration
-        Path of KITTI's calib.txt, which may not exist.
+        Path of the file calib.txt in KITTI, which may not exist.
     stations
-        Names of the sweeps if each sweep was recorded at a scan station. Unnamed sweeps have an
-        empty string.
+        Names of the sweeps if each sweep was recorded at a scan station. The name of an unnamed
+        sweep is an empty string.
     thinned
         Whether some returns were discarded, so that gaps are not necessarily lost returns.
     white
@@ -111,9 +111,10 @@ class Recording:
     energies
         Whether intensities are energies, as in results.
     firing_key
-        Recordings with the same key have the same rays. An empty string if this is unknown.
+        Key that identifies the rays of the recording. Recordings with the same key have the same
+        rays. An empty string if the rays are unknown.
     noise_classes
-        Classes of noise, which is omitted together with withheld points, or None to keep all
+        Classes of noise points, which are omitted together with withheld points. None to keep all
         points.
     notes
         Sentences for the user.
@@ -160,7 +161,8 @@ class Recording:
     def __getitem__(self, number: int) -> Sweep:
         """Read a sweep, or a part of a cloud.
 
-        Raises LidarError if the recording cannot be read, and IndexError if there is no such item.
+        Raises LidarError if the recording cannot be read, and IndexError if the item does not
+        exist.
         """
         number = operator.index(number)
         if not -self.count <= number < self.count:
@@ -178,13 +180,13 @@ class Recording:
             return self._resolved(number, self.fired(number)).returns()
 
     def read_sample(self, max_points: int) -> Sweep:
-        """Read approximately `max_points` points of a cloud that has the function `sample`."""
+        """Read approximately `max_points` points from a cloud that has the function `sample`."""
         assert self.sample is not None
         with reading(self.name):
             return self._resolved(None, self.sample(max_points))
 
     def _resolved(self, number: int | None, sweep: Sweep) -> Sweep:
-        """Return a stored sweep with standard names and in meters, without withheld points.
+        """Convert a stored sweep to standard column names and meters, without withheld points.
 
         `number` is None for a sample, whose omitted points are not counted.
         """
@@ -211,9 +213,9 @@ class Recording:
         return sweep.replace(points=points, columns=columns, pose=pose, **changes)
 
     def _chosen_intensity(self, stored: Columns, standard: Columns) -> Columns:
-        """Return columns with the chosen column as intensity.
+        """Return the standard columns with the chosen column as intensity.
 
-        Raises ValueError if there is no such column.
+        Raises ValueError if the chosen column does not exist.
         """
         name = self.intensity_column
         if name is None:
@@ -234,7 +236,7 @@ class Recording:
 
     @property
     def omission_notes(self) -> list[str]:
-        """Notes on points that were omitted from the items read so far."""
+        """Notes about points that were omitted from the items read so far."""
         totals = np.sum([(0, 0), *self._omitted.values()], axis=0).tolist()
         note = OmittedPoints(*totals).note()
         return [f"{self.name}: {note}"] if note else []
@@ -306,10 +308,10 @@ class Recording:
         return Rings.from_sweeps(self.name, [*sweeps.values()]), times
 
     def rings_of(self, sweep: Sweep) -> Ints | None:
-        """Return the rings (n,) of points without a ring column, counted from the lowest ring.
+        """Return the ring of each point in a sweep without a ring column, with shape (n,).
 
-        Points without a ring or without a return have the value -1. Returns None if the rings are
-        unknown.
+        Rings are numbered from the lowest ring. Points without a ring or without a return have the
+        value -1. Returns None if the rings are unknown, or if there is a ring column.
         """
         if not len(self.rings) or self.rings.numbers is not None:
             return None
@@ -320,9 +322,9 @@ class Recording:
         return rings
 
     def times_of(self, sweep: Sweep) -> Floats | None:
-        """Return the times (n,) of points relative to the timestamp of their sweep, in seconds.
+        """Return the time of each point relative to the timestamp of its sweep, in seconds.
 
-        Returns None if the times are unknown.
+        Returns None if the times are unknown, otherwise an array with shape (n,).
         """
         if self.fired is not None:  # a result, whose times are exact
             if "time" not in sweep.columns or sweep.time_ns is None:
@@ -344,17 +346,17 @@ class RecordingSource:
     sensor: str | None = None  # sensor or topic to read, if there are several
     intensity: str | None = None  # column to use as intensity, if it is not `intensity`
     unit: str | None = None  # unit of the positions, which overrides the file
-    # Whether positions remain in the units and coordinate system of the file, without checks, and
-    # each scan in the file is an item.
+    # Whether positions are returned in the units and the coordinate system of the file, without
+    # checks, and each scan in the file is an item.
     as_stored: bool = False
 
     def recording(self, count: int, read: Callable[[int], Sweep], **fields: Any) -> Recording:
-        """Return a recording with `count` sweeps or parts, and further fields of `Recording`."""
+        """Create a recording with `count` sweeps or parts. `fields` are passed to `Recording`."""
         fields.setdefault("intensity_column", self.intensity)
         return Recording(self.name, count, read, **fields)
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
-        """Return the chosen sensor or topic, as the function `choose`."""
+        """Return the sensor or topic that the user chose (see the function `choose`)."""
         return choose(self.name, kind, names, self.sensor)
 
     def of_sensors(self, sensors: Mapping[str, Recording]) -> Recording:
@@ -365,11 +367,11 @@ class RecordingSource:
         return sensors[self.choose("sensors", sensors)]
 
     def named(self, clauses: Iterable[str]) -> tuple[str, ...]:
-        """Return notes, which are clauses preceded by the name of the recording."""
+        """Turn clauses into notes by prepending the name of the recording."""
         return tuple(f"{self.name} {clause}" for clause in clauses)
 
     def chosen_meters(self) -> Meters:
-        """Return the units of x, y and z for a format that does not state them."""
+        """Return the units of x, y and z in meters, for a format that does not define them."""
         return stated_meters(None, np.zeros((0, 3)), self.unit)[0]
 
     def stated_meters(
@@ -377,8 +379,8 @@ class RecordingSource:
     ) -> tuple[Meters, tuple[str, ...]]:
         """Return the units of x, y and z in meters, and notes for the user.
 
-        `positions` are points of the file or a sample of them, of shape (n, 3), in its units.
-        Raises LidarError as `lidarsim.scene.files.stated_system.stated_meters`.
+        `positions` are points in the file, or a sample of them, in the units of the file. Raises
+        LidarError in the same cases as `lidarsim.scene.files.stated_system.stated_meters`.
         """
         if self.as_stored:
             return METERS, ()
@@ -386,7 +388,7 @@ class RecordingSource:
         return meters, self.named(clauses)
 
     def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
-        """Return the EPSG code of a coordinate system in meters, or None for other units."""
+        """Return the EPSG code of a coordinate system, or None if its unit is not the meter."""
         if system is None or self.unit is not None or meters != METERS:
             return None
         return system.epsg
@@ -398,11 +400,21 @@ class RecordingSource:
         count: int | None = None,
         **fields: Any,
     ) -> Recording:
-        """Return a recording that can only be read from its start.
+        """Create a recording from a file that can only be read from its start.
 
-        `sweeps` returns an iterator over the stored sweeps, and `convert` converts each of them to
-        a `Sweep`. If `count` is None, the sweeps are counted. `fields` are further fields of
-        `Recording`.
+        Reading the sweeps in order takes a single pass. To go back, the file is read again from its
+        start.
+
+        Parameters
+        ----------
+        sweeps
+            Function that returns an iterable of the stored sweeps.
+        convert
+            Function that converts a stored sweep to a `Sweep`.
+        count
+            Number of sweeps. If it is None, the sweeps are counted.
+        fields
+            Further fields of `Recording`.
         """
         if count is None:
             with reading(self.name):
@@ -413,7 +425,7 @@ class RecordingSource:
             position = positions()
             with position.lock:
                 start = position.next_number
-                position.next_number = 0  # after an error, the next call starts again
+                position.next_number = 0  # so that the next call starts again after an error
                 if not 0 < start <= number:
                     start = 0
                     position.remaining = iter(sweeps())
@@ -441,17 +453,17 @@ class RecordingSource:
 
 @dataclass
 class _StreamPosition:
-    """Position of a process in a stream, which one thread at a time moves."""
+    """Position of a process in a stream, which is protected by a lock."""
 
-    next_number: int = 0
+    next_number: int = 0  # number of the next sweep, or 0 to start again
     remaining: Iterator[Any] = field(default_factory=lambda: iter(()))  # from `next_number`
     lock: RLock = field(default_factory=RLock)
 
 
 def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
-    """Return a sweep whose points are the columns x, y and z.
+    """Create a sweep from columns, which must include the coordinates x, y and z.
 
-    Raises ValueError if one of these columns is missing.
+    Raises ValueError if a coordinate is missing. `fields` are passed to `Sweep`.
     """
     columns = with_standard_names(columns, "xyz")
     if missing := [axis for axis in "xyz" if axis not in columns]:
@@ -470,22 +482,25 @@ def open_cloud(
     intensity: str | None,
     **fields: Any,
 ) -> Recording:
-    """Open a cloud of lidarpool as the sweeps of a sensor, or in parts if it has no sweeps.
-
-    Raises LidarError if several sensors are present and none was chosen, or for an unknown sensor.
+    """Open a lidarpool cloud as the sweeps of a sensor, or in parts if it has no sweeps.
 
     Parameters
     ----------
     name
-        Name in messages.
+        Name that is used in messages.
     cloud
-        The cloud.
+        Cloud to open.
     load_sweeps
         Function that returns the sweeps of the cloud, or None for a cloud without sweeps.
     sensor, intensity
-        Sensor and intensity column that the user chose.
+        Sensor and intensity column that the user chose, or None.
     fields
         Further fields of `Recording`.
+
+    Raises
+    ------
+    LidarError
+        If there are several sensors and none was chosen, or if the chosen sensor does not exist.
     """
     fields |= {"intensity_column": intensity, "noise_classes": None}
     if load_sweeps is None:
@@ -543,11 +558,23 @@ def open_cloud(
 
 
 def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
-    """Return the chosen sensor or topic, or the only sensor or topic.
+    """Return the chosen sensor or topic, or the only one if none was chosen.
 
-    `kind` is a plural such as "sensors", and `name` is the name of the recording.
+    Parameters
+    ----------
+    name
+        Name of the recording, for error messages.
+    kind
+        What is chosen, in the plural, for error messages. For example "sensors".
+    names
+        Names of the available sensors or topics.
+    chosen
+        Name that the user chose, or None.
 
-    Raises LidarError if several are present and none was chosen, or for an unknown name.
+    Raises
+    ------
+    LidarError
+        If there are several and none was chosen, or if the chosen one does not exist.
     """
     available = list(names)
     if chosen is None and len(available) == 1:

@@ -1,8 +1,9 @@
-"""Rings of a recording, from a column or from the order or the elevation angles of the points.
+"""Determine the rings of a recording from a column, or from the points if there is no column.
 
 KITTI `.bin` files and many PCD files have no ring column. If points are stored ring by ring, a new
-ring starts where the azimuth jumps back. In any order, the points of a sensor whose beams sweep
-cones have few distinct elevation angles, unless motion compensation has changed them.
+ring starts where the azimuth jumps back. Otherwise, rings can be recognized by their elevation
+angles: beams that sweep cones have few distinct elevations, unless the points are
+motion-compensated.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _MIN_CLUSTER = 1e-3  # fraction of points in a cluster; smaller clusters are str
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """The rings of a recording, starting with the highest ring.
+    """Rings of a recording, sorted from the highest to the lowest.
 
     Attributes
     ----------
@@ -134,11 +135,12 @@ class Rings:
         return np.where(self.numbers[row] == numbers, row, -1)
 
     def _rows_of_runs(self, medians: Floats, is_ring: Bools) -> Ints:
-        """Return the rows (k,) of runs with median elevations (k,), or -1 for a run without a ring.
+        """Assign a ring to each run of points, given the median elevations of the runs.
 
-        Each ring is assigned to at most one run. Nearest elevations would be ambiguous, because the
-        median elevation of a ring depends on the surfaces that it hits, and may change by more than
-        the angle between neighboring rings.
+        Returns the index of the ring for each run, or -1 for runs that are not rings. Each ring is
+        assigned to at most one run. Choosing the ring with the nearest elevation would be
+        ambiguous, because the median elevation of a ring depends on the surfaces that it hits. It
+        can change by more than the angle between neighboring rings.
         """
         from scipy.optimize import linear_sum_assignment
 
@@ -150,15 +152,25 @@ class Rings:
 
 
 def elevations(points: Floats) -> Floats:
-    """Return the elevation angles (n,) of points (n, 3) in the sensor frame, in radians."""
+    """Return the elevation angles of points in the sensor frame, in radians."""
     return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
 
 
 def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
-    """Return the numbers and median elevations (r,) of rings, and their deviation from cones.
+    """Summarize the elevations of rings.
 
-    The rings are sorted from the highest to the lowest. The deviation is the interquartile range of
-    the elevations in a ring in radians, as a median over all rings.
+    Parameters
+    ----------
+    rings
+        Ring number of each point, with shape (n,).
+    elevation
+        Elevation angle of each point in radians, with shape (n,).
+
+    Returns
+    -------
+    Ring numbers and median elevations, sorted from the highest to the lowest ring, and the
+    deviation of the rings from cones. The deviation is the median, over all rings, of the
+    interquartile range of the elevations in a ring.
     """
     numbers, index = np.unique(rings, return_inverse=True)
     parts = [elevation[index == row] for row in range(len(numbers))]
@@ -168,7 +180,7 @@ def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
 
 
 def _clusters(points: Floats) -> Floats | None:
-    """Return the elevations (r,) of the cones that contain points (n, 3), the highest first.
+    """Return the elevations of the cones on which points lie, from the highest to the lowest.
 
     Returns None unless the gaps between the clusters of elevations are larger than the widest
     cluster.
@@ -193,7 +205,7 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return the starts (k,) of runs with monotonic azimuths, and a mask of runs that are rings."""
+    """Return the starts of runs with monotonic azimuths, and a mask of the runs that are rings."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     steps = np.diff(azimuth)
     direction = np.sign(np.sum(np.sign(steps)))
@@ -203,12 +215,12 @@ def _runs(points: Floats) -> tuple[Ints, Bools]:
 
 
 def _medians(values: Floats, starts: Ints) -> Floats:
-    """Return the medians (k,) of runs of values (n,)."""
+    """Return the median of each run of values."""
     return np.array([np.median(run) for run in np.split(values, starts[1:])])
 
 
 def _runs_in_order(points: Floats) -> Floats | None:
-    """Return the median elevations (k,) of runs in radians, or None if they are not rings."""
+    """Return the median elevation of each run of points, or None if the runs are not rings."""
     if len(points) < _MAX_RINGS:
         return None
     starts, is_ring = _runs(points)

@@ -1,4 +1,4 @@
-"""Recordings of Rerun: clouds, frames, boxes of actors, trajectories, path and scene over time."""
+"""Write Rerun recordings with sweeps, frames, boxes of actors, trajectories, path and scene."""
 
 from __future__ import annotations
 
@@ -24,30 +24,37 @@ from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 from .writing import ExportSpec
 
 APPLICATION = "lidarpool"
-SURVEY_TIME = "survey"  # timeline: since the survey's start
-UTC_TIME = "utc"  # timeline of surveys with a date
+SURVEY_TIME = "survey"  # timeline that starts with the survey
+UTC_TIME = "utc"  # timeline for surveys with a date
 _PIPE_BYTES = 1 << 20
 _POINT_PIXELS = 1.5
 _LINE_PIXELS = 1.5
 _GRAY = (150, 150, 150)
 _WHITE = (255, 255, 255)
-_SCENE_ALPHA = 100  # 255 is opaque; points on a surface, and behind a wall, can be seen
+_SCENE_ALPHA = 100  # translucent, so that points behind walls are visible (255 is opaque)
 _ORANGE = (255, 153, 0)
 _BLUE = (51, 153, 255)
 _GREEN = (26, 204, 77)
-# Limits of the color scale, the same in all sweeps: log10 of intensity, and z in the sensor frame.
+# Limits of the color scale for log10(intensity) and for z in the sensor frame. They are the same
+# for all sweeps.
 _INTENSITY_LIMITS = (-3.0, 0.0)
 _HEIGHT_LIMITS_M = (-3.0, 7.0)
 
 
 class Rerun(CloudFormat):
-    """A recording of Rerun, with scene and planned path of the pictures' content.
+    """A Rerun recording of a survey, for the Rerun viewer.
 
-    Points are at `map/base_link/NAME/points`, in the sensor frame at the start of their sweep, with
-    all columns; `map/base_link` and its sensors have their poses over time. The boxes of actors are
-    `map/actors`; `map/scene`, `map/trajectories` and `map/path` do not change. Positions are
-    float32 in Rerun, so those in the world are relative to the scene's local origin, which the
-    recording's property `origin` holds. Rerun's own identifiers make the bytes of each file unique.
+    A recording contains these entities:
+
+    - `map/base_link` and its sensors: poses over time.
+    - `map/base_link/NAME/points`: points of each sweep with all columns, in the sensor frame at the
+      start of the sweep.
+    - `map/actors`: boxes of actors over time.
+    - `map/scene`, `map/trajectories` and `map/path`: static scene, trajectories and planned path.
+
+    Rerun stores positions as float32. World coordinates are therefore relative to the origin of the
+    scene, which is stored in the recording property `origin`. Rerun adds unique identifiers to each
+    file, so the bytes of two files are never the same.
     """
 
     title = "RRD"
@@ -71,12 +78,15 @@ class Rerun(CloudFormat):
 def _recording_to(path: Path) -> Iterator[Any]:
     """Yield a recording that is written to a file.
 
-    Raises OSError if the file cannot be written.
+    If the disk is full, Rerun's writer only logs an error and then blocks forever. Rerun therefore
+    writes to a pipe, and a thread copies the data to the file.
 
-    Rerun's own writer logs the error of a full disk, and waits for ever. So it writes to a pipe,
-    and a thread copies the pipe to the file.
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
     """
-    recording = import_module("rerun").RecordingStream(APPLICATION)  # an extra
+    recording = import_module("rerun").RecordingStream(APPLICATION)  # optional dependency
     if not hasattr(os, "mkfifo"):  # Windows
         recording.save(path)
         yield recording
@@ -84,26 +94,27 @@ def _recording_to(path: Path) -> Iterator[Any]:
         return
     with (
         TemporaryDirectory(prefix="lidarpool-") as folder,
-        ThreadPoolExecutor(1, "rrd") as thread,  # waits for the thread
+        ThreadPoolExecutor(1, "rrd") as thread,  # exiting waits for the thread
         path.open("wb") as file,
     ):
         pipe = Path(folder, "pipe")
         os.mkfifo(pipe)
-        source = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)  # else opening waits for a writer
+        # Without O_NONBLOCK, opening the pipe would wait for a writer.
+        source = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
         os.set_blocking(source, True)
         recording.save(pipe)
         copying = thread.submit(_copy, source, file)
         try:
             yield recording
         finally:
-            recording.disconnect()  # the end of the pipe
+            recording.disconnect()  # closes the pipe
         copying.result()
 
 
 def _copy(source: int, file: BinaryIO) -> None:
     """Copy a pipe to a file.
 
-    After an error, read on to the end, so that no writer waits.
+    After an error, the pipe is still read to its end, so that the writer does not block.
     """
     error: OSError | None = None
     with open(source, "rb", buffering=0) as pipe:
@@ -119,7 +130,7 @@ def _copy(source: int, file: BinaryIO) -> None:
 
 
 class RerunLog:
-    """Logs surroundings and sweeps to a recording of Rerun."""
+    """Logs surroundings and sweeps to a Rerun recording."""
 
     def __init__(self, recording: Any) -> None:
         self._rr: Any = import_module("rerun")
@@ -132,7 +143,10 @@ class RerunLog:
         self._log_static(WORLD, self._rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Log scene, trajectories and path, and take the origin and the start of the survey."""
+        """Log the scene, the trajectories and the path.
+
+        Sweeps that are logged afterwards use the origin and the start time of these surroundings.
+        """
         self._origin = surroundings.origin
         self._start_ns = surroundings.start_ns
         x, y, z = self._origin.tolist()
@@ -142,7 +156,8 @@ class RerunLog:
             names = [self._rr.AnnotationInfo(*item) for item in surroundings.classes.items()]
             self._log_static(WORLD, self._rr.AnnotationContext(names))
         if (surface := surroundings.surface) is not None:
-            corners = surface.vertices[surface.faces]  # Rerun shades by the normals of vertices
+            # Rerun only supports vertex normals, so each triangle gets its own vertices.
+            corners = surface.vertices[surface.faces]
             colors = surface.colors
             mesh = self._rr.Mesh3D(
                 vertex_positions=corners.reshape(-1, 3),
@@ -157,11 +172,11 @@ class RerunLog:
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Log a planned path, (w, 3), meters, world coordinates."""
+        """Log a planned path, given its corners in world coordinates, with shape (w, 3)."""
         self._log_static(f"{WORLD}/path", self._line(path, _GREEN))
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Log the points of a sweep, its frames and its boxes of actors."""
+        """Log the points of a sweep, its frames and the boxes of actors."""
         since_ns = np.timedelta64(shown.start_ns - self._start_ns, "ns")
         self._recording.set_time(SURVEY_TIME, duration=since_ns)
         if self._start_ns != START_NS:
@@ -169,7 +184,7 @@ class RerunLog:
         paths = {WORLD: WORLD}  # {frame: path of its entity}
         for transform in shown.transforms:
             if transform.parent == WORLD and transform.name not in (CARRIER, shown.frame):
-                continue  # frame of an actor, whose box has a separate pose
+                continue  # actors are shown as boxes, which have their own poses
             path = paths[transform.name] = f"{paths[transform.parent]}/{transform.name}"
             in_world = transform.parent == WORLD
             position = transform.position - self._origin if in_world else transform.position
@@ -183,7 +198,7 @@ class RerunLog:
             shown.positions,
             colors=_colors(shown.positions, columns),
             radii=self._rr.Radius.ui_points(_POINT_PIXELS),
-            class_ids=columns["class"] if has_labels else None,  # names, since there are colors
+            class_ids=columns["class"] if has_labels else None,  # labels only, colors are set
         )
         self._recording.log(f"{paths[shown.frame]}/points", cloud, self._rr.AnyValues(**columns))
         if shown.boxes is not None:
@@ -197,7 +212,7 @@ class RerunLog:
         return self._rr.LineStrips3D([positions - self._origin], colors=color, radii=width)
 
     def _boxes(self, boxes: ActorBoxes) -> Any:
-        """Return the boxes of the actors that are present."""
+        """Return an archetype with the boxes of the actors that are present."""
         rows = np.flatnonzero(boxes.present)
         return self._rr.Boxes3D(
             centers=boxes.centers[rows] - self._origin,
@@ -209,7 +224,7 @@ class RerunLog:
 
 
 def _normals(corners: Floats32) -> Floats32:
-    """Return the unit normals (f, 3) of triangles (f, 3, 3), zero for triangles without area."""
+    """Return the unit normals of triangles, which are zero for degenerate triangles."""
     a, b, c = corners.swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -217,7 +232,10 @@ def _normals(corners: Floats32) -> Floats32:
 
 
 def _colors(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:
-    """Return colors (n, 3) of points: their own, or of their intensity, or of their height."""
+    """Return the colors of points with shape (n, 3).
+
+    They are the colors in the columns, or are derived from the intensity or else the height.
+    """
     if columns.keys() >= {*COLORS}:
         return np.stack([columns[name] for name in COLORS], axis=1)
     if "intensity" in columns:

@@ -1,4 +1,4 @@
-"""What live views and recordings for viewers show of a survey: surroundings, and each sweep."""
+"""Data that live views and viewer recordings show: the surroundings, and each sweep."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lidarview.picture_file import PictureContent
 from .boxes import Boxes
 from .frame_names import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
 
-MAX_TRIANGLES = 200_000  # triangles of the scene in viewers
-MAX_POSITIONS = 10_000  # positions of a trajectory
+MAX_TRIANGLES = 200_000  # maximum number of triangles that viewers show
+MAX_POSITIONS = 10_000  # maximum number of positions in a trajectory
 _ORIGIN_STEP_M = 10_000.0
-# Column types that viewers hold: {kind and size of other columns: the type sent instead}.
+# Types that viewers do not support, and the types to which they are converted.
 _SENT_TYPES = {"i8": np.float64, "u8": np.float64, "b1": np.uint8, "f2": np.float32}
 
 
@@ -38,16 +38,16 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Static triangles of a scene."""
+    """Static triangles of a scene, for display."""
 
-    vertices: Floats32  # (v, 3), meters, local coordinates
+    vertices: Floats32  # (v, 3): meters, relative to `origin`
     faces: Ints32  # (f, 3)
-    colors: Bytes | None  # (f, 3), sRGB; None for a gray scene
-    origin: Floats  # (3,), world coordinates of the local origin, meters
+    colors: Bytes | None  # (f, 3): sRGB colors, or None for a gray scene
+    origin: Floats  # (3,): origin of the vertices in world coordinates, in meters
 
     @classmethod
     def from_scene(cls, scene: Scene, max_triangles: int = MAX_TRIANGLES) -> Surface:
-        """Return the triangles of a scene with its instances, simplified to a maximum number."""
+        """Return the triangles of a scene and its instances, simplified to `max_triangles`."""
         drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
         if len(drawn.faces) > max_triangles:
             drawn, _ = simplified(drawn, max_triangles)
@@ -61,20 +61,21 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What viewers show beside the sweeps, once: scene, trajectories and planned path."""
+    """Static content that viewers show in addition to the sweeps."""
 
     surface: Surface | None = None
-    # {name of a frame: positions (k, 3)}, meters, world coordinates
+    # {name of the frame: positions of shape (k, 3) in world coordinates, in meters}
     trajectories: Mapping[str, Floats] = field(default_factory=dict)
-    path: Floats | None = None  # (w, 3): corners of the planned path, meters, world coordinates
+    # (w, 3): corners of the planned path in world coordinates, in meters.
+    path: Floats | None = None
     classes: Mapping[int, str] = field(default_factory=dict)  # {number: name}
-    start_ns: int = START_NS  # start of the survey, since 1970-01-01 UTC
-    topics: Sequence[str] = ()  # topics of the points of sweeps that will follow
-    has_actors: bool = False  # True if these sweeps have boxes
+    start_ns: int = START_NS  # start of the survey in ns since 1970-01-01 UTC
+    topics: Sequence[str] = ()  # topics of the points in the sweeps that follow
+    has_actors: bool = False  # whether the sweeps that follow have boxes of actors
 
     @property
     def origin(self) -> Floats:
-        """World coordinates, (3,), that viewers with float32 coordinates subtract, meters."""
+        """Position in world coordinates that viewers with float32 coordinates subtract."""
         if self.surface is not None:
             return self.surface.origin
         positions = next(iter(self.trajectories.values()), np.zeros((1, 3)))
@@ -82,7 +83,11 @@ class Surroundings:
 
     @classmethod
     def from_sweeps(cls, sweeps: Sweeps, content: PictureContent | None = None) -> Surroundings:
-        """Return the surroundings of sweeps, with scene and path of the pictures' content."""
+        """Create the surroundings of sweeps.
+
+        `content` provides the scene and the planned path. It is ignored unless it is in world
+        coordinates.
+        """
         frames = frame_names(sweeps.sensors, sweeps.actors)
         positions_by_sensor = {
             frames[number]: sweeps.pose.positions[sweeps.sensor == number]
@@ -109,7 +114,7 @@ class Surroundings:
     def from_content(
         cls, content: PictureContent, trajectories: Mapping[str, Floats] = MappingProxyType({})
     ) -> Surroundings:
-        """Return the surroundings with the scene and the path of the content of pictures."""
+        """Create surroundings with the scene and the planned path of a picture."""
         best = None if content.planning is None else content.planning.best
         return cls(
             Surface.from_scene(content.scene),
@@ -119,25 +124,28 @@ class Surroundings:
 
 
 def path_in_world(corners: Floats, origin: Floats) -> Floats:
-    """Return the corners (w, 3) of a planned path, local (w, 2), in world coordinates, meters."""
+    """Convert the corners of a planned path from local 2D coordinates to 3D world coordinates."""
     return np.pad(corners, ((0, 0), (0, 1))) + origin
 
 
 @dataclass(frozen=True, eq=False)
 class ActorBoxes:
-    """Boxes of the actors in a sweep, a in number, as in `Boxes`, meters, world coordinates."""
+    """Boxes of the actors in a sweep as in `Boxes`, with the names of the actors.
+
+    Positions and sizes are in meters, in world coordinates.
+    """
 
     names: Sequence[str]
     types: Sequence[str]
     centers: Floats  # (a, 3)
     quaternions: Floats  # (a, 4): x, y, z, w
     sizes: Floats  # (a, 3)
-    points: Sequence[int]  # points of the sweep on each actor
+    points: Sequence[int]  # number of points in the sweep on each actor
     present: Sequence[bool]
 
     @classmethod
     def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> ActorBoxes:
-        """Return the boxes of all actors in a sweep with its points."""
+        """Compute the boxes of all actors in a sweep, given the points of the sweep."""
         boxes = Boxes.from_points(sweeps, sweep, points)
         return cls(
             names=sweeps.actors,
@@ -152,20 +160,20 @@ class ActorBoxes:
 
 @dataclass(frozen=True, eq=False)
 class ShownSweep:
-    """A sweep for viewers: points in the frame of the sensor when the sweep began."""
+    """A sweep for viewers, with points in the sensor frame at the start of the sweep."""
 
-    start_ns: int  # start of the sweep, since 1970-01-01 UTC
-    stamp_ns: int  # the same by the sensor's clock, which faults may have moved
+    start_ns: int  # start of the sweep in ns since 1970-01-01 UTC
+    stamp_ns: int  # start of the sweep according to the sensor's clock, which may be faulty
     topic: str
     frame: str
-    positions: Floats32  # (n, 3), meters
-    columns: Mapping[str, AnyArray]  # {name: (n,)}, numbers of at most 32 bits or float64
-    transforms: Sequence[Transform]  # transforms of the frames at the start of the sweep
-    boxes: ActorBoxes | None = None  # None without actors
+    positions: Floats32  # (n, 3): meters
+    columns: Mapping[str, AnyArray]  # {name: (n,)}: integers of at most 32 bits, or floats
+    transforms: Sequence[Transform]  # poses of the frames at the start of the sweep
+    boxes: ActorBoxes | None = None  # None if there are no actors
 
 
 class SweepSequence:
-    """Makes the shown sweeps of a survey."""
+    """Converts the sweeps of a survey for viewers."""
 
     def __init__(self, sweeps: Sweeps) -> None:
         self.sweeps = sweeps
@@ -178,7 +186,7 @@ class SweepSequence:
         ]
 
     def show(self, sweep: int, points: Cloud) -> ShownSweep:
-        """Return the shown sweep of a number with its points."""
+        """Convert a sweep, given its number and its points."""
         sweeps = self.sweeps
         sensor = sweeps.sensor[sweep]
         return ShownSweep(
@@ -193,7 +201,7 @@ class SweepSequence:
         )
 
     def _transforms(self, sweep: int) -> list[Transform]:
-        """Return the frames of the carrier, its sensors and the actors present in a sweep."""
+        """Return the poses of the vehicle, its sensors and the actors that are in the scene."""
         sweeps = self.sweeps
         carrier = sweeps.carrier
         frames = [
@@ -209,7 +217,10 @@ class SweepSequence:
 
 
 def sendable(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return the columns of numbers, integers of 64 bits as float64, without waveforms."""
+    """Return the numeric columns with types that viewers support.
+
+    64-bit integers become float64. Waveforms are omitted.
+    """
     numbers = {name: values for name, values in columns.items() if values.dtype.kind in "biuf"}
     return {
         name: values.astype(_SENT_TYPES.get(values.dtype.str[1:], values.dtype), copy=False)

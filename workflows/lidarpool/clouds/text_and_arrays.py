@@ -1,4 +1,4 @@
-"""Clouds in text and in arrays, which are read at once: .xyz .txt .asc .csv .pts .ptx .npy."""
+"""Read text files and NumPy arrays: .xyz, .txt, .asc, .csv, .pts, .ptx and .npy."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from .recording import Recording, RecordingSource
 
 
 class TextFormats(CloudFormat):
-    """Text files and NumPy arrays of points, which can only be read."""
+    """Text files and NumPy arrays of points, which can be read but not written."""
 
     title = "text"
     for_scenes = True
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans of a .ptx, each in its scanner frame, or a cloud that is read at once.
+        """Open the scans in a .ptx file, or a cloud in another format, which is read as a whole.
 
-        A chosen unit replaces the units that the header of a cloud states. If a file contains
-        several clouds, the columns that they share are read.
+        Scans are in their scanner frames. If the user chose a unit, it overrides the units in the
+        header of a cloud. If a file contains several clouds, only their common columns are read.
         """
         read_scans = SCAN_READERS[source.path.suffix.lower()]
         if read_scans is read_ptx or source.as_stored:

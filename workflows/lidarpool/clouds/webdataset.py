@@ -1,4 +1,4 @@
-"""WebDataset: tar files of sweeps, which are read from end to end, or one sweep at a time."""
+"""Read and write WebDatasets, which are tar files for sequential access to sweeps."""
 
 from __future__ import annotations
 
@@ -34,14 +34,22 @@ _RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
 
 
 class WebDataset(MultiFileFormat):
-    """A tar file for a hundred sweeps or a million points each, such as `shards/000000.tar`.
+    """A folder of tar files with up to a hundred sweeps or one million points each.
 
-    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, meters in the sensor frame at
-    the start of the sweep), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4,
-    from this frame to the world frame), `boxes.npy` (float32 k x 7: `SweepBoxes.rows`), and `json`,
-    about sweep and boxes. In a data set it is JOB/SENSOR-000000 in `shards/SPLIT/JOB-000000.tar`;
-    `json` has the varied values, too, and `offsets/JOB.npz`, int64 (sweeps, 3), for each sweep the
-    first sweep of its tar file, the first byte of the sample in that file, and its end.
+    The tar files are named by their first sweep, for example `shards/000000.tar`. Each sweep is a
+    sample SENSOR-000000 with these files:
+
+    - `points.npy`: float32 of shape (n, 3), in meters, in the sensor frame at the start of the
+      sweep.
+    - A file for each column, for example `intensity.npy`.
+    - `pose.npy`: transformation of shape (4, 4) from this frame to the world frame.
+    - `boxes.npy`: float32 of shape (k, 7), as in `SweepBoxes.rows`.
+    - `json`: description of the sweep and the boxes.
+
+    In a data set, the sample is named JOB/SENSOR-000000, and the tar file
+    `shards/SPLIT/JOB-000000.tar`. The description also contains the varied values of the job. To
+    read single sweeps, `offsets/JOB.npz` contains int64 of shape (sweeps, 3): the first sweep in
+    the tar file, and the first byte and the end of the sample in this file.
 
     Aizman et al., High performance I/O for large scale deep learning, 2019.
     """
@@ -64,13 +72,16 @@ class WebDataset(MultiFileFormat):
             )
 
     def spans(self, min_spans: int = 1) -> list[PieceRange]:
-        """Divide all sweeps into ranges with separate tar files, wherever they are written."""
+        """Divide the sweeps into ranges, each of which has its own tar files.
+
+        The ranges, and therefore the bytes, do not depend on the number of workers.
+        """
         return super().spans()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the tar files of ranges, a single file in memory at a time.
+        """Write the tar files of ranges that start in a range, with one file in memory at a time.
 
-        Raises OSError on failure.
+        Raises OSError if a file cannot be written.
         """
         count = 0
         boxes_of_sweeps = []
@@ -96,19 +107,20 @@ class WebDataset(MultiFileFormat):
         return count, boxes_of_sweeps
 
     def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
-        """Return the offsets of the sweeps of a job."""
+        """Return the offset file of a job in a data set."""
         if self.entry is None:
             return {}
         return {f"offsets/{self.entry.name}.npz": packed({"at": self.offsets})}
 
     def _put(self, storage: Storage, start: int, tar: io.BytesIO) -> None:
-        tar.write(bytes(tarfile.RECORDSIZE - tar.tell() % tarfile.RECORDSIZE))  # two blocks end it
+        # A tar file ends with at least two empty blocks, and is padded to a full record.
+        tar.write(bytes(tarfile.RECORDSIZE - tar.tell() % tarfile.RECORDSIZE))
         name = _shard(self.entry, start)
         storage.prepare(name.rpartition("/")[0])
         storage.write(name, tar.getbuffer())
 
     def sample_files(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
-        """Yield the files of a sweep's sample, each with its header."""
+        """Yield the files in the sample of a sweep, including their tar headers."""
         sweeps = self.sweeps
         entry = self.entry
         present = SweepBoxes.select(sweeps, boxes and boxes.inward(sweeps.pose, number))
@@ -144,12 +156,12 @@ class WebDataset(MultiFileFormat):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the name of the tar file."""
+        """Return the name of the tar file that contains a sweep."""
         return [_shard(job.entry, int(_offsets(job)[sweep, 0]))]
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return points with all columns, and read only the bytes of the sweep."""
+        """Read points with all columns. Only the bytes of the sweep are read."""
         _, first, stop = _offsets(job)[sweep].tolist()
         sample = job.storage.read(cls.sweep_files(job, sweep)[0], first, stop)
         if len(sample) < stop - first:
@@ -168,7 +180,7 @@ class WebDataset(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the samples of a tar file, or of the tar files in a folder."""
+        """Open the samples in a tar file, or in all tar files in a folder."""
         path = source.path
         files = sort_by_number(path.rglob("*.tar")) if path.is_dir() else [path]
         with reading(source.name):
@@ -177,7 +189,7 @@ class WebDataset(MultiFileFormat):
 
 
 def _offsets(job: JobReader) -> Ints:
-    """Return the offsets of the sweeps of a job (`WebDataset`)."""
+    """Return the offsets of a job's sweeps, as described in `WebDataset`."""
 
     def read() -> Ints:
         name = f"offsets/{job.entry.name}.npz"
@@ -194,7 +206,7 @@ def _npy(array: AnyArray) -> bytes:
 
 
 def _shard(entry: Entry | None, start: int) -> str:
-    """Return the name of the tar file that starts with a sweep."""
+    """Return the name of the tar file that starts with the sweep `start`."""
     if entry is None:
         return f"shards/{start:06}.tar"
     return "/".join(filter(None, ("shards", entry.split, f"{entry.name}-{start:06}.tar")))
@@ -204,8 +216,9 @@ def _shard(entry: Entry | None, start: int) -> str:
 
 
 def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:
-    """Open the samples of tar files, {sensor: recording}: ``KEY.points.npy``, ``KEY.json``, ….
+    """Open the samples in tar files, as {sensor: recording}.
 
+    A sample consists of ``KEY.points.npy``, and optionally ``KEY.json`` and further arrays. Raises
     LidarError if no sample has points.
     """
     samples_of_sensor: dict[str, list[tuple[float | None, Path, dict[str, tuple[int, int]]]]] = {}
@@ -245,7 +258,7 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
 
 
 def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-    """Return the members of a tar file by sample, {key: {ending: (offset, bytes)}}."""
+    """Return the members of each sample in a tar file, as {key: {extension: (offset, size)}}."""
     input_size(path)
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     with tarfile.open(path, "r:") as tar:
@@ -257,7 +270,7 @@ def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
 
 
 def _slice(path: Path, offset: int, size: int) -> bytes:
-    """Read some bytes of a file."""
+    """Read `size` bytes of a file, starting at an offset."""
     with path.open("rb") as file:
         file.seek(offset)
         return file.read(size)

@@ -1,4 +1,4 @@
-"""Coordinate systems of files in well-known text, WKT 1."""
+"""Well-known text (WKT 1) for the coordinate systems in files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarsim.base.extras import install_command
 
 
 class _Geodetic(NamedTuple):
-    """A geodetic coordinate system with UTM zones."""
+    """A geodetic coordinate system on which UTM zones are based."""
 
     name: str
     datum: str
@@ -31,12 +31,14 @@ _ETRS89 = _Geodetic(
 
 
 def wkt(epsg: int) -> str:
-    """Return the WKT 1 of an EPSG code: of UTM zones of WGS 84 and ETRS89, or through rasterio.
+    """Return the WKT 1 for an EPSG code.
+
+    UTM zones of WGS 84 and ETRS89 are supported directly. Other systems require rasterio.
 
     Raises
     ------
     LidarError
-        If rasterio is missing, or knows no such system.
+        If rasterio is required but not installed, or if it does not know the code.
     """
     zone = epsg % 100
     if epsg // 100 in (326, 327) and 1 <= zone <= 60:
@@ -56,7 +58,7 @@ def wkt(epsg: int) -> str:
 
 
 def _utm(epsg: int, zone: int, south: bool, system: _Geodetic) -> str:
-    """Return the WKT 1 of a UTM zone."""
+    """Return the WKT 1 for a UTM zone."""
 
     def code(number: int) -> str:
         return f'AUTHORITY["EPSG","{number}"]'

@@ -1,4 +1,4 @@
-"""Writes clouds in any format. A file or folder is either written completely or not at all."""
+"""Write clouds in any format. A file or folder is either written completely or not at all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .multi_file_format import MultiFileFormat, RangeWorkers
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
-# Columns of every cloud whose omission is noted, and columns with the strength of a return.
+# Columns whose omission is always noted, and columns with the strength of a return.
 _ALWAYS = ("channel", "object")
 _STRENGTHS = {"intensity", "reflectivity", "signal"}
 # Options that only some formats support.
@@ -117,7 +117,7 @@ class ExportSpec:
 
     @classmethod
     def from_entry(cls, entry: str | Mapping[str, Any]) -> ExportSpec:
-        """Return the format in an entry of a scenario's `output.write`."""
+        """Create a specification from an entry of `output.write` in a scenario."""
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
@@ -128,7 +128,7 @@ class ExportSpec:
 
     @property
     def row(self) -> FormatRow:
-        """Row of the format in the table or in a plug-in."""
+        """Row of the format, from the table or from a plug-in."""
         return row_of(self.format)
 
     @property
@@ -152,11 +152,11 @@ class ExportSpec:
         return self.cloud_format.required_columns(self)
 
     def prepared(self, sweeps: Sweeps) -> Sweeps:
-        """Return sweeps whose points are positioned according to the options of the format."""
+        """Return sweeps that position their points according to the options of the format."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
-        """Return the names of the cloud's columns that the format cannot store."""
+        """Return the names of the columns that the format cannot store."""
         stored = self.cloud_format.stored
         names = (column.name for column in cloud.table)
         if stored is None:
@@ -167,10 +167,10 @@ class ExportSpec:
     def notes(
         self, cloud: CloudLike, sweeps: Sweeps, requested: Collection[str] | None = None
     ) -> list[str]:
-        """Return notes for the user on differences between the cloud and the file.
+        """Return notes for the user about differences between the cloud and the file.
 
-        `requested` are the columns that the user requested, if this is known. The omission of
-        columns that only exist because another format requires them is not noted.
+        `requested` are the columns that the user requested, or None if this is unknown. There is no
+        note about the omission of columns that only exist because another format requires them.
         """
         left_out = [
             name for name in self.left_out(cloud, sweeps) if self._is_missed(name, requested)
@@ -305,7 +305,7 @@ class ExportSpec:
 
         Returns
         -------
-        As `CloudFormat.write`.
+        The intensity that is stored as the largest integer, or None (see `CloudFormat.write`).
 
         Raises
         ------
@@ -316,7 +316,8 @@ class ExportSpec:
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as staging_folder:
-                staged = staging_folder / path.name  # bags contain the name of their file
+                # The file has its final name, because bags contain the name of their file.
+                staged = staging_folder / path.name
                 output = self.cloud_format(cloud, self.prepared(sweeps))
                 if isinstance(output, MultiFileFormat):
                     output.write(staged, self, workers)
@@ -324,7 +325,7 @@ class ExportSpec:
                     output.content = content
                     full_scale = output.write(staged, self)
                 flush(staged)
-                if path.is_dir() or staged.is_dir():  # files replace files atomically
+                if path.is_dir() or staged.is_dir():  # only files are replaced atomically
                     Storage.at(path.parent).discard(path.name)
                 staged.replace(path)
                 flush(path.parent)
@@ -333,9 +334,9 @@ class ExportSpec:
     def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
-        """Write a multi-file format to a storage.
+        """Write a multi-file format directly to storage.
 
-        If this fails, all files that were written are removed.
+        If this fails, all files that have been written are removed.
         """
         file = self.row.file
         folder = Storage(storage.path(file))
@@ -351,7 +352,7 @@ class ExportSpec:
 
 
 def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
-    """Return a survey with additional columns that its sensors require in some formats.
+    """Return a survey with the additional columns that its sensors require in these formats.
 
     Raises LidarError if a format does not support a sensor.
     """
@@ -362,7 +363,7 @@ def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
 
 
 def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:
-    """Raise LidarError if folders that would be replaced contain files of other programs."""
+    """Raise LidarError if folders that would be replaced contain files from other programs."""
     for format_name in formats:
         file = row_of(format_name).file
         pattern = format_named(format_name).file_pattern

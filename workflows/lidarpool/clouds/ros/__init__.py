@@ -1,1 +1,1 @@
-"""Messages of ROS 2: layouts of points, messages of a survey, and bags."""
+"""ROS 2 point layouts, messages and bags."""

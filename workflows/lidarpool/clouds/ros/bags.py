@@ -1,4 +1,4 @@
-"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, frames, /actors and /clock."""
+"""Read and write ROS 2 bags in MCAP format with rosbags."""
 
 from __future__ import annotations
 
@@ -45,43 +45,54 @@ from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
 
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
-_MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
+_MAX_DISTANCE_NS = 2e8  # maximum time between a sweep and the first or last pose
 
 
 class Rosbag2(CloudFormat):
-    """A folder for `ros2 bag play`.
+    """A folder with a ROS 2 bag in MCAP format, for `ros2 bag play`.
 
-    Each sweep is a PointCloud2 on `/NAME/points`, NAME from its sensor, or on `/points`. Points are
-    in the sensor frame at their own firing, as drivers publish them, and have times; or
-    compensated, in the sensor frame at the start of the sweep, without times. `/tf` has the frames
-    of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep.
-    `/tf` also has the frames at the end of the last sweep of each station, so that this sweep can
-    be deskewed, and with `pose_rate_hz` frames while the sweeps of the first sensor last.
-    `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
-    names of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
-    without one. `/actors` has a MarkerArray of the boxes of actors at the start of each sweep.
+    A bag contains these topics:
 
-    Of a 2D scanner (one beam in the plane of its x and y axes) `/NAME/scan`, or `/scan`, also has a
-    LaserScan of each sweep, where the survey keeps every return and has the columns ray and range.
+    - `/NAME/points`, or `/points` for an unnamed sensor: a PointCloud2 for each sweep. By default,
+      each point is in the sensor frame at the time of its firing, and has a time, as published by
+      drivers. With the option `compensated`, all points are in the sensor frame at the start of the
+      sweep, and have no times.
+    - `/NAME/scan` or `/scan`: a LaserScan for each sweep of a 2D scanner, whose only beam rotates
+      in its x-y plane. This requires that the survey keeps all returns, and the columns `ray` and
+      `range`.
+    - `/tf`: frames of the vehicle (`base_link`) and of actors in the frame `map`, at the start of
+      each sweep. The frames at the end of the last sweep at each station are included, so that this
+      sweep can be deskewed. The option `pose_rate_hz` adds frames during the sweeps of the first
+      sensor.
+    - `/tf_static`: frames of the sensors, and of the instruments `imu` and `gnss`, on the vehicle.
+    - `/clock`: the time at each sweep. It begins at the start of the survey, or at `START_NS` if
+      the start is unknown.
+    - `/actors`: a MarkerArray with the boxes of actors at the start of each sweep.
+    - `/label_info` and `/material_info`: names of classes and materials (LabelInfo in vision_msgs).
+    - `/imu/data_raw`: Imu messages without orientations.
+    - `/gnss/fix`: NavSatFix messages. If the latitude is unknown, `/gnss/position` contains
+      PointStamped messages in the frame `map` instead.
 
-    Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
-    orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
-    PointStamped in `map`.
+    A point has one of these layouts:
 
-    Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began), `autoware`
-    (PointXYZIRCAEDT, 32 bytes; angles in radians, azimuth clockwise from the start of the head,
-    time_stamp in ns since the sweep began; compensated: PointXYZIRC, 16 bytes), `ouster` (48
-    bytes; ring 0 is the highest beam, range in mm, t in ns since the sweep began, intensity:
-    signal), `hesai` and `robosense` (26 bytes; intensity: reflectivity, timestamp in seconds since
-    1970; rings are the maker's) and `livox` (26 bytes; timestamp in ns since 1970; `/NAME/livox`,
-    or `/livox`, has the same points as a CustomMsg). Whole numbers of intensity are 255 at 1 and
-    above. Where the cloud has red, green and blue, a field `rgb` follows, where it has radial
-    velocities, `radial_velocity`, where its classes have names, `label`, and then any columns of
-    normals, `incidence_deg` and origins of rays, and `material`; each makes points 4 bytes longer,
-    up to the 48 bytes of `ouster`.
+    - `velodyne`: 22 bytes, with the time in seconds since the start of the sweep.
+    - `autoware`: PointXYZIRCAEDT with 32 bytes. Angles are in radians, with clockwise azimuths from
+      the zero direction of the head, and time_stamp is in ns since the start of the sweep.
+      Compensated points are PointXYZIRC with 16 bytes.
+    - `ouster`: 48 bytes. Ring 0 is the highest beam, the range is in mm, t is in ns since the start
+      of the sweep, and the intensity is the signal.
+    - `hesai` and `robosense`: 26 bytes. The intensity is the reflectivity, timestamp is in seconds
+      since 1970, and rings are numbered as by the manufacturer.
+    - `livox`: 26 bytes, with timestamp in ns since 1970. `/NAME/livox` or `/livox` contains the
+      same points as CustomMsg messages.
 
-    Organized clouds have a point for each ray, NaN without a return (`organized_rows`). Second
-    returns of `ouster` are then on `/NAME/points2`.
+    Integer intensities are 255 for intensities of 1 and above. Depending on the columns of the
+    cloud, a layout is followed by the fields `rgb`, `radial_velocity`, `label` (if classes have
+    names), normals, `incidence_deg`, ray origins and `material`. Each of these fields adds 4 bytes.
+    The first fields fit into the padding of the layout `ouster`.
+
+    Organized clouds contain one point per ray, which is NaN if there is no return (see
+    `organized_rows`). The layout `ouster` then uses `/NAME/points2` for second returns.
     """
 
     title = "rosbag2"
@@ -101,7 +112,7 @@ class Rosbag2(CloudFormat):
         from .messages import LATCHED_TOPICS, message_store, survey_messages
 
         laid_out = LaidOut(spec.layout, spec.compensated, spec.organized)
-        # Readers of Humble accept no later version: from 9 on, profiles are lists.
+        # ROS 2 Humble cannot read later versions, because QoS profiles are lists from version 9 on.
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
             bag.set_custom_data("lidarpool", self.sweeps.frame_text(compensated=spec.compensated))
             topics: dict[str, Any] = {}
@@ -118,7 +129,7 @@ class Rosbag2(CloudFormat):
 
     @classmethod
     def check_options(cls, spec: ExportSpec) -> None:
-        """Raise LidarError if clouds of the layout cannot be organized."""
+        """Raise LidarError if the layout does not support organized clouds."""
         if spec.organized and not LAYOUTS[spec.layout].lines:
             organized = [name for name, layout in LAYOUTS.items() if layout.lines]
             raise LidarError(
@@ -137,31 +148,31 @@ class Rosbag2(CloudFormat):
 
     @classmethod
     def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
-        """Return the names of further columns, with those of the messages of 2D scanners."""
+        """Return the columns that can be stored, including the columns of LaserScan messages."""
         columns = super().optional_columns(spec, sweeps)
         return columns + (laser_scan.COLUMNS if laser_scan.has_laser_scans(sweeps) else ())
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
-        """Return the columns of LaserScan messages, which surveys that keep every return have."""
+        """Return the columns of LaserScan messages if a survey has 2D scanners and all returns."""
         has_scans = survey.keep_every == 1 and laser_scan.has_planar_sensors(survey)
         return laser_scan.COLUMNS if has_scans else ()
 
     @classmethod
     def survey_notes(cls, survey: Survey) -> list[str]:
-        """Return a note if 2D scanners have no LaserScan messages."""
+        """Return a note if there are 2D scanners without LaserScan messages."""
         note = "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
         note += "`cloud.keep_every: 1`"
         return [note] if survey.keep_every > 1 and laser_scan.has_planar_sensors(survey) else []
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a topic of PointCloud2, or CustomMsg of Livox, in a bag."""
+        """Open a topic with PointCloud2 or Livox CustomMsg messages in a bag."""
         return _open_bag(source)
 
 
 class MCAP(Rosbag2):
-    """The messages of a bag as an MCAP file."""
+    """A single MCAP file with the messages of a bag."""
 
     title = "MCAP"
     file_pattern = ""
@@ -179,7 +190,10 @@ class MCAP(Rosbag2):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Return points with intensity, limited by the layout, channel and named class."""
+        """Read points with channel, intensity and, if classes have names, class.
+
+        The range and resolution of intensities depend on the layout.
+        """
         layout = LAYOUTS[job.layout]
         message = _point_cloud(job, sweep, cls.path_of_job(job.entry))
         names = {field.name for field in message.fields}
@@ -199,7 +213,7 @@ class MCAP(Rosbag2):
 
 
 def _latched_profile() -> Any:
-    """Return the profile that `ros2 bag play` must offer, so that late listeners get the frames."""
+    """Return the QoS profile with which late subscribers receive messages that are sent once."""
     from rosbags import interfaces as ros
 
     return ros.Qos(
@@ -219,7 +233,7 @@ def _open_job(job: JobReader, file: str) -> Any:
     """Open the bag of a job in a data set."""
     from lidarsim.columns.closing_bag import ClosingBag
 
-    # AnyReader would parse the definitions of messages, which takes longer than a sweep.
+    # AnyReader would parse the message definitions, which takes longer than reading a sweep.
     bag = ClosingBag(job.local(file))
     bag.open()
     job.opened.callback(bag.close)
@@ -227,10 +241,7 @@ def _open_job(job: JobReader, file: str) -> Any:
 
 
 def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
-    """Return the PointCloud2 of a sweep.
-
-    Raises ValueError if the bag lacks the message.
-    """
+    """Return the PointCloud2 of a sweep. Raises ValueError if the bag does not contain it."""
     from .messages import sweep_topic
 
     bag = job.cached("bag", lambda: _open_job(job, file))
@@ -238,7 +249,7 @@ def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
     connections = [opened for opened in bag.connections if opened.topic == topic]
     time_ns = survey_start_ns(job.sweeps) + round(job.sweeps.begins_ns[sweep])
     record = next(bag.messages(connections, time_ns, time_ns + 1), None)
-    if record is None:  # rosbags 0.11.2 misses some messages by their time
+    if record is None:  # rosbags 0.11.2 does not find some messages by time
         records = bag.messages(connections)
         record = next((candidate for candidate in records if candidate[1] == time_ns), None)
     if record is None:
@@ -248,9 +259,9 @@ def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
 
 
 def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
-    """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
+    """Transform points as fired to the sensor frame at the start of the sweep.
 
-    `times` (n,) are the times of the layout.
+    `times` are the times of the points in the layout of the job.
     """
     sweeps = job.sweeps
     since_ns = LAYOUTS[job.layout].since_ns(times, message_stamp_ns(sweeps, sweep))
@@ -262,9 +273,10 @@ def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> 
 
 
 def _open_bag(source: RecordingSource) -> Recording:
-    """Open a topic of PointCloud2: each message is a sweep in the frame of the message.
+    """Open a topic of a bag, in which each message is a sweep in the frame of its header.
 
-    CustomMsg of Livox is read where a bag has no PointCloud2, or its topic is chosen.
+    The topic contains PointCloud2 messages. A topic with Livox CustomMsg messages is read if the
+    user chose it, or if the bag has no PointCloud2 messages.
     """
     bags = PerProcess(partial(open_bag, source.path, source.name))
     bag = bags()
@@ -291,7 +303,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
 
     with reading(source.name):
-        # Programs that set no stamps leave zeros.
+        # The stamp is zero if the recording program did not set it.
         is_stamped = any(_header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
 
     def headers() -> Iterator[_Header]:
@@ -318,9 +330,9 @@ def _open_bag(source: RecordingSource) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return what the custom data of a bag of `Rosbag2` state, or None for other bags.
+    """Return whether a bag states that it is motion-compensated, or None if it states neither.
 
-    rosbags reads custom data from folders only.
+    This does not use rosbags, which only reads custom data from folders.
     """
     if path.is_dir():
         text = read_input_text(path / "metadata.yaml", errors="replace")
@@ -330,14 +342,14 @@ def _stated_compensation(path: Path) -> bool | None:
 
 
 class _Header(NamedTuple):
-    """Header of a message."""
+    """Header of a ROS message."""
 
-    stamp_ns: int  # when the data was measured, which may be long before it was recorded
+    stamp_ns: int  # time of the measurement, which can be long before the recording time
     frame: str
 
 
 def _header_of(data: bytes) -> _Header:
-    """Return the header of a message of ROS 2 that begins with one."""
+    """Decode the header with which a serialized ROS 2 message starts."""
     order = "<u4" if data[1] & 1 else ">u4"
     seconds, nanoseconds, length = np.frombuffer(data, order, 3, 4).tolist()
     frame = bytes(data[16 : 15 + length]).decode(errors="replace")
@@ -345,17 +357,25 @@ def _header_of(data: bytes) -> _Header:
 
 
 def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
-    """Return the poses (n, 4, 4) of the frame of sweeps in the root of its tree of frames.
+    """Return the poses of sweeps relative to the root of the frame tree, with shape (n, 4, 4).
 
-    `headers` are those of the sweeps of a sensor. None if the bag has no poses of the frame at the
-    times of all sweeps.
+    Parameters
+    ----------
+    path
+        Path of the bag.
+    headers
+        Message headers of the sweeps of one sensor.
+
+    Returns
+    -------
+    None if the bag does not contain poses for the times of all sweeps.
     """
     frames = {header.frame.lstrip("/") for header in headers}
     if len(frames) != 1:
         return None
     try:
         seconds, positions, quaternions = read_bag(path, f"/tf:{frames.pop()}", None)
-    except LidarError:  # no frame of this name, or a frame that stands still
+    except LidarError:  # the frame does not exist or does not move
         return None
     times_ns = 1e9 * (seconds - seconds[0])
     stamps_ns = np.array([header.stamp_ns for header in headers]) - 1e9 * seconds[0]

@@ -1,4 +1,4 @@
-"""Layouts of the points of a PointCloud2, as drivers of ROS 2 publish them."""
+"""Layouts of points in PointCloud2 messages, as published by ROS 2 drivers."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from ..frame_names import survey_start_ns
 
-# Types of returns of Autoware's sensor drivers.
+# Return types in Autoware.
 UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
 _SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
 
 _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 _XYZI = [*_XYZ, ("intensity", "<f4")]
-# Additional fields after the layout: {name: (type, columns that the field needs)}.
+# Additional fields after the layout: {name: (type, columns that the field requires)}.
 EXTRA_FIELDS = {
     "rgb": ("<f4", {*COLORS}),
     VELOCITY: ("<f4", {VELOCITY}),
@@ -39,24 +39,27 @@ EXTRA_FIELDS = {
 
 
 class PointLayout(ABC):
-    """Layout of the points of a driver: fields of a point, and their values.
+    """Layout in which a driver publishes points, with the fields of a point and their values.
 
     Attributes
     ----------
     fields
         Type of a point.
     compensated_fields
-        Type of a point that is compensated for motion, which has no time.
+        Type of a motion-compensated point, which has no time.
     time_field
-        Name of the field of times, which compensated points lack.
+        Name of the time field, which compensated points do not have.
     ring_field
-        Name of the field of channels.
+        Name of the ring field.
     full_intensity
-        Value of the field `intensity` at an intensity of 1, or of a reflectivity at its maximum.
+        Value of the field `intensity` for an intensity of 1, or for the maximum reflectivity.
     columns
         Columns that the layout requires and stores, in addition to those of all bags.
     lines
-        Lines of an organized cloud, "firings" or "channels"; empty if drivers publish none.
+        Rows of an organized cloud: "firings", "channels", or an empty string if the driver does not
+        publish organized clouds.
+    no_intensity
+        Intensity of rays without a return in organized clouds.
     """
 
     fields: ClassVar[np.dtype[np.void]]
@@ -66,40 +69,42 @@ class PointLayout(ABC):
     ring_field: ClassVar[str] = "ring"
     full_intensity: ClassVar[float] = 1
     lines: ClassVar[str] = ""
-    no_intensity: ClassVar[float] = 0  # value of rays without return, in organized clouds
+    no_intensity: ClassVar[float] = 0
 
     @abstractmethod
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return values of fields, {name: (n,)}, beside position, ring and time.
+        """Return the values of all fields except position, ring and time, by field name.
 
-        `traits` are those of the sensor.
+        `traits` describe the sensor of the sweep.
         """
 
     @abstractmethod
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Return the field of times of firings (n,), nanoseconds since the stamp of the message.
+        """Convert firing times to values of the time field.
 
-        `stamp_ns` is the stamp, nanoseconds since 1970.
+        Parameters
+        ----------
+        since_ns
+            Firing times in nanoseconds since the stamp of the message.
+        stamp_ns
+            Stamp of the message in nanoseconds since 1970.
         """
 
     @abstractmethod
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Return the firings (n,), nanoseconds since the stamp: the inverse of `times`."""
+        """Convert values of the time field to nanoseconds since the stamp (inverse of `times`)."""
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
-        """Return the field of rings of channels (n,).
-
-        Channel 0 is the lowest beam.
-        """
+        """Convert channels, where 0 is the lowest beam, to values of the ring field."""
         del traits
         return channels
 
     def channels(self, rings: Ints, traits: LidarTraits) -> Ints:
-        """Return the channels (n,) of rings: the inverse of `rings`."""
+        """Convert values of the ring field to channels (inverse of `rings`)."""
         return self.rings(rings, traits)
 
     def row(self, extra: Sequence[str], *, compensated: bool) -> np.dtype[np.void]:
-        """Return the type of a point, followed by additional fields."""
+        """Return the type of a point with additional fields at its end."""
         row = self.compensated_fields if compensated else self.fields
         if not extra:
             return row
@@ -116,10 +121,7 @@ class PointLayout(ABC):
 
 
 class VelodyneLayout(PointLayout):
-    """Layout of velodyne_pointcloud.
-
-    Times are seconds since the stamp.
-    """
+    """Layout of velodyne_pointcloud, with times in seconds since the stamp."""
 
     columns: ClassVar[tuple[str, ...]] = ("intensity", "time")
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")])
@@ -129,43 +131,46 @@ class VelodyneLayout(PointLayout):
     no_intensity = np.nan
 
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the energy."""
+        """Return the intensity, which is the energy of the return."""
         del traits
         return {"intensity": sweep.columns["intensity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Return seconds since the stamp."""
+        """Convert nanoseconds to seconds since the stamp."""
         del stamp_ns
         return since_ns / 1e9
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Return nanoseconds since the stamp."""
+        """Convert seconds to nanoseconds since the stamp."""
         del stamp_ns
         return times.astype(np.float64) * 1e9
 
 
 class ImagesLayout(VelodyneLayout):
-    """Layout of velodyne_pointcloud with range images, which need all rays and every return."""
+    """Layout of velodyne_pointcloud with range images, which require all returns."""
 
     columns = ("intensity", "time", "ray", "range")
 
 
 class _CountedNanoseconds(PointLayout):
-    """Layouts whose times are whole nanoseconds since the stamp, in 32 bits."""
+    """Base class for layouts with times in nanoseconds since the stamp, as 32-bit integers."""
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Return nanoseconds since the stamp, which a sensor without rotation may exceed."""
+        """Clip times to 32 bits, because sweeps of non-rotating sensors can exceed this range."""
         del stamp_ns
         return np.clip(since_ns, 0, 2**32 - 1)
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Return nanoseconds since the stamp."""
+        """Return the times as floats."""
         del stamp_ns
         return times.astype(np.float64)
 
 
 class AutowareLayout(_CountedNanoseconds):
-    """Layout of nebula, Autoware's driver: PointXYZIRCAEDT, or PointXYZIRC if compensated."""
+    """Layout of nebula, the driver of Autoware.
+
+    Points are PointXYZIRCAEDT, or PointXYZIRC if they are motion-compensated.
+    """
 
     columns = ("intensity", "time", "return_number", "returns")
     fields = np.dtype([
@@ -178,7 +183,7 @@ class AutowareLayout(_CountedNanoseconds):
     full_intensity = 255
 
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return energy, type of return, and polar coordinates of the positions."""
+        """Return the intensity, the return type, and the spherical coordinates of the points."""
         x, y, z = sweep.points.astype(np.float64).T
         level = np.hypot(x, y)
         zero = np.radians(traits.zero_deg)
@@ -192,10 +197,7 @@ class AutowareLayout(_CountedNanoseconds):
 
 
 class OusterLayout(_CountedNanoseconds):
-    """Layout of ouster-ros (`original`).
-
-    Ring 0 is the highest beam.
-    """
+    """Layout `original` of ouster-ros, in which ring 0 is the highest beam."""
 
     columns = ("signal", "time", "reflectivity", "range")
     fields = np.dtype({
@@ -215,7 +217,7 @@ class OusterLayout(_CountedNanoseconds):
     lines = "channels"
 
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the signal, the reflectivity, and the sensor's range in millimeters."""
+        """Return the signal, the reflectivity, and the range in millimeters."""
         columns = sweep.columns
         range_m = columns["range"].astype(np.float64) + traits.range_offset_m
         return {
@@ -225,36 +227,36 @@ class OusterLayout(_CountedNanoseconds):
         }
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
-        """Return rows of the sensor's image."""
+        """Convert channels to rows in the range image of the sensor."""
         return np.maximum(traits.channels - 1 - channels.astype(np.int64), 0)
 
 
 class _Reflectivities(PointLayout):
-    """Layouts whose intensity is the maker's reflectivity, and whose times are absolute."""
+    """Base class for layouts with absolute times, whose intensity is the reflectivity."""
 
     columns = ("reflectivity", "time")
     full_intensity = 255
-    unit_ns: ClassVar[float] = 1e9  # nanoseconds in a unit of the field of times
+    unit_ns: ClassVar[float] = 1e9  # unit of the time field in nanoseconds
 
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the reflectivity."""
+        """Return the intensity, which is the reflectivity."""
         del traits
         return {"intensity": sweep.columns["reflectivity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Return times since 1970."""
-        # Whole nanoseconds first: near 1e18, float64 counts steps of 128 ns.
+        """Convert times relative to the stamp to times since 1970."""
+        # Times are added as integers, because the resolution of float64 near 1e18 is 128 ns.
         return (np.rint(since_ns).astype(np.int64) + stamp_ns) / self.unit_ns
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Return nanoseconds since the stamp."""
+        """Convert times since 1970 to nanoseconds since the stamp."""
         return (times - stamp_ns / self.unit_ns) * self.unit_ns
 
 
 class HesaiLayout(_Reflectivities):
     """Layout of HesaiLidar_ROS_2.0.
 
-    Times are seconds since 1970, rings the maker's channels.
+    Times are in seconds since 1970, and rings are numbered as by the manufacturer.
     """
 
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("timestamp", "<f8")])
@@ -262,18 +264,18 @@ class HesaiLayout(_Reflectivities):
     time_field = "timestamp"
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
-        """Return the maker's numbers of the channels, from 0, by default from the highest."""
+        """Convert channels to the channel numbers of the manufacturer."""
         return _maker_numbers(traits)[channels]
 
     def channels(self, rings: Ints, traits: LidarTraits) -> Ints:
-        """Return the channels of the maker's numbers."""
+        """Convert channel numbers of the manufacturer to channels."""
         return np.argsort(_maker_numbers(traits))[rings]
 
 
 class RoboSenseLayout(_Reflectivities):
-    """Layout of rslidar_sdk (`XYZIRT`).
+    """Layout `XYZIRT` of rslidar_sdk.
 
-    Times are seconds since 1970, ring 0 is the lowest beam.
+    Times are in seconds since 1970, and ring 0 is the lowest beam.
     """
 
     fields = HesaiLayout.fields
@@ -283,11 +285,9 @@ class RoboSenseLayout(_Reflectivities):
 
 
 class LivoxLayout(_Reflectivities):
-    """Layout of livox_ros_driver2 (PointXYZRTLT).
+    """Layout PointXYZRTLT of livox_ros_driver2, with times in nanoseconds since 1970.
 
-    Times are nanoseconds since 1970.
-
-    All points have the tag 0, a normal point.
+    The tag of all points is 0, which marks normal points.
     """
 
     fields = np.dtype([*_XYZI, ("tag", "u1"), ("line", "u1"), ("timestamp", "<f8")])
@@ -310,22 +310,19 @@ LAYOUTS: dict[str, PointLayout] = {
 
 @dataclass(frozen=True)
 class LaidOut:
-    """How points of a survey are laid out in messages."""
+    """Layout of points in messages, and how the points are positioned and ordered."""
 
     name: str  # name of the layout in `LAYOUTS`
-    compensated: bool = False  # points in the sensor's axes at the start of the sweep, no times
-    organized: bool = False  # a point for each ray, NaN without a return
+    compensated: bool = False  # whether points are motion-compensated and have no times
+    organized: bool = False  # whether there is a point for each ray, with NaN if it has no return
 
     @property
     def layout(self) -> PointLayout:
-        """The layout."""
+        """Layout of a point."""
         return LAYOUTS[self.name]
 
     def row(self, columns: set[str]) -> np.dtype[np.void]:
-        """Return the type of a point.
-
-        `columns` are the names of the columns of the cloud.
-        """
+        """Return the type of a point, given the names of the columns in the cloud."""
         extra = [name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= columns]
         return self.layout.row(extra, compensated=self.compensated)
 
@@ -333,7 +330,7 @@ class LaidOut:
 def point_rows(
     laid_out: LaidOut, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Return the points of a sweep in a layout, of the type of its `row`."""
+    """Convert the points of a sweep to the layout. `row` is the type of a point in it."""
     layout = laid_out.layout
     traits = sensor_traits(sweeps, sweep)
     if laid_out.compensated:
@@ -362,35 +359,36 @@ def point_rows(
 
 
 def since_stamp_ns(points: Cloud, sweeps: Sweeps, sweep: int) -> AnyArray:
-    """Return the firings of points of a sweep, nanoseconds since the stamp of the message: (n,)."""
+    """Return the firing times of points in nanoseconds since the stamp of their message."""
     begin_ns = sweeps.begins_ns[sweep]
     return points["time"] - (begin_ns + sweeps.stamp_ns(sweep) - round(begin_ns))
 
 
 def message_stamp_ns(sweeps: Sweeps, sweep: int) -> int:
-    """Return the stamp of a sweep's message, nanoseconds since 1970."""
+    """Return the stamp of the message of a sweep, in nanoseconds since 1970."""
     return survey_start_ns(sweeps) + sweeps.stamp_ns(sweep)
 
 
 def sensor_traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
-    """Return the traits of the sensor of a sweep."""
+    """Return the traits of the sensor that recorded a sweep."""
     return sweeps.lidars[sweeps.sensor[sweep]]
 
 
 def _maker_numbers(traits: LidarTraits) -> Ints:
-    """Return the maker's number of each channel (c,), from 0, by default from the highest."""
+    """Return the manufacturer's number of each channel, starting at 0.
+
+    If the numbers are unknown, channels are numbered from the highest to the lowest beam.
+    """
     if traits.lasers:
         return np.array(traits.lasers, np.int64)
     return np.arange(traits.channels)[::-1]
 
 
 def _return_types(columns: Mapping[str, AnyArray], mode: str) -> AnyArray:
-    """Return Autoware's types of the returns of a sweep, (n,).
+    """Return the Autoware type of each return in a sweep, whose returns are sorted by pulse.
 
-    Returns follow their pulses.
-
-    Of two returns of a pulse the nearer is first, and the brighter is strong; of two equally bright
-    returns, the farther. A single return of a pulse is all of these.
+    The first of two returns is the nearer one, and the strongest is the brighter one. If both are
+    equally bright, the farther return is the strongest. A single return has the type IDENTICAL.
     """
     number = columns["return_number"]
     returns = columns["returns"]

@@ -1,4 +1,4 @@
-"""CustomMsg of livox_ros_driver2, Livox's driver of ROS 2."""
+"""CustomMsg messages of livox_ros_driver2, the ROS 2 driver of Livox."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ uint8 reflectivity
 uint8 tag
 uint8 line
 """
-_MAX_LINES = 256  # the field has a byte
+_MAX_LINES = 256  # line numbers are stored in a byte
 
 
 def check_lines(channels: int) -> None:
-    """Raise LidarError if a sensor has more channels than a point of Livox has lines."""
+    """Raise LidarError if a sensor has more channels than the layout `livox` supports."""
     if channels > _MAX_LINES:
         raise LidarError(
             f"The layout livox stores line numbers in one byte, but a sensor has {channels:,} "
@@ -43,10 +43,20 @@ def check_lines(channels: int) -> None:
 def custom_message(
     store: Typestore, header: Any, stamp_ns: int, since_ns: AnyArray, rows: Records
 ) -> bytes:
-    """Return a serialized CustomMsg of points.
+    """Return a serialized CustomMsg with points.
 
-    `rows` (n,) are the points in the layout `livox`. `since_ns` (n,) are nanoseconds from the stamp
-    to the firings.
+    Parameters
+    ----------
+    store
+        Types of messages.
+    header
+        Header of the message.
+    stamp_ns
+        Stamp of the message in nanoseconds since 1970.
+    since_ns
+        Firing times of the points in nanoseconds since the stamp.
+    rows
+        Points in the layout `livox`.
     """
     points = np.zeros(len(rows), LIVOX_POINT)
     points["offset_time"] = np.clip(since_ns, 0, 2**32 - 1)
@@ -55,7 +65,8 @@ def custom_message(
     points["reflectivity"] = rows["intensity"]
     reserved = np.zeros(3, np.uint8)
     message = store.types[CUSTOM_MSG](header, stamp_ns, len(rows), 0, reserved, [])
-    # rosbags would take an object for each point. The message ends with the number of points.
+    # rosbags would require an object for each point. The message is therefore serialized without
+    # points, and the number of points at its end is replaced.
     start = bytes(store.serialize_cdr(message, CUSTOM_MSG))[:-4]
     content = points.tobytes()
     return start + np.uint32(len(rows)).tobytes() + content[: len(content) - LIVOX_PADDING]

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 of a survey, in the order of their times, serialized."""
+"""Serialized ROS 2 messages of a survey, sorted by time."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ from .organized import organized_rows
 
 
 class RosMessage(NamedTuple):
-    """A message on a topic."""
+    """A serialized message on a topic."""
 
     topic: str
-    kind: str  # such as "sensor_msgs/msg/PointCloud2"
-    time_ns: int  # when it is sent
-    cdr: bytes | memoryview  # serialized, with the header of its encoding
+    kind: str  # type of the message, for example "sensor_msgs/msg/PointCloud2"
+    time_ns: int  # time at which the message is sent
+    cdr: bytes | memoryview  # serialized message with its encapsulation header
 
 
 class Serialized(NamedTuple):
-    """The content of a message that is serialized already."""
+    """A message that is already serialized."""
 
     kind: str
     cdr: bytes
 
 
-# The last frame is later than the last point, whose time some layouts round up.
+# Time between the last point and the last frame, because some layouts round up times.
 _ROUNDING_NS = 1000
-LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # kept for late readers
-# Messages of vision_msgs, which rosbags lacks.
+LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # also sent to late subscribers
+# Messages of vision_msgs, which rosbags does not provide.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
 _LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
 
 @cache
 def message_store() -> Typestore:
-    """Return the types of messages that a survey has."""
+    """Return the types of the messages that a survey can contain."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
     store.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_MSG))
@@ -62,7 +62,7 @@ def message_store() -> Typestore:
 def survey_messages(
     cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut, pose_rate_hz: float | None = None
 ) -> Iterator[RosMessage]:
-    """Yield the messages of a cloud, in the order of their times."""
+    """Yield the messages of a cloud, sorted by time."""
     columns = {column.name for column in cloud.table}
     messages = SurveyMessages(sweeps, laid_out, columns, pose_rate_hz)
     measured = messages.instruments()
@@ -80,19 +80,19 @@ def survey_messages(
 
 
 class SurveyMessages:
-    """Makes the messages of a survey: static, of the clock, of sweeps, and of instruments.
+    """Creates the messages of a survey.
 
     Parameters
     ----------
     sweeps
-        The sweeps of the survey.
+        Sweeps of the survey.
     laid_out
-        How points are laid out.
+        Layout of points in messages.
     columns
-        Names of the columns of the cloud.
+        Names of the columns in the cloud.
     pose_rate_hz
-        Frames per second on `/tf` while a sweep of the first sensor lasts; by default only those at
-        the starts of sweeps and at the end of the last.
+        Rate of frames on `/tf` during the sweeps of the first sensor. By default, there are only
+        frames at the start of each sweep and at the end of the last sweep.
     """
 
     def __init__(
@@ -115,19 +115,20 @@ class SurveyMessages:
         self._frames = frame_names(sweeps.sensors, sweeps.actors)
         self._actors = self._frames[len(sweeps.sensors) : -len(INSTRUMENTS)]
         poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
-        # Carrier and actors: frame and poses.
+        # Frames of the vehicle and the actors, with their poses.
         self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
         self._start_ns = survey_start_ns(sweeps)
         self._pose_rate_hz = pose_rate_hz
         sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=1)[sweeps.sensor]
-        self._sweeps_per_station = sweeps_per_sensor // sweeps.stations  # (n,), of each sensor
+        # Number of sweeps per station for the sensor of each sweep.
+        self._sweeps_per_station = sweeps_per_sensor // sweeps.stations
 
     def sweep_start_ns(self, sweep: int) -> int:
-        """Return the start of a sweep, nanoseconds since 1970."""
+        """Return the start of a sweep in nanoseconds since 1970."""
         return self._start_ns + round(self._sweeps.begins_ns[sweep])
 
     def static(self) -> Iterator[RosMessage]:
-        """Yield the messages that are sent once."""
+        """Yield the messages that are only sent once, at the start of the survey."""
         sweeps = self._sweeps
         start_ns = self._start_ns
         on_carrier = [
@@ -146,16 +147,16 @@ class SurveyMessages:
             yield _sent("/material_info", info(header, materials, 0.0), start_ns)
 
     def instruments(self) -> Iterator[RosMessage]:
-        """Return the messages of IMU and GNSS receiver, in the order of their times."""
+        """Yield the messages of the IMU and the GNSS receiver, sorted by time."""
         return self._make.instrument_messages(self._sweeps, self._start_ns)
 
     def clock(self, time_ns: int) -> RosMessage:
-        """Return the message of the clock at a time, nanoseconds since 1970."""
+        """Return the clock message for a time in nanoseconds since 1970."""
         (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
     def of_sweep(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
-        """Yield the messages of a sweep, which are sent at its start, and frames while it lasts."""
+        """Yield the messages that are sent at the start of a sweep, and the frames during it."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
@@ -168,7 +169,7 @@ class SurveyMessages:
         yield from self._frames_within(sweep)
 
     def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
-        """Return the messages of a sensor's sweep, by the last part of their topics."""
+        """Return the sensor messages of a sweep, by the last part of their topics."""
         sweeps = self._sweeps
         stamp_ns = message_stamp_ns(sweeps, sweep)
         header = self._make.header(self._frames[sweeps.sensor[sweep]], stamp_ns)
@@ -198,7 +199,7 @@ class SurveyMessages:
         return contents
 
     def _frames_in_world(self, sweep: int) -> list[tuple[str, str, SweepPoses, int]]:
-        """Return the frames of the carrier and of the actors that are present during a sweep."""
+        """Return the frames of the vehicle and of the actors that are present in a sweep."""
         present = [True, *self._sweeps.actor_there[:, sweep]]
         return [
             (WORLD, name, poses, sweep)
@@ -207,7 +208,7 @@ class SurveyMessages:
         ]
 
     def _frames_within(self, sweep: int) -> Iterator[RosMessage]:
-        """Yield the frames of the carrier and of actors after the start of a sweep."""
+        """Yield the frames of the vehicle and of actors after the start of a sweep."""
         sweeps = self._sweeps
         since_ns = self._pose_times(sweep)
         if not len(since_ns):
@@ -224,7 +225,7 @@ class SurveyMessages:
             yield _sent("/tf", self._make.transforms(in_world, time_ns), time_ns)
 
     def _pose_times(self, sweep: int) -> Ints:
-        """Return the times of frames after the start of a sweep, (k,), ns since its start."""
+        """Return the times of frames during a sweep, in nanoseconds since its start."""
         sweeps = self._sweeps
         span_ns = sweeps.span_ns(sweep)
         times_ns = np.empty(0, np.int64)
@@ -236,12 +237,12 @@ class SurveyMessages:
             end_ns = int(span_ns) + _ROUNDING_NS
             if sweep + 1 < len(sweeps) and sweeps.sensor[sweep + 1] == sweeps.sensor[sweep]:
                 next_ns = round(sweeps.begins_ns[sweep + 1] - sweeps.begins_ns[sweep])
-                end_ns = min(end_ns, next_ns - 1)  # the carrier is at the next station then
+                end_ns = min(end_ns, next_ns - 1)  # before the vehicle is at the next station
             times_ns = np.append(times_ns, end_ns)
         return times_ns
 
     def _point_cloud(self, rows: Records, header: Any) -> Any:
-        """Return the PointCloud2 of points (height, width)."""
+        """Return a PointCloud2 with points, which have the shape (height, width)."""
         height, width = rows.shape
         (message,) = self._make.types_of("sensor_msgs", "PointCloud2")
         return message(
@@ -258,12 +259,12 @@ class SurveyMessages:
 
 
 def _numbered(name: str, plane: int) -> str:
-    """Return the name of the topic of a return of each pulse, counted from 0."""
+    """Return the name of the topic for a return, where 0 is the first return of a pulse."""
     return f"{name}{plane + 1 if plane else ''}"
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
-    """Return the frames of the instruments on the carrier."""
+    """Return the frames of the instruments on the vehicle, as for `_Messages.transforms`."""
     instruments = sweeps.instruments
     if instruments is None or instruments.folder is None:
         return []
@@ -292,7 +293,7 @@ def sweep_topic(sweeps: Sweeps, sweep: int) -> str:
 
 
 def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
-    """Return a message that is sent at a time."""
+    """Serialize a message that is sent on a topic at a time."""
     if isinstance(content, Serialized):
         return RosMessage(topic, content.kind, time_ns, content.cdr)
     kind = content.__msgtype__
@@ -300,25 +301,29 @@ def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
 
 
 class _Messages:
-    """Makes messages and their common parts."""
+    """Creates messages and the parts that they have in common."""
 
     def __init__(self, types: Any) -> None:
         self._types = types
 
     def types_of(self, package: str, *names: str) -> list[Any]:
-        """Return types of messages of a package."""
+        """Return message types from a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
-        """Return the time of a message."""
+        """Return a Time message."""
         return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
 
     def header(self, frame: str, time_ns: int) -> Any:
-        """Return the header of a message."""
+        """Return a Header message."""
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
     def transforms(self, frames: list[tuple[str, str, SweepPoses, int]], time_ns: int) -> Any:
-        """Return frames in their parents: (parent, name, poses, index of the pose)."""
+        """Return a TFMessage.
+
+        Each frame is given by its parent, its name, and an array of poses relative to the parent
+        with the index of the pose to use.
+        """
         vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
         transform, stamped = self.types_of("geometry_msgs", "Transform", "TransformStamped")
         return self._types["tf2_msgs/msg/TFMessage"](
@@ -336,7 +341,7 @@ class _Messages:
         )
 
     def instrument_messages(self, sweeps: Sweeps, start_ns: int) -> Iterator[RosMessage]:
-        """Return the messages of IMU and GNSS receiver, in order of time."""
+        """Yield the messages of the IMU and the GNSS receiver, sorted by time."""
         instruments = sweeps.instruments
         if instruments is None:
             return iter(())
@@ -391,7 +396,7 @@ class _Messages:
                 yield _sent("/gnss/position", message, time_ns)
 
     def laser_scan(self, rays: ScanRays, header: Any) -> Any:
-        """Return the LaserScan of a sweep of a 2D scanner."""
+        """Return a LaserScan message with the rays of a sweep."""
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")
@@ -410,7 +415,7 @@ class _Messages:
         )
 
     def image(self, values: Floats32, header: Any) -> Any:
-        """Return an image of numbers (height, width)."""
+        """Return an Image message with float32 values of shape (height, width)."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
         image = self._types["sensor_msgs/msg/Image"]
@@ -425,7 +430,7 @@ class _Messages:
         )
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
-        """Return the boxes of actors in a sweep as markers, which replace earlier markers."""
+        """Return a MarkerArray with the boxes of actors, which replaces earlier markers."""
         types = self._types
         names = ("Point", "Quaternion", "Pose", "Vector3")
         point, quaternion, pose, vector = self.types_of("geometry_msgs", *names)

@@ -1,4 +1,4 @@
-"""Organized clouds: a point for each ray of a sweep, NaN where the ray has no return."""
+"""Organized clouds, which have a point for each ray, with NaN for rays without a return."""
 
 from __future__ import annotations
 
@@ -15,17 +15,37 @@ from .layouts import LaidOut, message_stamp_ns, sensor_traits
 def organized_rows(
     laid_out: LaidOut, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
 ) -> list[Records]:
-    """Return the organized clouds (height, width) of a sweep, in the lines of the layout's driver.
+    """Arrange the points of a sweep as organized clouds, in the order of the layout's driver.
 
-    `rows` (n,) are the points of the sweep in the layout. Lines are firings, with a point for each
-    channel, the lowest first, and further returns as lines after the line of their firing. Or lines
-    are channels, the highest first, with a point for each firing, in a cloud for each return; lines
-    are then shifted by the azimuths of the beams, so that a column is a single direction.
+    If the layout has rows of firings, a single cloud is returned. Its columns are the channels from
+    the lowest to the highest. The rows with further returns follow the row of their firing.
 
-    LidarError if the points are not in order, or the rays of the survey are unknown.
+    If the layout has rows of channels, there is one cloud per return. Its rows are the channels
+    from the highest to the lowest. They are shifted by the azimuths of the beams, so that all
+    points in a column have the same direction.
+
+    Parameters
+    ----------
+    laid_out
+        Layout of the points.
+    rows
+        Points of the sweep in this layout, with shape (n,).
+    points
+        The same points as a cloud.
+    sweeps, sweep
+        Sweeps of the survey, and the number of the sweep.
+
+    Returns
+    -------
+    Clouds with shape (height, width).
+
+    Raises
+    ------
+    LidarError
+        If the points are not in order, or if the rays of the survey are unknown.
     """
     image = Image.from_points(sweeps, sweep, points)
-    # Points are moved as bytes: NumPy leaves the padding of copied fields uninitialized.
+    # Points are copied as bytes, because NumPy does not copy the padding between fields.
     point = np.dtype((np.void, rows.dtype.itemsize))
     without_return = _rays(laid_out, image, rows.dtype, sweeps, sweep).view(point)
     planes = np.repeat(without_return[np.newaxis], image.planes, axis=0)
@@ -43,7 +63,7 @@ def organized_rows(
 def _rays(
     laid_out: LaidOut, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Return points of all rays without a return, (channels, firings)."""
+    """Return points for all rays as if none had a return, with shape (channels, firings)."""
     layout = laid_out.layout
     channels = np.arange(image.sensor.channels)
     rays = np.zeros((len(channels), len(image.firings)), row)
@@ -59,7 +79,10 @@ def _rays(
 
 
 def _looking_ahead(image: Image) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    """Return the firing of each pixel, so that a column is a direction: (channels, firings)."""
+    """Return the firing for each pixel such that all pixels in a column have the same direction.
+
+    The shape is (channels, firings).
+    """
     sensor = image.sensor
     count = len(image.firings)
     firings_per_turn = float(getattr(sensor.head, "firings_per_turn", count))
