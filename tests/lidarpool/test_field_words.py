@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Planning
-from lidarpool.base.field_words import differences, fields_in_words
+from lidarpool.base.field_words import describe_changes, describe_fields
 from lidarpool.run.job_source import fields_of
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
@@ -36,30 +36,30 @@ def words(**sections):
     ],
 )
 def test_fields_that_differ_are_named_as_in_a_scenario(sections, differs):
-    assert differs in differences(words(), words(**sections), max_fields=20)
+    assert differs in describe_changes(words(), words(**sections), max_fields=20)
 
 
 def test_of_many_fields_some_are_named_and_the_others_counted():
     earlier = {f"field{number}": "1" for number in range(9)}
     now = dict.fromkeys(earlier, "2")
-    said = differences(earlier, now)
+    said = describe_changes(earlier, now)
     assert said.startswith("field0 changed from 1 to 2; field1 changed") and said.endswith(
         "; and 5 more"
     )
-    assert differences(now, now) == ""
+    assert describe_changes(now, now) == ""
 
 
 def test_a_long_list_that_differs_has_other_content():
-    lists = [dict(fields_in_words({"poses": np.add(POSES, shift)})) for shift in (0, 1)]
-    assert differences(*lists) == "the content of poses changed"
-    poses = dict(fields_in_words({"poses": POSES[:-1]})), dict(fields_in_words({"poses": POSES}))
-    assert differences(*poses) == "poses changed from 29 entries to 30 entries"
+    lists = [dict(describe_fields({"poses": np.add(POSES, shift)})) for shift in (0, 1)]
+    assert describe_changes(*lists) == "the content of poses changed"
+    poses = dict(describe_fields({"poses": POSES[:-1]})), dict(describe_fields({"poses": POSES}))
+    assert describe_changes(*poses) == "poses changed from 29 entries to 30 entries"
 
 
 def test_a_plan_is_of_the_fields():
     plans = [Planning((0, 0), (10, 0), centers=[(5, 0)], radii=r) for r in (1, 2)]
-    fields = [dict(fields_in_words(plan, "planning")) for plan in plans]
-    assert differences(*fields) == "planning.radii changed from [1.0] to [2.0]"
+    fields = [dict(describe_fields(plan, "planning")) for plan in plans]
+    assert describe_changes(*fields) == "planning.radii changed from [1.0] to [2.0]"
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from hypothesis.extra import numpy as npst
 
 from lidarpool import Beams, LidarError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.software import PACKAGES, difference, software, sources
+from lidarpool.base.software import PACKAGES, describe_difference, software, source_hash
 from lidarsim.sensor import Head
 
 Pair = namedtuple("Pair", "a b")
@@ -216,7 +216,7 @@ def test_what_has_none_is_refused_by_name(thing, name):
             fingerprint(outer)
 
 
-ASK = "from lidarpool.base.software import sources; print(sources())"
+ASK = "from lidarpool.base.software import source_hash; print(source_hash())"
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def asked(folder: Path) -> str:
 
 @pytest.mark.slow
 def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_not(packages):
-    ours = sources()
+    ours = source_hash()
     assert asked(packages) == ours
     changed = packages / "raybeam" / "intersect.cu"
     changed.write_text(changed.read_text() + "\n")
@@ -255,11 +255,13 @@ def test_a_process_older_than_its_files_does_not_speak_for_them(packages):
 
 def test_the_first_difference_is_named():
     here = software("numpy")
-    assert difference(here, here) == ""
+    assert describe_difference(here, here) == ""
     there = here | {"numpy": "1.0 with nothing"}
     assert (
-        difference(there, here)
+        describe_difference(there, here)
         == f"numpy 1.0 with nothing, but the run requires numpy {here['numpy']}"
     )
-    assert difference({}, here).startswith("no lidarpool, but the run requires lidarpool 0.")
+    assert describe_difference({}, here).startswith(
+        "no lidarpool, but the run requires lidarpool 0."
+    )
     assert here["numpy"] == np.__version__  # and no instruction sets

@@ -9,7 +9,7 @@ from tests.meshes import write
 from tests.plugin_files import write_distribution
 
 from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
-from lidarpool.base.software import difference, plugin_versions, software
+from lidarpool.base.software import describe_difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
 from lidarpool.clouds.writing import ExportSpec
@@ -331,7 +331,7 @@ def test_software_has_the_plugins_that_are_used(tmp_path, distribution):
     assert described.keys() == {"lidarpool", "plug-in used-mesh"}
     assert described["plug-in used-mesh"] == plugin_versions([plugin])[plugin]
     assert described["plug-in used-mesh"].startswith("0.1 (sources ")
-    told = difference(software(), described)
+    told = describe_difference(software(), described)
     assert told.startswith("no plug-in used-mesh, but the run requires plug-in used-mesh 0.1")
 
 

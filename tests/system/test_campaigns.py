@@ -34,7 +34,7 @@ from lidarpool import (
     simulate,
     sweeps,
 )
-from lidarpool.base.sealed import sealed, unsealed
+from lidarpool.base.sealed import seal_json, unseal_json
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
@@ -555,9 +555,9 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
         assert other.code == 2 and "a different campaign (seed changed from 3 to 4)" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
-    made = unsealed(record.read_bytes())
+    made = unseal_json(record.read_bytes())
     made["casting"]["numpy"] = "1.0"
-    record.write_bytes(sealed(made))
+    record.write_bytes(seal_json(made))
     old = lidarpool(*run, "--job", 1)
     assert old.code == 2 and "was created with numpy 1.0, " in old.err and old.err.count("\n") == 1
 

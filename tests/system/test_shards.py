@@ -17,7 +17,7 @@ from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps
-from lidarpool.base.sealed import sealed, unsealed
+from lidarpool.base.sealed import seal_json, unseal_json
 from lidarpool.base.shard import Shard
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.job_seconds import read_seconds
@@ -166,9 +166,9 @@ def change(path: Path, old: str, new: str) -> None:
 def change_record(part: Path, old: str, new: str) -> None:
     """Change text of campaign.json, and its checksum."""
     path = part / "campaign.json"
-    text = json.dumps(unsealed(path.read_bytes()))
+    text = json.dumps(unseal_json(path.read_bytes()))
     assert old in text
-    path.write_bytes(sealed(json.loads(text.replace(old, new))))
+    path.write_bytes(seal_json(json.loads(text.replace(old, new))))
 
 
 DAMAGE = {
@@ -311,7 +311,7 @@ def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
 def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path, slots):
     path = parts[1] / "campaign.json"
     whole = path.read_bytes()
-    other_type = sealed(unsealed(whole) | {"files": 5})
+    other_type = seal_json(unseal_json(whole) | {"files": 5})
     for data in (whole[:90] + b"x" + whole[91:], b"[]", other_type):
         path.write_bytes(data)
         with pytest.raises(LidarError, match=r"campaign\.json is damaged or has been edited: its "):

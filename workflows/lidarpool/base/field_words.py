@@ -25,7 +25,7 @@ _MAX_LETTERS = 80  # longest text that is written in full
 _MARK = " #"  # separates a description from the fingerprint of its content
 
 
-def fields_in_words(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+def describe_fields(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
     """Yield the path and a readable description of each field in a value.
 
     Fields that are None are skipped.
@@ -39,33 +39,33 @@ def fields_in_words(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
 
     Examples
     --------
-    >>> dict(fields_in_words({"noise": {"range_m": 0.02}, "poses": [[0, 0, 1]], "steps": None}))
+    >>> dict(describe_fields({"noise": {"range_m": 0.02}, "poses": [[0, 0, 1]], "steps": None}))
     {'noise.range_m': '0.02', 'poses[0]': '[0, 0, 1]'}
     """
     value = value.tolist() if isinstance(value, np.generic) else value
     if value is None:
         return
     if isinstance(value, _PLAIN):
-        yield path, _text(value)
+        yield path, _format_value(value)
     elif isinstance(value, Mapping) and len(value) <= _MAX_LOOKED_AT:
         for key, inner in value.items():
-            yield from fields_in_words(inner, f"{path}.{key}".removeprefix("."))
+            yield from describe_fields(inner, f"{path}.{key}".removeprefix("."))
     elif is_dataclass(value):
         inner_fields = {f.name: getattr(value, f.name) for f in fields(value) if f.compare}
-        yield from fields_in_words(inner_fields, path)
+        yield from describe_fields(inner_fields, path)
     elif isinstance(value, (list, tuple)) and all(isinstance(entry, _PLAIN) for entry in value):
         is_short = len(value) <= _MAX_NUMBERS
-        yield path, f"[{', '.join(map(_text, value))}]" if is_short else _marked(value)
+        yield path, f"[{', '.join(map(_format_value, value))}]" if is_short else _summarize(value)
     elif isinstance(value, (list, tuple)) and len(value) <= _MAX_ENTRIES:
         for number, entry in enumerate(value):
-            yield from fields_in_words(entry, f"{path}[{number}]")
+            yield from describe_fields(entry, f"{path}[{number}]")
     elif isinstance(value, np.ndarray) and value.size <= _MAX_NUMBERS:
-        yield path, _text(str(value.tolist()))
+        yield path, _format_value(str(value.tolist()))
     else:
-        yield path, _marked(value)
+        yield path, _summarize(value)
 
 
-def _text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """Return a plain value as it is written in a scenario file."""
     if isinstance(value, bool):
         return str(value).lower()
@@ -73,7 +73,7 @@ def _text(value: Any) -> str:
     return text if len(text) <= _MAX_LETTERS else f"{text[:_MAX_LETTERS]}… #{fingerprint(text)[:8]}"
 
 
-def _marked(value: Any) -> str:
+def _summarize(value: Any) -> str:
     """Describe a value by its length or type, followed by a short fingerprint of its content."""
     size = f"{len(value):,} entries" if hasattr(value, "__len__") else type(value).__name__
     if isinstance(value, Sequence):
@@ -84,13 +84,15 @@ def _marked(value: Any) -> str:
         return size
 
 
-def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: int = 4) -> str:
+def describe_changes(
+    earlier: Mapping[str, str], now: Mapping[str, str], max_fields: int = 4
+) -> str:
     """Describe the fields that changed between two descriptions of a run.
 
     Parameters
     ----------
     earlier, now
-        Descriptions by field path, as returned by `fields_in_words`.
+        Descriptions by field path, as returned by `describe_fields`.
     max_fields
         Number of changed fields to describe. Further changes are only counted.
 
@@ -100,11 +102,11 @@ def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: 
 
     Examples
     --------
-    >>> differences({"steps": "3", "noise.range_m": "0.02"}, {"steps": "4"})
+    >>> describe_changes({"steps": "3", "noise.range_m": "0.02"}, {"steps": "4"})
     'steps changed from 3 to 4; noise.range_m was removed (it was 0.02)'
     """
     clauses = [
-        _change(name, earlier.get(name), now.get(name))
+        _describe_change(name, earlier.get(name), now.get(name))
         for name in dict.fromkeys([*now, *earlier])
         if earlier.get(name) != now.get(name)
     ]
@@ -112,7 +114,7 @@ def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: 
     return "; ".join(clauses[:max_fields]) + (f"; and {further:,} more" if further > 0 else "")
 
 
-def _change(name: str, earlier_text: str | None, text: str | None) -> str:
+def _describe_change(name: str, earlier_text: str | None, text: str | None) -> str:
     """Return a clause that describes the change of a field. A text is None if it is not set."""
     earlier_value = earlier_text and earlier_text.partition(_MARK)[0]
     value = text and text.partition(_MARK)[0]

@@ -66,13 +66,13 @@ def fingerprint(*values: Any) -> str:
 
 
 @lru_cache(1024)
-def _of_word(word: str) -> str:
+def _hash_name(word: str) -> str:
     """Return the fingerprint of a field name. It is cached, because the same names recur."""
     return fingerprint(word)
 
 
-def _of_key(key: Any) -> str:
-    return _of_word(key) if type(key) is str else fingerprint(key)
+def _hash_key(key: Any) -> str:
+    return _hash_name(key) if type(key) is str else fingerprint(key)
 
 
 # {id of a read-only array: (array, hash)}. The jobs of a campaign share large scenes.
@@ -80,7 +80,7 @@ _hashes: dict[int, tuple[weakref.ref[Any], bytes]] = {}
 _MIN_CACHED_BYTES = 1 << 16  # smaller arrays are hashed each time
 
 
-def _content(array: np.ndarray[Any, Any]) -> bytes:
+def _hash_array(array: np.ndarray[Any, Any]) -> bytes:
     """Return the hash of an array's values. Hashes of large read-only arrays are cached."""
     cached = _hashes.get(id(array))
     if cached is not None and cached[0]() is array:
@@ -133,9 +133,9 @@ class _Digest:
             self._mark("datetime", value.isoformat())
         elif isinstance(value, np.ndarray):
             if value.dtype.hasobject:
-                raise _refusal(value)
+                raise _unhashable_error(value)
             self._mark("array", value.dtype.str, value.shape)
-            self._hash.update(_content(value))
+            self._hash.update(_hash_array(value))
         elif isinstance(value, (list, tuple, Mapping, Set)):
             self._add_container(value)
         elif isinstance(value, _CODE):
@@ -151,7 +151,7 @@ class _Digest:
                 self.add(item)
         elif isinstance(container, Mapping):
             self._mark("mapping", len(container))
-            for key in sorted(container, key=_of_key):
+            for key in sorted(container, key=_hash_key):
                 self.add(key)
                 self.add(container[key])
         else:
@@ -179,7 +179,7 @@ class _Digest:
         state = {field.name: getattr(instance, field.name) for field in declared_fields}
         attributes = getattr(instance, "__dict__", None)
         if attributes is None and not state:
-            raise _refusal(instance)
+            raise _unhashable_error(instance)
         state |= {k: v for k, v in (attributes or {}).items() if not _is_cached(cls, k)}
         ignored = {field.name for field in declared_fields if not field.compare}
         self._add_class(cls)
@@ -217,7 +217,7 @@ class _Digest:
         self.add((function.__defaults__, function.__kwdefaults__))
         for cell in function.__closure__ or ():
             self.add(cell.cell_contents)
-        for name in _names(function.__code__):
+        for name in _used_names(function.__code__):
             if name in function.__globals__:
                 self._mark(name)
                 self.add(function.__globals__[name])
@@ -233,10 +233,10 @@ class _Digest:
                 self.add(constant)
 
 
-def _names(code: types.CodeType) -> list[str]:
+def _used_names(code: types.CodeType) -> list[str]:
     """Return the sorted global and attribute names that code uses, including nested code."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return sorted({*code.co_names, *(name for c in inner for name in _names(c))})
+    return sorted({*code.co_names, *(name for c in inner for name in _used_names(c))})
 
 
 def _is_cached(kind: type, name: str) -> bool:
@@ -244,7 +244,7 @@ def _is_cached(kind: type, name: str) -> bool:
     return isinstance(getattr(kind, name, None), cached_property)
 
 
-def _refusal(value: Any) -> LidarError:
+def _unhashable_error(value: Any) -> LidarError:
     return LidarError(
         f"{reprlib.repr(value)} of type {type(value).__name__} cannot be hashed, so runs that "
         "use it cannot be distinguished. Use only numbers, strings, arrays and dataclasses in "

@@ -11,7 +11,7 @@ _NUMBER = re.compile(r"\bjob \d+: ")  # prefix with which an error message names
 _VALUES = "\nThe values of the job are "  # text that introduces the varied values in a message
 
 
-def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> list[str]:
+def summarize_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> list[str]:
     """Return one line for each distinct error, which lists the jobs that failed with it.
 
     Parameters
@@ -24,7 +24,7 @@ def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> lis
 
     Examples
     --------
-    >>> lines_of_errors([("0001", "job 1: no hall"), ("0004", "job 4: no hall"), ("0009", "no")])
+    >>> summarize_errors([("0001", "job 1: no hall"), ("0004", "job 4: no hall"), ("0009", "no")])
     ['jobs 0001, 0004: no hall', 'job 0009: no']
     """
     values_by_job: dict[str, dict[str, str]] = {}  # {message: {job: its values}}

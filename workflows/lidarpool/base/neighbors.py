@@ -9,7 +9,7 @@ from lidarsim.base.arrays import Floats, Ints
 from .open3d_module import load_open3d
 
 
-def nearest(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
+def nearest_neighbors(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
     """Find the nearest point in a reference cloud for each point.
 
     Parameters

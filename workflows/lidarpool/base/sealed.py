@@ -32,22 +32,22 @@ class SealedWriter:
         self._file.write(f',\n"crc": {self._crc}}}\n'.encode())
 
 
-def sealed(content: Mapping[str, Any]) -> bytes:
+def seal_json(content: Mapping[str, Any]) -> bytes:
     r"""Serialize a non-empty mapping as a JSON object with a checksum at the end.
 
     Examples
     --------
-    >>> sealed({"count": 7})
+    >>> seal_json({"count": 7})
     b'{\n "count": 7,\n"crc": 2540531583}\n'
-    >>> unsealed(sealed({"count": 7}))
+    >>> unseal_json(seal_json({"count": 7}))
     {'count': 7}
     """
     text = json.dumps(content, indent=1).removesuffix("\n}").encode()
     return text + f',\n"crc": {zlib.crc32(text)}}}\n'.encode()
 
 
-def unsealed(data: bytes) -> dict[str, Any]:
-    """Return the content of a JSON object written by `sealed` or `SealedWriter`.
+def unseal_json(data: bytes) -> dict[str, Any]:
+    """Return the content of a JSON object written by `seal_json` or `SealedWriter`.
 
     Raises
     ------

@@ -13,12 +13,12 @@ _SLURM = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "C
 _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
-def shard_in_words(text: str) -> str:
+def describe_shard(text: str) -> str:
     """Return the name of a shard in messages.
 
     Examples
     --------
-    >>> shard_in_words("3/10"), shard_in_words("1/1")
+    >>> describe_shard("3/10"), describe_shard("1/1")
     ('shard 3/10', 'the whole run')
     """
     return "the whole run" if text == "1/1" else f"shard {text}"

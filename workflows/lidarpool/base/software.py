@@ -51,33 +51,33 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
     are included if a backend is given. Each plug-in has an entry with the version and the source
     hash of its distribution.
     """
-    described = {"lidarpool": f"{__version__} (sources {sources()})"}
+    described = {"lidarpool": f"{__version__} (sources {source_hash()})"}
     if backend:
         described["numpy"] = np.__version__
         described["backend"] = f"{backend} {backend_build(backend)}".strip()
     for plugin in plugins:
         if (installed := find_plugin(plugin.group, plugin.name)) is not None:
-            described[_entry_of(installed)] = _version_of(installed)
+            described[_entry_name(installed)] = _plugin_version(installed)
     return described
 
 
 @cache
-def sources() -> str:
+def source_hash() -> str:
     """Return the hash of the installed sources, as eight hexadecimal digits.
 
     If files have changed since this process started, it may be running older code. The function
     then returns a text that says so instead of a hash.
     """
-    return _hash_of(PACKAGES)
+    return _hash_packages(PACKAGES)
 
 
 @cache
-def _version_of(plugin: Plugin) -> str:
+def _plugin_version(plugin: Plugin) -> str:
     """Return the version and the source hash of a plug-in's distribution."""
-    return f"{plugin.version} (sources {_hash_of((_package_of(plugin.module),))})"
+    return f"{plugin.version} (sources {_hash_packages((_top_package(plugin.module),))})"
 
 
-def _package_of(module: str) -> str:
+def _top_package(module: str) -> str:
     """Return the outermost regular package of a module, or the module if it has no package.
 
     Namespace packages are skipped, because several distributions can share them.
@@ -91,12 +91,12 @@ def _package_of(module: str) -> str:
     return module
 
 
-def _hash_of(packages: Iterable[str]) -> str:
-    """Return the hash of the files in packages or modules, as described in `sources`."""
+def _hash_packages(packages: Iterable[str]) -> str:
+    """Return the hash of the files in packages or modules, as described in `source_hash`."""
     digest = hashlib.sha256()
     newest_s = 0.0
     for package in packages:
-        for name, path in _files_of(package):
+        for name, path in _package_files(package):
             content = path.read_bytes()
             newest_s = max(newest_s, path.stat().st_mtime)
             digest.update(f"{name} {len(content)} ".encode() + content)
@@ -105,7 +105,7 @@ def _hash_of(packages: Iterable[str]) -> str:
     return digest.hexdigest()[:8]
 
 
-def _files_of(package: str) -> Iterator[tuple[str, Path]]:
+def _package_files(package: str) -> Iterator[tuple[str, Path]]:
     """Yield the name and path of each file in a package. Names start with the package name."""
     try:
         spec = find_spec(package)
@@ -139,7 +139,7 @@ def software_query(
         for plugin in plugins
     ]
 
-    def ask() -> dict[str, str]:
+    def query() -> dict[str, str]:
         try:
             from lidarsim._version import __version__
         except ModuleNotFoundError:
@@ -152,12 +152,12 @@ def software_query(
             return {"lidarpool": __version__}
         return software(backend, [Plugin(*fields) for fields in named])
 
-    return ask
+    return query
 
 
 def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
     """Return the version and the source hash of each plug-in, as installed in this process."""
-    return {plugin: _version_of(plugin) for plugin in plugins}
+    return {plugin: _plugin_version(plugin) for plugin in plugins}
 
 
 def call_with_same_sources(required: str, function: Callable[..., T], *arguments: Any) -> T:
@@ -175,7 +175,7 @@ def call_with_same_sources(required: str, function: Callable[..., T], *arguments
     LidarError
         If the worker has different sources.
     """
-    return _call(software(), {"lidarpool": required}, function, *arguments)
+    return _call_if_compatible(software(), {"lidarpool": required}, function, *arguments)
 
 
 def call_with_plugins(
@@ -195,17 +195,17 @@ def call_with_plugins(
     LidarError
         If a plug-in is missing, or has a different version or different sources.
     """
-    required = {_entry_of(plugin): version for plugin, version in versions.items()}
-    return _call(software(plugins=versions), required, function, *arguments)
+    required = {_entry_name(plugin): version for plugin, version in versions.items()}
+    return _call_if_compatible(software(plugins=versions), required, function, *arguments)
 
 
-def _call(
+def _call_if_compatible(
     installed: Mapping[str, str],
     required: Mapping[str, str],
     function: Callable[..., T],
     *arguments: Any,
 ) -> T:
-    if differs := difference(installed, required):
+    if differs := describe_difference(installed, required):
         worker = get_worker()
         raise LidarError(
             f"Worker {worker.name} at {worker.address} has {differs}. Install the same version on "
@@ -214,21 +214,21 @@ def _call(
     return function(*arguments)
 
 
-def _entry_of(plugin: Plugin) -> str:
+def _entry_name(plugin: Plugin) -> str:
     """Return the name of a plug-in's entry in `software`."""
     return f"plug-in {plugin.distribution}"
 
 
-def difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
+def describe_difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
     """Describe the first difference between installed and required software.
 
     Returns an empty string if all required entries are the same.
 
     Examples
     --------
-    >>> difference({"numpy": "2.3.1"}, {"numpy": "2.4.6"})
+    >>> describe_difference({"numpy": "2.3.1"}, {"numpy": "2.4.6"})
     'numpy 2.3.1, but the run requires numpy 2.4.6'
-    >>> difference({}, {"numpy": "2.4.6"})
+    >>> describe_difference({}, {"numpy": "2.4.6"})
     'no numpy, but the run requires numpy 2.4.6'
     """
     for name, value in required.items():

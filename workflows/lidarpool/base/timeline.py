@@ -61,7 +61,7 @@ _ROW = (
 )
 
 
-class Step(NamedTuple):
+class TimelineStep(NamedTuple):
     """A step of a command, which starts when the previous step ends."""
 
     name: str
@@ -85,12 +85,12 @@ class Timeline:
     def __init__(self) -> None:
         # Start of the process in seconds since 1970, with a resolution of 10 ms.
         self._started = time.time() - _age_s()
-        self.steps: list[Step] = []
+        self.steps: list[TimelineStep] = []
 
     def mark(self, name: str) -> None:
         """Record that a step ends now, unless a step with this name has already been recorded."""
         if all(step.name != name for step in self.steps):
-            self.steps.append(Step(name, time.time() - self._started))
+            self.steps.append(TimelineStep(name, time.time() - self._started))
 
     def table(self) -> str:
         """Return a text table with the name of each step, and its duration and end in seconds."""

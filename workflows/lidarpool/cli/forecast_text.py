@@ -16,7 +16,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural, rounded, scans_in_words
 
-from ..base.job_errors import lines_of_errors
+from ..base.job_errors import summarize_errors
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
 from ..run.job_source import OneJob
@@ -129,7 +129,7 @@ def _campaign_figures(
         errors += [(name, reason) for reason in figures["reasons"]]
     return {
         "can_run": not errors,
-        "reasons": lines_of_errors(errors),
+        "reasons": summarize_errors(errors),
         "occupied": _holds_files(out),
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),

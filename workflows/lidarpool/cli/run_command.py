@@ -20,7 +20,7 @@ from lidarsim.columns.table import NO_SURFACE
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base import timeline
-from ..base.shard import Shard, shard_in_words
+from ..base.shard import Shard, describe_shard
 from ..clouds.folder import local_result, output_place, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
@@ -79,7 +79,7 @@ def run_scenario(
         result = cast_to_store(jobs, options, terminal, page, made_of=made_of, target=out)
     points = len(result.points)
     line = (
-        f"{shard_in_words(str(shard))} in {out}: {plural(points, 'point')}. To combine the shards, "
+        f"{describe_shard(str(shard))} in {out}: {plural(points, 'point')}. To combine the shards, "
         "use lidarpool merge"
     )
     figures = {"folder": str(out), "shard": str(shard), "points": points}

@@ -22,7 +22,7 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 
-from ..base.neighbors import nearest
+from ..base.neighbors import nearest_neighbors
 from ..clouds.recording import Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
@@ -306,7 +306,7 @@ class _Comparing:
             return
         for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
             chosen = cloud.select(even_indices(len(cloud), budget))
-            distance, index = nearest(chosen.points, reference.points)
+            distance, index = nearest_neighbors(chosen.points, reference.points)
             if len(self.points) < 2:
                 self.points.append(chosen.points)
             intensity = chosen.intensity

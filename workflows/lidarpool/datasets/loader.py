@@ -29,7 +29,7 @@ from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
-from ..base.sealed import unsealed
+from ..base.sealed import unseal_json
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import Entry
 from ..clouds.folder import refuse_missing
@@ -306,7 +306,7 @@ def read_index(storage: Storage) -> dict[str, Any]:
     """
     refuse_missing(storage, "specify the output folder of a campaign")
     try:
-        head = unsealed(storage.read(INDEX_FILE))
+        head = unseal_json(storage.read(INDEX_FILE))
         if head["version"] != VERSION:
             raise ValueError(f"its version is {head['version']} instead of {VERSION}")
         if head["format"] not in DATA_SETS:

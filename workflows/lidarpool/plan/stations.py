@@ -23,7 +23,7 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
 
-from ..base.neighbors import nearest
+from ..base.neighbors import nearest_neighbors
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # share of the reachable area that each adds, if no number or coverage is given
@@ -277,7 +277,7 @@ def survey_coverage(
     for points in clouds:
         missing = np.flatnonzero(~has_point)
         if len(points) and len(missing):
-            distance_m, _ = nearest(samples.points[missing], points - scene.origin)
+            distance_m, _ = nearest_neighbors(samples.points[missing], points - scene.origin)
             has_point[missing] = distance_m <= within_m
     sides = np.stack(
         [sight.sides(p, samples.points, samples.normals) for p in positions - scene.origin]

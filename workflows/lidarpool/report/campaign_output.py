@@ -15,11 +15,11 @@ from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import listed, plural
 
-from ..base.field_words import differences
-from ..base.job_errors import lines_of_errors
-from ..base.sealed import sealed, unsealed
-from ..base.shard import ALL, Shard, shard_in_words
-from ..base.software import difference, software
+from ..base.field_words import describe_changes
+from ..base.job_errors import summarize_errors
+from ..base.sealed import seal_json, unseal_json
+from ..base.shard import ALL, Shard, describe_shard
+from ..base.software import describe_difference, software
 from ..clouds.folder import LAST_FILE, refuse_missing, result_folder
 from ..clouds.format_table import DATA_SETS, format_named
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
@@ -154,10 +154,10 @@ class DataSetOutput:
     def _check_shards(self, shards: Sequence[str]) -> None:
         """Raise LidarError unless a finished data set has the shards of this run."""
         if shards != [str(self.campaign.shard)]:
-            held = listed([*map(shard_in_words, shards)]) or "no shards"
+            held = listed([*map(describe_shard, shards)]) or "no shards"
             raise LidarError(
                 f"{self.dataset.storage} contains {held}, but this run is "
-                f"{shard_in_words(str(self.campaign.shard))}. Specify another folder with "
+                f"{describe_shard(str(self.campaign.shard))}. Specify another folder with "
                 "`--out`."
             )
 
@@ -295,7 +295,7 @@ class DamagedRecordError(LidarError):
 def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
     """Write CAMPAIGN_FILE."""
     with explained(f"{storage} cannot be written"):
-        storage.write(CAMPAIGN_FILE, sealed(record))
+        storage.write(CAMPAIGN_FILE, seal_json(record))
 
 
 def read_record(storage: Storage) -> dict[str, Any]:
@@ -305,7 +305,7 @@ def read_record(storage: Storage) -> dict[str, Any]:
     """
     refuse_missing(storage, "specify the output folder of a campaign")
     try:
-        record = unsealed(storage.read(CAMPAIGN_FILE))
+        record = unseal_json(storage.read(CAMPAIGN_FILE))
         for name, kind in _RECORDED.items():
             if not isinstance(record.get(name), kind):
                 raise ValueError(f"its entry `{name}` is missing or has the wrong type")
@@ -470,14 +470,16 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     record = read_record(storage)
     installed = software(record["backend"])
     recorded = record["casting"] or {"lidarpool": record["identity"]["lidarpool"]}
-    if differs := difference(recorded, {name: installed.get(name, "none") for name in recorded}):
+    if differs := describe_difference(
+        recorded, {name: installed.get(name, "none") for name in recorded}
+    ):
         raise LidarError(
             f"{storage} was created with {differs}. Only that version reproduces its jobs bit "
             "for bit. Install it, or run the job in a separate folder with `--out`."
         )
     for name, value in campaign.identity.items():
         if record["identity"].get(name) != value:
-            changed = differences(record["fields"], campaign.fields)
+            changed = describe_changes(record["fields"], campaign.fields)
             raise LidarError(
                 f"{storage} belongs to a different campaign "
                 f"({changed or f'its {name} differs'}). Run the job in a separate folder with "
@@ -525,7 +527,7 @@ def failures(sums: CampaignRun, max_errors: int = 5) -> str:
             f"{name} {'none' if value is None else value}" for name, value in row.values.items()
         )
         errors.append((f"{row.name}{f' ({values})' if values else ''}", row.error))
-    lines = lines_of_errors(errors, max_jobs=3)
+    lines = summarize_errors(errors, max_jobs=3)
     if (hidden := len(lines) - max_errors) > 0:
         lines[max_errors:] = [f"{plural(hidden, 'more error')}, listed in jobs.csv"]
     return "\n".join([head, *lines, "To run the failed jobs again, use `--retry-failed`."])

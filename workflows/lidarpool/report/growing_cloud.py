@@ -23,7 +23,7 @@ from lidarsim.columns.table import AXES
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..base.processors import processors
+from ..base.processors import processor_count
 from ..clouds.ply import GrowingPly, real_type
 from ..clouds.ply_rows import RowMaker
 from ..columns.part_blocks import BlockMemory, read_blocks
@@ -156,7 +156,7 @@ class CloudWriter:
     ) -> None:
         self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
         self._flushed_bytes = 0  # size of the file at the last flush
-        self.threads = min(processors(), _MAX_THREADS)
+        self.threads = min(processor_count(), _MAX_THREADS)
         self._idle = SimpleQueue[_PartWriter]()
         for _ in range(self.threads):
             counts = CloudCounts(

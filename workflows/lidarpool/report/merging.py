@@ -19,7 +19,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import listed
 
-from ..base.field_words import differences
+from ..base.field_words import describe_changes
 from ..base.fingerprint import fingerprint
 from ..base.open3d_module import load_open3d
 from ..base.shard import ALL, Shard
@@ -298,7 +298,9 @@ def _check(
             name for name in expected if common.get(name, expected[name]) != expected[name]
         ]:
             changed = (
-                differences(first_fields, shard_folder.record["fields"]) if first_fields else ""
+                describe_changes(first_fields, shard_folder.record["fields"])
+                if first_fields
+                else ""
             )
             message = f"{shard_folder.storage} and {first} differ in {differs[0]}"
             message += f" ({changed})" * bool(changed)
@@ -551,7 +553,7 @@ def _merge_survey(
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
-        changed = differences(record["fields"], jobs.fields)
+        changed = describe_changes(record["fields"], jobs.fields)
         raise LidarError(
             f"{path} does not match these shards, because its {differs[0]} is "
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "

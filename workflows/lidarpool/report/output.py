@@ -23,7 +23,7 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
 from ..base import timeline
-from ..base.field_words import differences
+from ..base.field_words import describe_changes
 from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
 from ..clouds.format_table import FORMATS, plugin_formats, row_of
@@ -154,7 +154,7 @@ class SurveyOutput:
         if REPORT in entries and not overwrite:
             expected = inputs.identity  # takes a moment for large scenes
             if earlier != {name: expected[name] for name in _SURVEY}:
-                changed = differences(earlier_fields, inputs.fields) if earlier_fields else ""
+                changed = describe_changes(earlier_fields, inputs.fields) if earlier_fields else ""
                 raise LidarError(
                     f"{target} contains the result of a different "
                     f"survey{f' ({changed})' * bool(changed)}. {advice}"

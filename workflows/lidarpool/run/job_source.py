@@ -20,7 +20,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
-from ..base.field_words import fields_in_words
+from ..base.field_words import describe_fields
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
@@ -71,7 +71,7 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
     for name in ("poses", "trajectory", "steps", "materials", "returns", "noise", "navigation"):
         values[name] = getattr(survey, name)
     values |= {"faults": survey.faults, "planning": planning}
-    return dict(fields_in_words(values))
+    return dict(describe_fields(values))
 
 
 class Identified(Protocol):

@@ -23,7 +23,7 @@ from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.validation import checked
 from lidarsim.base.yamlfile import read_yaml
 
-from ..base.field_words import fields_in_words
+from ..base.field_words import describe_fields
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..clouds.writing import with_format_columns
@@ -320,7 +320,7 @@ class CampaignSpec:
     def fields(self) -> dict[str, str]:
         """Fields that the data set depends on, in words: {path of a field: its value}."""
         head = {"seed": self.seed, "keep": asdict(self.keep), "splits": self.splits}
-        return dict(fields_in_words({**head, "vary": self.choices})) | self._jobs.fields
+        return dict(describe_fields({**head, "vary": self.choices})) | self._jobs.fields
 
 
 def _head(**fields: Any) -> CampaignSection:

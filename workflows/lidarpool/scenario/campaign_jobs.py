@@ -25,7 +25,7 @@ from lidarsim.base.value_texts import shown
 from lidarsim.base.words import plural
 from lidarsim.scene.files.mesh_formats import plugin_of
 
-from ..base.field_words import fields_in_words
+from ..base.field_words import describe_fields
 from ..base.fingerprint import fingerprint
 from ..base.software import plugin_versions
 from ..clouds.format_table import check_all_returns
@@ -294,7 +294,7 @@ class VariedJobs(JobSource):
         """Fields of the bases, and rows of the tables, in words."""
         bases = self._bases[:_MAX_DESCRIBED]
         tables = {f"rows of {text}": rows for base in bases for text, rows in base.tables.items()}
-        words = fields_in_words({name: to_json(rows).decode() for name, rows in tables.items()})
+        words = describe_fields({name: to_json(rows).decode() for name, rows in tables.items()})
         return _fields_of({base.name: base.scenario for base in bases}) | dict(words)
 
     def named_in(self, file: Path) -> str:
@@ -487,7 +487,7 @@ def _fields_of(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
     words: dict[str, str] = {}
     for name, scenario in scenarios.items():
         content = scenario.model_dump(exclude={"pool"}, exclude_unset=True)
-        words |= {f"{name}: {field}": text for field, text in fields_in_words(content)}
+        words |= {f"{name}: {field}": text for field, text in describe_fields(content)}
     return words
 
 

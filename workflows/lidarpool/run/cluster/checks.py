@@ -21,7 +21,7 @@ from poolpart.task_locations import look_for_tasks
 from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
-from ...base.software import difference, software, software_query
+from ...base.software import describe_difference, software, software_query
 from ...clouds.writing import ExportSpec
 from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
@@ -222,7 +222,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
     for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
-        if differs := difference(answer, required):
+        if differs := describe_difference(answer, required):
             raise LidarError(
                 f"The worker at {address} has {differs}. Install the same version on both "
                 "machines, and restart the worker."
@@ -253,7 +253,7 @@ def common_software(
         address, installed = next(iter(answers.items()))
         raise LidarError(
             "The software on the casting workers differs from the software with which the run "
-            f"was started. The worker at {address} has {difference(installed, earlier)}. "
+            f"was started. The worker at {address} has {describe_difference(installed, earlier)}. "
             "Continue the run with the earlier software, or remove it with `--restart` "
             "(`remove_run` in Python)."
         )

@@ -24,7 +24,7 @@ from poolpart.task_locations import TaskLocations, look_for_tasks
 from poolpart.workers import worker_identities
 
 from ...base.shared_memory import Pickled, SharedHandle, SharedValue
-from ...base.software import difference, software_query
+from ...base.software import describe_difference, software_query
 from .batches import Outcome
 from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
@@ -341,7 +341,7 @@ class CastingWorkers:
         """Record a worker that has answered the software check, and refuse different software."""
         worker = self._workers[address]
         worker.check = None
-        if differs := difference(software, self._software):
+        if differs := describe_difference(software, self._software):
             self.notes.append(
                 f"worker {identity['name']} at {address} was not used because it has {differs}"
             )

@@ -36,5 +36,5 @@ with suppress(ImportError):  # a check says why the module cannot be loaded
         print("note: the ray caster was compiled for this processor", file=sys.stderr)  # noqa: T201
 # What each worker would read from many files: versions of packages, and a hash of the sources.
 distributed.versions.get_versions()
-software.sources()
+software.source_hash()
 gc.freeze()  # a collection in a worker would copy the memory that it shares with the others

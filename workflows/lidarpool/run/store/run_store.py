@@ -21,9 +21,9 @@ from lidarsim.base.words import rounded
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 
-from ...base.field_words import differences
+from ...base.field_words import describe_changes
 from ...base.fingerprint import fingerprint
-from ...base.shard import shard_in_words
+from ...base.shard import describe_shard
 from ...base.software import software
 from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
@@ -286,10 +286,12 @@ class RunStore:
             if earlier.get(name) != value:
                 if name == "shard":
                     shards = str(earlier.get(name)), str(value)
-                    earlier_shard, requested_shard = map(shard_in_words, shards)
+                    earlier_shard, requested_shard = map(describe_shard, shards)
                     return f"it is {earlier_shard} rather than {requested_shard}."
                 if name != "lidarpool":
-                    changed = differences(json.loads(meta.get("fields", "{}")), self.jobs.fields)
+                    changed = describe_changes(
+                        json.loads(meta.get("fields", "{}")), self.jobs.fields
+                    )
                     kind = name if name in CONTENT else "campaign"
                     differs = f"the {kind} has changed{f': {changed}' if changed else ''}"
                     return f"{differs}. {self.jobs.changeable}"

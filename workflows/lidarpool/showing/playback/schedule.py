@@ -11,7 +11,7 @@ from typing import Generic, Self, TypeVar
 
 from lidarsim.base.arrays import Ints
 
-from ...base.processors import processors
+from ...base.processors import processor_count
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1
@@ -30,7 +30,7 @@ def casting_threads() -> int:
     The threads of a single cast share only its rays; steps on their hits, a half of the time, would
     use one core.
     """
-    return min(processors(), _MAX_THREADS)
+    return min(processor_count(), _MAX_THREADS)
 
 
 class Schedule:
