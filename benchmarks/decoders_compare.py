@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarpool.clouds.intensity_full_scale import full_scale_of
+from lidarpool.clouds.intensity_full_scale import compute_full_scale
 from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.packets.encoders import START_NS
 
@@ -273,7 +273,7 @@ def compare_las(drive: Drive, arrays: Arrays) -> Iterator[Row]:
     columns = {"classification": "class", "object": "object", "time": "time", "ring": "channel"}
     for name in ("las", "laz"):
         late_s = arrays[f"{name}/gps_time"] - start_s - cloud["time"] / 1e9
-        shares = cloud["intensity"] / full_scale_of(cloud)
+        shares = cloud["intensity"] / compute_full_scale(cloud)
         steps = np.clip(shares, 0, 1) * 65_535.0 - arrays[f"{name}/intensity"]
         first = np.stack([arrays[f"{name}/{field}"].astype(np.int64) for field in columns])
         second = np.stack([cloud[column].astype(np.int64) for column in columns.values()])

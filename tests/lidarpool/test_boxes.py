@@ -495,7 +495,7 @@ def test_actors_are_compensated_in_both_coordinates(coordinates):
     cloud, sweeps = moving_corners(coordinates)
     boxes_by_sweep = []
     for number, points in enumerate(sweeps.points(cloud)):
-        boxes = Boxes.from_points(sweeps, number, points).inward(sweeps.pose, number)
+        boxes = Boxes.from_points(sweeps, number, points).to_sensor_frame(sweeps.pose, number)
         boxes_by_sweep.append(SweepBoxes.select(sweeps, boxes))
     moved = replace(sweeps, actors_at_start=True)
     for number, points in enumerate(moved.points(cloud)):

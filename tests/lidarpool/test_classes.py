@@ -169,8 +169,8 @@ def test_formats_hold_classes_that_have_names(scene, sweeps):
     cloud = points_of(scene, 0)
     plain = replace(sweeps, classes={})
     for name in ("nuscenes", "mcap", "rosbag2"):
-        assert "class" in ExportSpec(name).left_out(cloud, plain)
-        assert "class" not in ExportSpec(name).left_out(cloud, sweeps)
+        assert "class" in ExportSpec(name).unsupported_columns(cloud, plain)
+        assert "class" not in ExportSpec(name).unsupported_columns(cloud, sweeps)
 
 
 def tables_of(folder):

@@ -417,10 +417,10 @@ def test_scans_of_an_e57_are_named_by_their_stations(tmp_path, poses, turns, nam
 
 
 def test_what_contradicts_a_frame_is_noted():
-    assert ExportSpec("kitti").contradictions("world") == []
-    assert ExportSpec("mcap").contradictions("sensor") == []
+    assert ExportSpec("kitti").frame_notes("world") == []
+    assert ExportSpec("mcap").frame_notes("sensor") == []
     for one in (ExportSpec("laz"), ExportSpec("kitti"), ExportSpec("mcap", compensated=True)):
-        (note,) = one.contradictions("sensor")
+        (note,) = one.frame_notes("sensor")
         assert "cloud.coordinates" in note
     with pytest.raises(LidarError, match="kitti does not support `compensated`"):
         ExportSpec("kitti", compensated=True)

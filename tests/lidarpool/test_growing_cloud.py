@@ -87,7 +87,7 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
 def test_bytes_and_counts_do_not_depend_on_threads_and_blocks(
     store, tmp_path, monkeypatch, count, block_rows
 ):
-    monkeypatch.setattr(growing_cloud, "processors", lambda: count)
+    monkeypatch.setattr(growing_cloud, "processor_count", lambda: count)
     monkeypatch.setattr(growing_cloud, "_BLOCK_ROWS", block_rows)
     with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         for first, counts in FEW.items():
@@ -101,8 +101,8 @@ def test_bytes_and_counts_do_not_depend_on_threads_and_blocks(
 
 
 def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, monkeypatch):
-    monkeypatch.setattr(growing_cloud, "processors", lambda: 4)
-    write = ply.GrowingPly.write_rows
+    monkeypatch.setattr(growing_cloud, "processor_count", lambda: 4)
+    write = ply.PlyAppender.write_rows
     offsets = []
 
     def faulty(self, rows, offset):
@@ -111,7 +111,7 @@ def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, 
             raise OSError(28, "No space left on device")
         write(self, rows, offset)
 
-    monkeypatch.setattr(ply.GrowingPly, "write_rows", faulty)
+    monkeypatch.setattr(ply.PlyAppender, "write_rows", faulty)
     path = grown_at(tmp_path / "new")
     with GrowingCloud(path, store.only_job) as growing:
         for first, counts in FEW.items():

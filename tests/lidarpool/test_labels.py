@@ -9,7 +9,7 @@ import pytest
 import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarpool.clouds.format_table import FORMATS, format_named
+from lidarpool.clouds.format_table import FORMATS, load_format
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
@@ -33,7 +33,7 @@ def test_the_table_of_labels_is_that_of_the_registry():
     assert page.keys() == FORMATS.keys()
     for name in FORMATS:
         thing, semantic_class, boxes = page[name]
-        cloud_format = format_named(name)
+        cloud_format = load_format(name)
         stored = ("object", "class") if cloud_format.stored is None else cloud_format.stored
         assert (thing != "no") == ("object" in stored), name
         assert (semantic_class != "no") == ("class" in (*stored, *cloud_format.named)), name

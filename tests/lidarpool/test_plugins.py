@@ -11,7 +11,7 @@ from tests.plugin_files import write_distribution
 from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.base.software import describe_difference, plugin_versions, software
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.format_table import row_of
+from lidarpool.clouds.format_table import format_row
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.campaign_jobs import file_hashes
@@ -233,9 +233,9 @@ def test_formats_of_clouds_that_cannot_be_used(distribution):
             "class Taken(CloudFormat): row = FormatRow('cloud.ply')\n"
         },
     )
-    assert "lacks half_cloud.Half.write" in refused(row_of, "Half")
-    assert "lacks a subclass of lidarpool.plugins.CloudFormat" in refused(row_of, "Row")
-    assert "writes 'cloud.ply'" in refused(row_of, "Taken")
+    assert "lacks half_cloud.Half.write" in refused(format_row, "Half")
+    assert "lacks a subclass of lidarpool.plugins.CloudFormat" in refused(format_row, "Row")
+    assert "writes 'cloud.ply'" in refused(format_row, "Taken")
     told = refused(ExportSpec, "quarter")
     assert "Unknown cloud format 'quarter'" in told and "Half" in told
 
@@ -282,7 +282,7 @@ def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
     cloud = Cloud([[0.0, 0.0, 1.0]], {})
     told = refused(save_cloud, cloud, tmp_path / "a.text", format="text")
     assert "requires no_such. Run pip install no_such" in told
-    object.__setattr__(row_of("text"), "packages", ())
+    object.__setattr__(format_row("text"), "packages", ())
     save_cloud(cloud, tmp_path / "a.text", format="text")
     assert (tmp_path / "a.text").read_text() == "1 points"
 

@@ -141,7 +141,7 @@ def test_rows_move_if_the_header_gets_another_length(tmp_path, monkeypatch, expe
     cloud = sample(40)
     columns = {**dict(zip("xyz", cloud.positions.T, strict=True)), **cloud.columns}
     kind = np.dtype(np.float32)
-    with ply.GrowingPly(
+    with ply.PlyAppender(
         tmp_path / "grown.ply", cloud.table, kind, Sweeps.unknown(), expected
     ) as file:
         for rows in (slice(0, 5), slice(5, 5), slice(5, 23), slice(23, 40)):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Column, LidarError
-from lidarpool.clouds.ply_rows import RowMaker
+from lidarpool.clouds.ply_rows import PlyRowEncoder
 from lidarpool.columns.part_blocks import BlockMemory
 from lidarsim.columns.part_columns import positions_of
 from lidarsim.columns.ply_format import as_file_type, row_type
@@ -59,11 +59,11 @@ def test_rows_are_numpys(position_type, table, rows):
     given = row_type(np.dtype(position_type), TABLES[table])
     names = [*given.names[:3], *reversed(given.names[3:])]
     row = np.dtype([(name, given[name]) for name in names])
-    maker = RowMaker(row, TABLES[table], memory, 0.01, origin)
+    encoder = PlyRowEncoder(row, TABLES[table], memory, 0.01, origin)
     for count in (rows, max(1, rows // 2)):
         columns = memory.columns(count)
         expected = expected_rows(row, TABLES[table], columns, 0.01, origin)
-        assert bytes(maker.make(columns)) == expected.tobytes()
+        assert bytes(encoder.encode(columns)) == expected.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -74,10 +74,10 @@ def test_positions_are_numpys_at_any_precision(precision_m, origin_m):
     memory = filled_memory((), 3000, 2**31)
     row = row_type(np.dtype(np.float64), ())
     origin = np.array([origin_m, -origin_m, 2 * origin_m])
-    maker = RowMaker(row, (), memory, precision_m, origin)
+    encoder = PlyRowEncoder(row, (), memory, precision_m, origin)
     columns = memory.columns(3000)
     expected = expected_rows(row, (), columns, precision_m, origin)
-    assert bytes(maker.make(columns)) == expected.tobytes()
+    assert bytes(encoder.encode(columns)) == expected.tobytes()
 
 
 def test_a_number_that_a_file_cannot_hold_is_refused():
@@ -85,6 +85,6 @@ def test_a_number_that_a_file_cannot_hold_is_refused():
     memory = filled_memory(table, 5, 100)
     columns = memory.columns(5)
     columns["time"][3] = 2**53 + 1
-    maker = RowMaker(row_type(np.dtype(np.float32), table), table, memory, 0.01, np.zeros(3))
+    encoder = PlyRowEncoder(row_type(np.dtype(np.float32), table), table, memory, 0.01, np.zeros(3))
     with pytest.raises(LidarError, match="'time' contains 9007199254740993"):
-        maker.make(columns)
+        encoder.encode(columns)

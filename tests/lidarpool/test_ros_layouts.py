@@ -394,10 +394,10 @@ def test_the_padding_of_organized_points_is_zero(tmp_path):
     used = {b for kind, at, *_ in row.fields.values() for b in range(at, at + kind.itemsize)}
     dirty = [np.full(size, 255, np.uint8) for size in range(1000, 20_000, 100) for _ in range(4)]
     del dirty
-    laid_out = layouts.LaidOut("ouster", organized=True)
+    message_layout = layouts.MessageLayout("ouster", organized=True)
     sweeps = Sweeps.from_survey(survey, SCENE)
-    rows = layouts.point_rows(laid_out, row, points, sweeps, 0)
-    (organized,) = organized_rows(laid_out, rows, points, sweeps, 0)
+    rows = layouts.encode_points(message_layout, row, points, sweeps, 0)
+    (organized,) = organized_rows(message_layout, rows, points, sweeps, 0)
     stored = np.frombuffer(organized.tobytes(), np.uint8).reshape(-1, row.itemsize)
     assert not stored[:, sorted({*range(row.itemsize)} - used)].any()
 

@@ -24,7 +24,7 @@ from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps,
 import lidarpool
 from lidarpool import LidarError, Scene, Sweep
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS, format_named
+from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS, load_format
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.recordings.opening import open_recording
@@ -294,7 +294,7 @@ def test_threads_and_forks_read_beside_each_other(written, name):
 @pytest.mark.parametrize("url", [False, True])
 def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
     name = "kitti" if url else "webdataset"
-    cloud_format = format_named(name)
+    cloud_format = load_format(name)
     read = cloud_format.read_sweep
     threads: list[str] = []
 

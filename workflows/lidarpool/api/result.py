@@ -72,13 +72,13 @@ class Result(RunResult):
             If a file cannot be written, if the folder contains the result of a different survey, or
             if a format requires a missing package or column.
         """
-        from ..clouds.folder import output_place
+        from ..clouds.folder import output_destination
         from ..clouds.writing import ExportSpec
         from ..report.output import SurveyOutput
 
         further_formats = [ExportSpec.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
-        output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
+        output = SurveyOutput(output_destination(folder), self.survey, further_formats, extent)
         with output.lock():
             output.check_existing(self, overwrite=overwrite)
             output.write(self)

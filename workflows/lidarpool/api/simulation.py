@@ -18,7 +18,7 @@ from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.survey.survey import Survey
 
 from ..base.shard import Shard
-from ..clouds.folder import output_place
+from ..clouds.folder import output_destination
 from ..plan import Planning
 from ..report.campaign_output import run_campaign
 from ..run.job_source import OneJob
@@ -224,7 +224,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             If the cluster lacks a resource, or if `out` contains other files or the unfinished run
             of a different campaign or version. The message states the cause and the remedy.
         """
-        target = output_place(out)
+        target = output_destination(out)
         chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
         run_options = RunOptions(folder=folder, **chosen).with_pool(self.pool, chosen)

@@ -88,8 +88,8 @@ def forecast_scenario(
         figures["sources"] = dict(prepared.findings.sources)
         if campaign is not None:
             file_format = campaign.keep.of_jobs
-            figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
-            figures["notes"] += file_format.cloud_format.renamed([*scenario.sensors])
+            figures["notes"] += file_format.frame_notes(scenario.cloud.coordinates)
+            figures["notes"] += file_format.cloud_format.renaming_notes([*scenario.sensors])
             if "class" in file_format.needs:
                 figures["notes"] += unlabeled(job.scene, job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)

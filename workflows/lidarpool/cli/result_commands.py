@@ -15,7 +15,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
-from ..clouds.format_table import EXPORTS, LAYOUTS, format_named, row_of
+from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
 from . import completion
 from . import shared_options as options
 
@@ -45,7 +45,7 @@ class _FormatName(click.Choice[str]):
         """
         if value in EXPORTS or value == "ply":
             return super().convert(value, param, ctx)
-        row_of(value)
+        format_row(value)
         return value
 
 
@@ -85,7 +85,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..base.fork_server import keep_freed_memory
-    from ..clouds.folder import local_folder, local_result, send
+    from ..clouds.folder import local_folder, local_result, upload
     from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
@@ -100,9 +100,9 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
         content = PictureContent.load(folder_of_result / PICTURE_FILE)
         with nullcontext(folder_of_result) if out is None else local_folder(out) as folder:
             for path in draw_pictures(content, folder_of_result, folder, **settings):
-                click.echo(click.format_filename(send(path, target)))
+                click.echo(click.format_filename(upload(path, target)))
             if out is None and (folder_of_result / PAGE).exists():
-                send(folder_of_result / PAGE, target)
+                upload(folder_of_result / PAGE, target)
 
 
 @click.command()
@@ -177,7 +177,7 @@ def export(
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-    from ..clouds.folder import local_result, result_folder, send
+    from ..clouds.folder import local_result, result_folder, upload
 
     # The report of a result is moved into place last.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -206,7 +206,7 @@ def export(
                     full_scale = chosen.write(
                         file, cloud, sweeps, overwrite=overwrite, content=pictures
                     )
-                    written.append(click.format_filename(send(folder / chosen.row.file, target)))
+                    written.append(click.format_filename(upload(folder / chosen.row.file, target)))
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     if full_scale is not None:
@@ -234,7 +234,7 @@ def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[Exp
     """
     from ..clouds.writing import ExportSpec
 
-    formats = {name: format_named(name) for name in names}
+    formats = {name: load_format(name) for name in names}
     refused = [
         option
         for option in options

@@ -21,7 +21,7 @@ from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base import timeline
 from ..base.shard import Shard, describe_shard
-from ..clouds.folder import local_result, output_place, result_folder
+from ..clouds.folder import local_result, output_destination, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
@@ -189,7 +189,7 @@ def run_job(
     if CAMPAIGN_FILE in target.entries():
         backend = check_same(target, campaign)["backend"]
         verify(target, number)
-        out = output_place(f"{out}/job-{name}")
+        out = output_destination(f"{out}/job-{name}")
         options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
         compare = partial(_compare_with_dataset, target, number, name)
     prepared = campaign.prepare(number, dataset.columns)

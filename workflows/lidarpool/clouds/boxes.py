@@ -27,7 +27,7 @@ class Boxes:
     the scene, even if a frozen sensor still repeats its points.
     """
 
-    centers: Floats  # (a, 3): meters, world coordinates, or the sensor frame after `inward`
+    centers: Floats  # (a, 3): meters, world coordinates, or the sensor frame (`to_sensor_frame`)
     quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor to the same frame
     sizes: Floats  # (a, 3): length, width and height in meters, along the actor's axes
     points: Ints  # (a,): number of points in the sweep that belong to the actor
@@ -46,7 +46,7 @@ class Boxes:
         present = sweeps.actor_there[:, sweep] | (sweeps.actor_comes[:, sweep] & (counts > 0))
         return cls(position + middle, quaternion, upper - lower, counts, present)
 
-    def inward(self, pose: SweepPoses, index: int | slice) -> Boxes:
+    def to_sensor_frame(self, pose: SweepPoses, index: int | slice) -> Boxes:
         """Transform the boxes from world coordinates to the sensor frame at the start of a sweep.
 
         If `index` is a slice of sweeps, arrays have a leading axis for the sweep.

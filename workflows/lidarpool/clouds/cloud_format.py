@@ -147,7 +147,7 @@ class CloudFormat(ABC):
         return []
 
     @classmethod
-    def renamed(cls, sensors: Sequence[str]) -> list[str]:
+    def renaming_notes(cls, sensors: Sequence[str]) -> list[str]:
         """Return notes for the user about sensors that the format stores under different names.
 
         The name of an unnamed sensor is an empty string.
@@ -188,14 +188,14 @@ class CloudFormat(ABC):
 
         Returns
         -------
-        The jobs whose labels must be renumbered (see `renumbered`), because jobs can have different
-        classes. Maps the name of a job to the new list of classes.
+        The jobs whose labels must be renumbered (see `renumber_labels`), because jobs can have
+        different classes. Maps the name of a job to the new list of classes.
         """
         deque(manifests, maxlen=0)
         return {}
 
     @classmethod
-    def renumbered(
+    def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
         """Return the content of a label file with renumbered labels, or None for other files.

@@ -78,7 +78,7 @@ class E57(CloudFormat):
         """Write the file."""
         from pye57 import libe57
 
-        from .e57_writer import E57Writer, E57WriterWithNormals, named_by, normal_fields
+        from .e57_writer import E57Writer, E57WriterWithNormals, content_guids, normal_fields
 
         content = fingerprint(self.sweeps, len(self.cloud), np.asarray(self.cloud.bounds))
         normals = {*NORMAL} <= {column.name for column in self.cloud.table}
@@ -87,7 +87,7 @@ class E57(CloudFormat):
         )
         system = "" if self.sweeps.epsg is None else wkt(self.sweeps.epsg)
         highest = _highest_intensity(self.cloud)
-        with named_by(content), fields(), file_class(path, system, self.sweeps) as file:
+        with content_guids(content), fields(), file_class(path, system, self.sweeps) as file:
             if normals:
                 file.image_file.extensionsAdd("nor", _NORMALS_URI)
             try:
@@ -209,7 +209,7 @@ def _open_e57(source: RecordingSource) -> Recording:
         len(headers),
         read,
         point_count=sum(h.point_count for h in headers) if source.as_stored else None,
-        notes=source.named(notes),
+        notes=source.prefix_notes(notes),
         system=system,
         epsg=epsg,
         is_metric=True,

@@ -81,7 +81,7 @@ def normal_fields() -> Iterator[None]:
 
 
 @contextmanager
-def named_by(content: str) -> Iterator[None]:
+def content_guids(content: str) -> Iterator[None]:
     """Patch pye57 so that it derives GUIDs from a text, instead of generating random GUIDs."""
     numbers = count()
     uuid_module = pye57.e57.uuid

@@ -35,7 +35,7 @@ def flight_lines(survey: Survey) -> StraightLines | None:
     return lines if len(lines.starts_s) else None
 
 
-def scanned_lines(survey: Survey) -> dict[str, float] | None:
+def summarize_flight_lines(survey: Survey) -> dict[str, float] | None:
     """Summarize the flight lines on which at least one scanner fires, or return None.
 
     Returns

@@ -18,7 +18,7 @@ from lidarsim.base.storage import WRITING, Storage, is_url
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 
 
-def output_place(text: str | Path) -> Path | Storage:
+def output_destination(text: str | Path) -> Path | Storage:
     """Return the destination for a result, which is remote storage if the text is a URL."""
     return Storage.at(text) if is_url(text) else Path(text)
 
@@ -68,7 +68,7 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
         os.close(lock)
 
 
-def refuse_missing(place: Path | Storage, advice: str) -> None:
+def check_exists(place: Path | Storage, advice: str) -> None:
     """Raise LidarError with advice for the user if a local file or folder does not exist."""
     local = place if isinstance(place, Path) else Path(place.url) if place.is_local else None
     if local is not None and not local.exists():
@@ -92,7 +92,7 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
         If the folder does not exist, or if the storage cannot be read or does not contain a
         complete result.
     """
-    refuse_missing(output, "specify the output folder of a finished run")
+    check_exists(output, "specify the output folder of a finished run")
     with local_folder(output) as folder:
         if not isinstance(output, Storage):
             yield folder
@@ -111,7 +111,7 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
         yield folder
 
 
-def send(path: Path, output: Path | Storage) -> str:
+def upload(path: Path, output: Path | Storage) -> str:
     """Copy a file or folder from `result_folder` to storage, unless the output is local.
 
     An existing file or folder with the same name is replaced.

@@ -117,7 +117,7 @@ FORMATS = {
     "pcap": FormatRow(
         "packets", "lidarpool.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
     ),
-    "rrd": FormatRow("cloud.rrd", "lidarpool.clouds.rrd:Rerun", packages=("rerun",), extra="rerun"),
+    "rrd": FormatRow("cloud.rrd", "lidarpool.clouds.rrd:RRD", packages=("rerun",), extra="rerun"),
     # Readers derive the message type from the suffix "_sd" in the file name.
     "osi": FormatRow("cloud_sd.osi", "lidarpool.clouds.osi:OSI", **_OSI),
     "osi_mcap": FormatRow("cloud_osi.mcap", "lidarpool.clouds.osi:OSIInMCAP", **_OSI),
@@ -147,7 +147,7 @@ LAYOUTS = ("velodyne", "autoware", "ouster", "images", "livox", "hesai", "robose
 
 def data_set_title(data_set: str) -> str:
     """Return the proper name of a data set format, for example KITTI."""
-    return format_named(DATA_SETS[data_set]).title if data_set in DATA_SETS else data_set
+    return load_format(DATA_SETS[data_set]).title if data_set in DATA_SETS else data_set
 
 
 def _row_of_plugin(plugin: Plugin) -> FormatRow:
@@ -175,7 +175,7 @@ _FILES = [row.file for row in FORMATS.values()]
 _TABLE = PluginTable(GROUP, "cloud format", FORMATS, _row_of_plugin)
 
 
-def row_of(name: str) -> FormatRow:
+def format_row(name: str) -> FormatRow:
     """Return the row of a format that can be written, from the table or a plug-in.
 
     Raises
@@ -191,12 +191,12 @@ def row_of(name: str) -> FormatRow:
     return row
 
 
-def format_named(name: str) -> type[CloudFormat]:
+def load_format(name: str) -> type[CloudFormat]:
     """Import the class of a format that can be written.
 
-    Raises LidarError as `row_of`.
+    Raises LidarError as `format_row`.
     """
-    return row_of(name).load()
+    return format_row(name).load()
 
 
 def _all_rows() -> Iterator[FormatRow]:
@@ -243,7 +243,7 @@ def plugin_formats(files: Collection[str]) -> list[str]:
     names: list[str] = []
     for name in plugins_of(GROUP) if files else ():
         with suppress(LidarError):
-            names += [name] if row_of(name).file in files else []
+            names += [name] if format_row(name).file in files else []
     return names
 
 

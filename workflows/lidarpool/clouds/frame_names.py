@@ -8,7 +8,7 @@ from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 WORLD = "map"
-CARRIER = "base_link"
+VEHICLE = "base_link"
 INSTRUMENTS = "imu", "gnss"
 
 
@@ -18,7 +18,7 @@ def frame_names(sensors: Sequence[str], actors: Sequence[str]) -> list[str]:
     The frames are in this order. The name of an unnamed sensor is an empty string.
     """
     named = (*(name or "lidar" for name in sensors), *actors)
-    return plain_names((WORLD, CARRIER, *named, *INSTRUMENTS))[2:]
+    return plain_names((WORLD, VEHICLE, *named, *INSTRUMENTS))[2:]
 
 
 def points_topic(name: str, frame: str) -> str:

@@ -110,7 +110,7 @@ class ImageFolder(MultiFileFormat):
         """Open the range images in a folder that has one subfolder per sensor."""
         with reading(source.name):
             sensors = _sensors(source)
-        return source.of_sensors(sensors)
+        return source.select_sensor(sensors)
 
 
 def points_of_images(images: dict[str, AnyArray]) -> PointColumns:

@@ -12,7 +12,7 @@ _MIN_EXPONENT = -149  # exponent of the smallest float32
 _EXPONENTS = 300  # number of exponents that are counted
 
 
-def full_scale_of(cloud: CloudLike) -> float | None:
+def compute_full_scale(cloud: CloudLike) -> float | None:
     """Return the full scale of the intensities in a cloud.
 
     The full scale is the smallest power of two at which at most 1 % of the points are stored as

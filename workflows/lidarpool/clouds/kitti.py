@@ -31,7 +31,7 @@ from lidarsim.sweeps.sweeps import Sweeps, plain_names
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
-from .multi_file_format import Data, MultiFileFormat, as_data
+from .multi_file_format import FileContent, MultiFileFormat, as_bytes
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
@@ -94,18 +94,18 @@ class KITTI(MultiFileFormat):
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
         self.cameras = [_camera(sweeps, sensor) for sensor in range(len(sweeps.sensors))]
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes | None]:
         """Return the files of a sweep, and its boxes if there are actors."""
         sweeps = self.sweeps
         folder = self.sequences[sweeps.sensor[number]]
         name = f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
         rows[:, :3] = sweeps.compensated(number, points)
-        rows[:, 3] = intensity_of(points)
+        rows[:, 3] = kitti_intensity(points)
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        files: dict[str, Data] = {
-            f"{folder}/velodyne/{name}.bin": as_data(rows),
-            f"{folder}/labels/{name}.label": as_data(labels),
+        files: dict[str, FileContent] = {
+            f"{folder}/velodyne/{name}.bin": as_bytes(rows),
+            f"{folder}/labels/{name}.label": as_bytes(labels),
         }
         if not sweeps.actors:
             return files, None
@@ -184,7 +184,7 @@ class KITTI(MultiFileFormat):
             return source.recording(1, lambda _: _read_sweep(path, labels))
         with reading(source.name):
             sequences = _sequences(source)
-        return source.of_sensors(sequences)
+        return source.select_sensor(sequences)
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> dict[str, bytes]:
@@ -195,7 +195,7 @@ class KITTI(MultiFileFormat):
         return {"semantic-kitti.yaml": yaml.safe_dump(content, allow_unicode=True).encode()}
 
 
-def intensity_of(points: Cloud) -> Floats32:
+def kitti_intensity(points: Cloud) -> Floats32:
     """Return the reflectivity of points scaled to 0 to 1, which KITTI stores as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
@@ -310,7 +310,7 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
         len(files),
         read,
         read_stamps=None if times_ns is None else times_ns.tolist,
-        notes=source.named(notes),
+        notes=source.prefix_notes(notes),
         sequence=name,
         calibration=calibration,
     )

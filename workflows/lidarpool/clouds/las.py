@@ -28,7 +28,7 @@ from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 from .cloud_format import CloudFormat
 from .flight_lines import FlightLines
 from .gps_time import gps_start_s
-from .intensity_full_scale import full_scale_of
+from .intensity_full_scale import compute_full_scale
 from .las_header import las_system, noise_classes, open_las
 from .recording import Recording, RecordingSource
 from .well_known_text import wkt
@@ -106,7 +106,7 @@ class LAS(CloudFormat):
         import laspy
         import lazrs
 
-        full_scale = full_scale_of(self.cloud)
+        full_scale = compute_full_scale(self.cloud)
         if full_scale is not None:
             full_scale = spec.intensity_full_scale or full_scale
         packets = _Packets.from_cloud(self.cloud)

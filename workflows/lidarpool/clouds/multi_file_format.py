@@ -18,7 +18,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 from .cloud_format import CloudFormat
-from .format_table import format_named, row_of
+from .format_table import format_row, load_format
 
 if TYPE_CHECKING:
     from .writing import ExportSpec
@@ -31,7 +31,7 @@ RANGE_PIECES = 100
 _MARK = ".writing"  # file that exists only while ranges are being written
 
 
-Data = bytes | memoryview
+FileContent = bytes | memoryview
 PieceRange = tuple[int, int]  # first piece, and the end of the range (exclusive)
 # Number of points in a range, and the details of its pieces.
 WrittenRange = tuple[int, list[Any]]
@@ -54,7 +54,7 @@ class MultiFileFormat(CloudFormat):
         """Yield the points of the pieces from `first` to `stop` (exclusive)."""
         return self.sweeps.points(self.cloud, first, stop)
 
-    def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
+    def files(self, number: int, points: Cloud) -> tuple[Mapping[str, FileContent], Any]:
         """Return the files of a piece as {name: content}, and details for `shared_files`.
 
         The type of the details depends on the format.
@@ -162,7 +162,7 @@ class RangeWriter:
         format requires is missing, or after `stop`. Raises OSError if a file cannot be written.
         """
         try:
-            output = format_named(self.format)(self.cloud, self.sweeps)
+            output = load_format(self.format)(self.cloud, self.sweeps)
         except ImportError:
             return None
         if not self.storage.sees(_MARK, self._mark):
@@ -174,7 +174,7 @@ class RangeWriter:
     @property
     def plugins(self) -> tuple[Plugin, ...]:
         """Plug-in that provides the format, which workers require, or an empty tuple."""
-        plugin = row_of(self.format).plugin
+        plugin = format_row(self.format).plugin
         return () if plugin is None else (plugin,)
 
     def start(self) -> None:
@@ -186,7 +186,7 @@ class RangeWriter:
         self.storage.remove([_MARK])
 
 
-def as_data(array: AnyArray) -> Data:
+def as_bytes(array: AnyArray) -> FileContent:
     """Return the bytes of an array without a copy."""
     return array.data.cast("B") if array.size else b""
 

@@ -31,7 +31,7 @@ from ..base.fingerprint import fingerprint
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
-from .multi_file_format import Data, MultiFileFormat, as_data
+from .multi_file_format import FileContent, MultiFileFormat, as_bytes
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 VERSION = "v1.0-lidarpool"
@@ -101,7 +101,7 @@ class NuScenes(MultiFileFormat):
         self.folders += [LABELS] if named else []
         self.label_of_class = _labels_of_classes(sweeps.classes)
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes]:
         """Return the point file and the label file of a sweep, and its boxes."""
         inside = self.sweeps.compensated(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
@@ -109,9 +109,9 @@ class NuScenes(MultiFileFormat):
         rows[:, :3] = inside
         rows[:, 3] = intensity
         rows[:, 4] = points["channel"]
-        files = {self.names[number]: as_data(rows)}
+        files = {self.names[number]: as_bytes(rows)}
         if self.labels:
-            files[self.labels[number]] = as_data(self.label_of_class[points["class"]])
+            files[self.labels[number]] = as_bytes(self.label_of_class[points["class"]])
         return files, Boxes.from_points(self.sweeps, number, points)
 
     def shared_files(self, boxes: Sequence[Boxes]) -> dict[str, bytes]:
@@ -147,7 +147,7 @@ class NuScenes(MultiFileFormat):
         return tables.rows
 
     @classmethod
-    def renamed(cls, sensors: Sequence[str]) -> list[str]:
+    def renaming_notes(cls, sensors: Sequence[str]) -> list[str]:
         """Return a note if the first sensor is renamed, because readers expect a certain name."""
         if not sensors or sensors[0] in ("", FIRST_SENSOR):
             return []
@@ -230,7 +230,7 @@ class NuScenes(MultiFileFormat):
         return classes.relabeled_jobs()
 
     @classmethod
-    def renumbered(
+    def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
         """Return the content of a nuScenes-lidarseg file with labels for the classes `after`."""
@@ -520,7 +520,7 @@ def _open_data_set(source: RecordingSource) -> Recording:
         (tables,) = versions
     with reading(source.name):
         lidars = _DataSet(source, tables.absolute()).lidars()
-    return source.of_sensors(lidars)
+    return source.select_sensor(lidars)
 
 
 class _DataSet:

@@ -247,14 +247,14 @@ class _OSIMessages:
             sensor_id=sensor,
         )
         positions = sweeps.compensated(sweep, points)
-        detections = _field(_HEADER, header.to_binary()) + encoded_detections(positions, points)
+        detections = _field(_HEADER, header.to_binary()) + encode_detections(positions, points)
         return _EncodedMessage(message, _field(_FEATURE_DATA, _field(_LIDAR_SENSOR, detections)))
 
     def _detected(self, sweep: int, boxes: Boxes) -> list[Any]:
         """Return the actors that have points in a sweep, in sensor coordinates."""
         osi = self._osi
         sweeps = self._sweeps
-        in_sensor = SweepBoxes.select(sweeps, boxes.inward(sweeps.pose, sweep))
+        in_sensor = SweepBoxes.select(sweeps, boxes.to_sensor_frame(sweeps.pose, sweep))
         detected = []
         for row in np.flatnonzero(in_sensor.points).tolist():
             number = osi.Identifier(value=int(in_sensor.objects[row]))
@@ -308,7 +308,7 @@ def _orientation(osi: Any, quaternion: Floats) -> Any:
     return osi.Orientation3d(roll=roll, pitch=pitch, yaw=yaw)
 
 
-def encoded_detections(positions: Floats, points: Cloud) -> bytes:
+def encode_detections(positions: Floats, points: Cloud) -> bytes:
     """Encode the detections of points as fields of LidarDetectionData.
 
     As defined by Spherical3d in OSI, azimuth and elevation are right-handed rotations about the z

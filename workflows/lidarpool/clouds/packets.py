@@ -100,5 +100,5 @@ def _open_capture(source: RecordingSource) -> Recording:
         convert,
         white=white,
         read_stamps=lambda: map(decoder.time_ns, sweeps()),
-        notes=source.named(decoder.notes),
+        notes=source.prefix_notes(decoder.notes),
     )

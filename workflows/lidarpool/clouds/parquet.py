@@ -191,5 +191,5 @@ def _parts(source: RecordingSource) -> Recording:
         read,
         is_cloud=True,
         point_count=dataset.count_rows(),
-        notes=source.named(notes),
+        notes=source.prefix_notes(notes),
     )

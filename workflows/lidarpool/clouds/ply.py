@@ -60,9 +60,9 @@ class PLY(CloudFormat):
     def write(self, path: Path, spec: ExportSpec) -> None:
         """Write the file."""
         cloud = self.cloud
-        position_type = real_type(cloud.bounds, self.sweeps.precision_m)
-        with GrowingPly(path, cloud.table, position_type, self.sweeps, len(cloud)) as file:
-            file.check_room(len(cloud))
+        position_type = position_dtype(cloud.bounds, self.sweeps.precision_m)
+        with PlyAppender(path, cloud.table, position_type, self.sweeps, len(cloud)) as file:
+            file.check_disk_space(len(cloud))
             for chunk in cloud.chunks():
                 file.append(len(chunk), chunk.by_name.items())
             file.finish()
@@ -87,7 +87,7 @@ class PLY(CloudFormat):
         return _open_file(source)
 
 
-class GrowingPly:
+class PlyAppender:
     """A binary PLY file to which points are appended. It is complete after `finish`.
 
     The bytes are the same as if Open3D wrote all points at once, but without holding all points in
@@ -105,7 +105,7 @@ class GrowingPly:
     table
         Columns in addition to the positions.
     position_type
-        Type of the positions, float32 or float64 (see `real_type`).
+        Type of the positions, float32 or float64 (see `position_dtype`).
     sweeps
         Sweeps to which the points belong, which determine the comments.
     expected_count
@@ -133,7 +133,7 @@ class GrowingPly:
         self._head_parts = (b"", b"")  # header before and after the line with the number of points
         self._file = path.open("x+b", buffering=0)
 
-    def __enter__(self) -> GrowingPly:
+    def __enter__(self) -> PlyAppender:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -153,7 +153,7 @@ class GrowingPly:
         """Whether the first points were written, so that `row` is the row type in the file."""
         return bool(self._start)
 
-    def check_room(self, count: int) -> None:
+    def check_disk_space(self, count: int) -> None:
         """Raise LidarError unless the disk has enough space for `count` points.
 
         The first points are temporarily stored twice.
@@ -328,7 +328,7 @@ def _comment(name: str) -> str:
     return printable(name).encode("ascii", "backslashreplace").decode()
 
 
-def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
+def position_dtype(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     """Return the smallest floating-point type that is precise enough for positions.
 
     Parameters

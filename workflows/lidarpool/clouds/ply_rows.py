@@ -45,7 +45,7 @@ class _Rows(NamedTuple):
     of_8: AnyArray
 
 
-class RowMaker:
+class PlyRowEncoder:
     """Creates rows of a PLY file in memory that is reused.
 
     Columns that have a different type in the file are converted by NumPy.
@@ -102,7 +102,7 @@ class RowMaker:
         shape = (len(self._rows), row_bytes - dtype.itemsize + 1)
         return np.ndarray(shape, dtype, self._rows.view(np.uint8), strides=(row_bytes, 1))
 
-    def make(self, columns: Mapping[str, AnyArray]) -> memoryview:
+    def encode(self, columns: Mapping[str, AnyArray]) -> memoryview:
         """Return the rows of a block as bytes, which are valid until the next call.
 
         Parameters

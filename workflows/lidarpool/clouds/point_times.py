@@ -19,8 +19,8 @@ _MAX_SWEEP_S = 2.0
 _MIN_TIMES = 8  # distinct times of a sweep; fewer are packet times, or lack precision
 
 
-class Clock(StrEnum):
-    """Clock of the point times."""
+class PointClock(StrEnum):
+    """PointClock of the point times."""
 
     RELATIVE = "relative to the timestamp of the sweep"
     ABSOLUTE = "clock of the timestamps"
@@ -42,7 +42,7 @@ class PointTimes(NamedTuple):
 
     unit_s: float  # length of the unit of the stored times in seconds
     sweep_s: float  # median duration of a sweep in seconds
-    clock: Clock = Clock.OTHER
+    clock: PointClock = PointClock.OTHER
     first_s: float = 0.0  # median time of the first point relative to the timestamp, in seconds
 
     @classmethod
@@ -68,16 +68,16 @@ class PointTimes(NamedTuple):
         known = [row for row, part in enumerate(parts) if len(part.since)]
         firsts_s = np.array([parts[row].first for row in known]) * unit_s
         lasts_s = firsts_s + [parts[row].since.max() * unit_s for row in known]
-        zeros_s = {Clock.RELATIVE: np.zeros(len(known))}
+        zeros_s = {PointClock.RELATIVE: np.zeros(len(known))}
         if stamps_s is not None:
-            zeros_s[Clock.ABSOLUTE] = np.asarray(stamps_s)[known]
+            zeros_s[PointClock.ABSOLUTE] = np.asarray(stamps_s)[known]
         for clock, zero_s in zeros_s.items():
             outside_s = np.maximum(firsts_s - zero_s, zero_s - lasts_s)
             if np.median(outside_s) <= _MAX_OUTSIDE * sweep_s:
                 return cls(unit_s, sweep_s, clock, float(np.median(firsts_s - zero_s)))
         return cls(unit_s, sweep_s)
 
-    def of_points(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
+    def relative_times(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
         """Return the times of a sweep's points relative to its timestamp in seconds. Shape (n,).
 
         Returns None if times are missing, or if they are too far from each other or from the
@@ -90,8 +90,8 @@ class PointTimes(NamedTuple):
         if not len(since_s):
             return since_s
         first_s = 0.0
-        if self.clock is not Clock.OTHER:
-            zero_s = stamp_s if self.clock is Clock.ABSOLUTE and stamp_s is not None else 0.0
+        if self.clock is not PointClock.OTHER:
+            zero_s = stamp_s if self.clock is PointClock.ABSOLUTE and stamp_s is not None else 0.0
             first_s = times.first * self.unit_s - zero_s
         if since_s.max() > _MAX_SWEEP_S or abs(first_s) > _MAX_SWEEP_S:
             return None
@@ -99,7 +99,7 @@ class PointTimes(NamedTuple):
 
     def note(self, name: str) -> str:
         """Return a note if the times come from a different clock, otherwise an empty string."""
-        if self.clock is not Clock.OTHER:
+        if self.clock is not PointClock.OTHER:
             return ""
         return (
             f"The point times in {name} use a different clock than the sweep timestamps. The first "

@@ -316,7 +316,7 @@ class Recording:
         if not len(self.rings) or self.rings.numbers is not None:
             return None
         returned = sweep.has_return
-        rows = self.rings.rows(sweep.returns())
+        rows = self.rings.ring_indices(sweep.returns())
         rings = np.full(len(sweep), -1)
         rings[returned] = np.where(rows >= 0, len(self.rings) - 1 - rows, -1)
         return rings
@@ -334,7 +334,7 @@ class Recording:
             return None
         stamps_ns = self.stamps_ns
         stamp_s = None if stamps_ns is None else 1e-9 * float(stamps_ns[sweep.number])
-        return self.point_times.of_points(sweep.columns, stamp_s)
+        return self.point_times.relative_times(sweep.columns, stamp_s)
 
 
 @dataclass(frozen=True)
@@ -359,14 +359,14 @@ class RecordingSource:
         """Return the sensor or topic that the user chose (see the function `choose`)."""
         return choose(self.name, kind, names, self.sensor)
 
-    def of_sensors(self, sensors: Mapping[str, Recording]) -> Recording:
+    def select_sensor(self, sensors: Mapping[str, Recording]) -> Recording:
         """Return the recording of the chosen sensor.
 
         A single sensor may have an empty name.
         """
         return sensors[self.choose("sensors", sensors)]
 
-    def named(self, clauses: Iterable[str]) -> tuple[str, ...]:
+    def prefix_notes(self, clauses: Iterable[str]) -> tuple[str, ...]:
         """Turn clauses into notes by prepending the name of the recording."""
         return tuple(f"{self.name} {clause}" for clause in clauses)
 
@@ -385,7 +385,7 @@ class RecordingSource:
         if self.as_stored:
             return METERS, ()
         meters, clauses = stated_meters(system, positions, self.unit)
-        return meters, self.named(clauses)
+        return meters, self.prefix_notes(clauses)
 
     def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
         """Return the EPSG code of a coordinate system, or None if its unit is not the meter."""

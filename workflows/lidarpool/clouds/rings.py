@@ -90,7 +90,7 @@ class Rings:
     def _from_columns(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
         rings = np.concatenate([np.asarray(sweep.columns["channel"]) for sweep in sweeps])
         elevation = np.concatenate([elevations(sweep.points) for sweep in sweeps])
-        numbers, medians, spread_rad = cones(rings.astype(np.int64), elevation)
+        numbers, medians, spread_rad = summarize_rings(rings.astype(np.int64), elevation)
         if len(numbers) < MIN_RINGS:
             return cls(name)
         if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
@@ -103,7 +103,7 @@ class Rings:
     def __len__(self) -> int:
         return len(self.elevation_rad)
 
-    def rows(self, sweep: Sweep) -> Ints:
+    def ring_indices(self, sweep: Sweep) -> Ints:
         """Return the index of each point's ring in `elevation_rad`, or -1 if it is unknown.
 
         Raises LidarError if the sweep lacks the ring column that other sweeps have.
@@ -156,7 +156,7 @@ def elevations(points: Floats) -> Floats:
     return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
 
 
-def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
+def summarize_rings(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
     """Summarize the elevations of rings.
 
     Parameters

@@ -19,7 +19,7 @@ from lidarsim.packets.encoders import START_NS
 from lidarview.render.coloring import TURBO
 
 from .cloud_format import CloudFormat
-from .frame_names import CARRIER, WORLD
+from .frame_names import VEHICLE, WORLD
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 from .writing import ExportSpec
 
@@ -41,7 +41,7 @@ _INTENSITY_LIMITS = (-3.0, 0.0)
 _HEIGHT_LIMITS_M = (-3.0, 7.0)
 
 
-class Rerun(CloudFormat):
+class RRD(CloudFormat):
     """A Rerun recording of a survey, for the Rerun viewer.
 
     A recording contains these entities:
@@ -183,7 +183,7 @@ class RerunLog:
             self._recording.set_time(UTC_TIME, timestamp=np.datetime64(shown.start_ns, "ns"))
         paths = {WORLD: WORLD}  # {frame: path of its entity}
         for transform in shown.transforms:
-            if transform.parent == WORLD and transform.name not in (CARRIER, shown.frame):
+            if transform.parent == WORLD and transform.name not in (VEHICLE, shown.frame):
                 continue  # actors are shown as boxes, which have their own poses
             path = paths[transform.name] = f"{paths[transform.parent]}/{transform.name}"
             in_world = transform.parent == WORLD

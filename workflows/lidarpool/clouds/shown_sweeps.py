@@ -17,7 +17,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from .boxes import Boxes
-from .frame_names import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
+from .frame_names import VEHICLE, WORLD, frame_names, points_topic, survey_start_ns
 
 MAX_TRIANGLES = 200_000  # maximum number of triangles that viewers show
 MAX_POSITIONS = 10_000  # maximum number of positions in a trajectory
@@ -182,7 +182,7 @@ class SweepSequence:
         self._actor_frames = self._frames[len(sweeps.sensors) :][: len(sweeps.actors)]
         mounts = zip(sweeps.mounts.positions, sweeps.mounts.quaternions, strict=True)
         self._mounts = [
-            Transform(CARRIER, self._frames[number], *mount) for number, mount in enumerate(mounts)
+            Transform(VEHICLE, self._frames[number], *mount) for number, mount in enumerate(mounts)
         ]
 
     def show(self, sweep: int, points: Cloud) -> ShownSweep:
@@ -195,7 +195,7 @@ class SweepSequence:
             topic=points_topic(sweeps.sensors[sensor], self._frames[sensor]),
             frame=self._frames[sensor],
             positions=sweeps.compensated(sweep, points).astype(np.float32),
-            columns=sendable(sweeps.columns_compensated(sweep, points)),
+            columns=viewer_columns(sweeps.columns_compensated(sweep, points)),
             transforms=self._transforms(sweep),
             boxes=ActorBoxes.from_points(sweeps, sweep, points) if sweeps.actors else None,
         )
@@ -205,7 +205,7 @@ class SweepSequence:
         sweeps = self.sweeps
         carrier = sweeps.carrier
         frames = [
-            Transform(WORLD, CARRIER, carrier.positions[sweep], carrier.quaternions[sweep]),
+            Transform(WORLD, VEHICLE, carrier.positions[sweep], carrier.quaternions[sweep]),
             *self._mounts,
         ]
         poses = sweeps.actor_poses
@@ -216,7 +216,7 @@ class SweepSequence:
         ]
 
 
-def sendable(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
+def viewer_columns(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """Return the numeric columns with types that viewers support.
 
     64-bit integers become float64. Waveforms are omitted.

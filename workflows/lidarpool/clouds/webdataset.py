@@ -123,7 +123,7 @@ class WebDataset(MultiFileFormat):
         """Yield the files in the sample of a sweep, including their tar headers."""
         sweeps = self.sweeps
         entry = self.entry
-        present = SweepBoxes.select(sweeps, boxes and boxes.inward(sweeps.pose, number))
+        present = SweepBoxes.select(sweeps, boxes and boxes.to_sensor_frame(sweeps.pose, number))
         columns = sweeps.columns_in_sensor(number, points)
         arrays = {
             "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
@@ -185,7 +185,7 @@ class WebDataset(MultiFileFormat):
         files = sort_by_number(path.rglob("*.tar")) if path.is_dir() else [path]
         with reading(source.name):
             sensors = _sensors(source, files)
-        return source.of_sensors(sensors)
+        return source.select_sensor(sensors)
 
 
 def _offsets(job: JobReader) -> Ints:

@@ -25,7 +25,7 @@ from lidarview.picture_file import PictureContent
 from ..columns.parts import StoredCloud
 from .cloud_format import CloudFormat
 from .folder import staging
-from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, format_named, row_of
+from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, format_row, load_format
 from .multi_file_format import MultiFileFormat, RangeWorkers
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
@@ -107,7 +107,7 @@ class ExportSpec:
         for option in _OPTIONS:  # LidarError for an unknown format
             is_set = getattr(self, option) not in (False, None)
             if is_set and not self.cloud_format.supports(option):
-                choices = [name for name in FORMATS if format_named(name).supports(option)]
+                choices = [name for name in FORMATS if load_format(name).supports(option)]
                 such = " formats that store single sweeps:" * (option == "compensated_actors")
                 raise LidarError(
                     f"The format {self.format} does not support `{option}`. It can only be set "
@@ -129,12 +129,12 @@ class ExportSpec:
     @property
     def row(self) -> FormatRow:
         """Row of the format, from the table or from a plug-in."""
-        return row_of(self.format)
+        return format_row(self.format)
 
     @property
     def cloud_format(self) -> type[CloudFormat]:
         """Class of the format."""
-        return format_named(self.format)
+        return load_format(self.format)
 
     @property
     def has_many_files(self) -> bool:
@@ -151,11 +151,11 @@ class ExportSpec:
         """Names of the columns that a cloud must have."""
         return self.cloud_format.required_columns(self)
 
-    def prepared(self, sweeps: Sweeps) -> Sweeps:
+    def configure_sweeps(self, sweeps: Sweeps) -> Sweeps:
         """Return sweeps that position their points according to the options of the format."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
-    def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
+    def unsupported_columns(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return the names of the columns that the format cannot store."""
         stored = self.cloud_format.stored
         names = (column.name for column in cloud.table)
@@ -172,13 +172,17 @@ class ExportSpec:
         `requested` are the columns that the user requested, or None if this is unknown. There is no
         note about the omission of columns that only exist because another format requires them.
         """
-        left_out = [
-            name for name in self.left_out(cloud, sweeps) if self._is_missed(name, requested)
+        unsupported_columns = [
+            name
+            for name in self.unsupported_columns(cloud, sweeps)
+            if self._is_missed(name, requested)
         ]
-        unnamed = [name for name in left_out if name in self.cloud_format.named]
+        unnamed = [name for name in unsupported_columns if name in self.cloud_format.named]
         strengths = [name for name in self.needs if name in _STRENGTHS]
-        replaced = [name for name in left_out if strengths and name in _STRENGTHS]
-        unsupported = ", ".join(name for name in left_out if name not in unnamed + replaced)
+        replaced = [name for name in unsupported_columns if strengths and name in _STRENGTHS]
+        unsupported = ", ".join(
+            name for name in unsupported_columns if name not in unnamed + replaced
+        )
         notes = [f"{self.title} cannot store {unsupported}"] if unsupported else []
         if replaced:
             notes.append(f"{self.title} stores {joined(strengths)} instead of {joined(replaced)}")
@@ -189,8 +193,8 @@ class ExportSpec:
             )
             for name in unnamed
         ]
-        notes += self.contradictions(sweeps.coordinates)
-        return notes + self.cloud_format.renamed(sweeps.sensors)
+        notes += self.frame_notes(sweeps.coordinates)
+        return notes + self.cloud_format.renaming_notes(sweeps.sensors)
 
     def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
         """Return whether the omission of a column should be noted."""
@@ -200,7 +204,7 @@ class ExportSpec:
             return name in (*_ALWAYS, "class") or name in requested
         return name != "ray" and name not in _STRENGTHS
 
-    def contradictions(self, coordinates: str) -> list[str]:
+    def frame_notes(self, coordinates: str) -> list[str]:
         """Return a note if readers of the format expect coordinates in a different frame."""
         if coordinates != "sensor":
             return []
@@ -251,12 +255,12 @@ class ExportSpec:
         cloud_columns = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in cloud_columns]:
             has_layouts = self.cloud_format.supports("layout")
-            laid_out = f" with the layout {self.layout}" if has_layouts else ""
+            with_layout = f" with the layout {self.layout}" if has_layouts else ""
             entry = f"`output: {{write: [{self._entry}]}}`"
             lacks = joined(missing)
             columns = "column" if len(missing) == 1 else "columns"
             raise LidarError(
-                f"The format {self.format}{laid_out} requires the {columns} {lacks}, which the "
+                f"The format {self.format}{with_layout} requires the {columns} {lacks}, which the "
                 f"cloud does not contain. Run the survey again with {entry}, or add {lacks} to "
                 "`cloud.columns`."
             )
@@ -318,7 +322,7 @@ class ExportSpec:
             with staging(path.parent) as staging_folder:
                 # The file has its final name, because bags contain the name of their file.
                 staged = staging_folder / path.name
-                output = self.cloud_format(cloud, self.prepared(sweeps))
+                output = self.cloud_format(cloud, self.configure_sweeps(sweeps))
                 if isinstance(output, MultiFileFormat):
                     output.write(staged, self, workers)
                 else:
@@ -342,7 +346,7 @@ class ExportSpec:
         folder = Storage(storage.path(file))
         with explained(f"{folder} cannot be written"):
             try:
-                output = self.cloud_format(cloud, self.prepared(sweeps))
+                output = self.cloud_format(cloud, self.configure_sweeps(sweeps))
                 assert isinstance(output, MultiFileFormat)
                 output.write_to(folder, self, workers)
             except BaseException:
@@ -365,8 +369,8 @@ def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
 def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:
     """Raise LidarError if folders that would be replaced contain files from other programs."""
     for format_name in formats:
-        file = row_of(format_name).file
-        pattern = format_named(format_name).file_pattern
+        file = format_row(format_name).file
+        pattern = load_format(format_name).file_pattern
         if not pattern:
             continue
         own_names = re.compile(rf"{file}/(?:{pattern}|(?:.*/)?\.(?:lidarpool-|writing).*)")
@@ -476,4 +480,4 @@ def save_cloud(
             "`Result`, or a cloud that was read from a result folder."
         )
     spec.write(path, cloud, sweeps, overwrite=True)
-    return spec.left_out(cloud, sweeps)
+    return spec.unsupported_columns(cloud, sweeps)

@@ -30,7 +30,7 @@ from ..base.sealed import SealedWriter
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import CloudFormat, Entry
 from ..clouds.folder import local_folder
-from ..clouds.format_table import DATA_SETS, LAYOUTS, format_named
+from ..clouds.format_table import DATA_SETS, LAYOUTS, load_format
 from ..clouds.multi_file_format import MultiFileFormat
 from ..clouds.writing import ExportSpec
 from .job_table import TABLE_FILE, JobRow, Tally
@@ -58,7 +58,7 @@ def _name_pattern(cloud_format: type[CloudFormat]) -> str:
 # Names of files of jobs, in all formats.
 JOB_FILES = re.compile(
     r"\.jobs/[^/]+\.json|jobs/[^/]+/(sweeps|boxes)\.npz|(sweeps|boxes)/[^/]+\.npz|"
-    + "|".join(_name_pattern(format_named(name)) for name in DATA_SETS.values())
+    + "|".join(_name_pattern(load_format(name)) for name in DATA_SETS.values())
 )
 
 
@@ -176,7 +176,7 @@ class DataSet:
         storage = listing or Listing.from_storage(self.storage)
         boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {storage}"):
-            output = spec.cloud_format(cloud, spec.prepared(sweeps), entry)
+            output = spec.cloud_format(cloud, spec.configure_sweeps(sweeps), entry)
             if isinstance(output, MultiFileFormat):
                 details = _write_pieces(output, storage)
                 manifest = output.summary(details)
@@ -264,7 +264,7 @@ class DataSet:
         self.storage.remove([manifest_file(job)])
         storage = Listing.from_storage(self.storage)
         for name in manifest["files"]:
-            labels = self.spec.cloud_format.renumbered(
+            labels = self.spec.cloud_format.renumber_labels(
                 name, self.storage.read, manifest["lidarseg"], classes
             )
             if labels is not None:

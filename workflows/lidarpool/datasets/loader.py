@@ -32,7 +32,7 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from ..base.sealed import unseal_json
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import Entry
-from ..clouds.folder import refuse_missing
+from ..clouds.folder import check_exists
 from ..clouds.format_table import DATA_SETS
 from ..clouds.job_reader import JobReader
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
@@ -214,7 +214,7 @@ class _OpenJob:
                     arrays["points"],
                     present=arrays["there"],
                 )
-                self.boxes = boxes.inward(self.sweeps.pose, slice(None))
+                self.boxes = boxes.to_sensor_frame(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
         self.reader = JobReader(storage, self.sweeps, entry, dataset.layout, classes)
 
@@ -304,7 +304,7 @@ def read_index(storage: Storage) -> dict[str, Any]:
 
     Raises LidarError if the set is unfinished.
     """
-    refuse_missing(storage, "specify the output folder of a campaign")
+    check_exists(storage, "specify the output folder of a campaign")
     try:
         head = unseal_json(storage.read(INDEX_FILE))
         if head["version"] != VERSION:

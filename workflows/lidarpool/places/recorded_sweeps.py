@@ -22,7 +22,7 @@ from lidarsim.columns.sweep import Sweep
 
 from ..clouds.point_times import PointTimes
 from ..clouds.recording import Recording
-from ..clouds.rings import MIN_RINGS, Rings, cones, elevations
+from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
 from ..recordings.opening import open_recording
 from .labels import labels_of
 
@@ -168,7 +168,7 @@ class RecordedSweeps:
 
     def _read(self, number: int) -> Sweep:
         returns = self._returns(number)
-        row = self.rings.rows(returns)
+        row = self.rings.ring_indices(returns)
         intensity = returns.intensity
         sweep = Sweep(returns.points).with_columns(
             row=row.clip(min=0),
@@ -192,7 +192,7 @@ class RecordedSweeps:
         stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
         if len(returns) and not returns.columns:
             return None  # `of_points` cannot count the points
-        return self.point_times.of_points(returns.columns, stamp_s)
+        return self.point_times.relative_times(returns.columns, stamp_s)
 
     def rotation(self, period_s: float, first_s: float) -> Rotation | None:
         """Determine the rotation from the times and azimuths of points, or return None.
@@ -225,11 +225,11 @@ class RecordedSweeps:
         return Rotation(is_clockwise, float(np.degrees(mean) % 360))
 
     def cone_spread_rad(self, number: int) -> float:
-        """Return the deviation of a sweep's rings from cones (`cones`), or inf if it is empty."""
+        """Return how far the rings of a sweep deviate from cones, or inf if it has no points."""
         sweep = self.read(number)
         if not len(sweep):
             return float("inf")
-        return cones(sweep.columns["row"], elevations(sweep.points))[2]
+        return summarize_rings(sweep.columns["row"], elevations(sweep.points))[2]
 
 
 def ring_starts(sweep: Sweep, ring_count: int) -> Floats:

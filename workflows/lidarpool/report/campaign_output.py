@@ -20,8 +20,8 @@ from ..base.job_errors import summarize_errors
 from ..base.sealed import seal_json, unseal_json
 from ..base.shard import ALL, Shard, describe_shard
 from ..base.software import describe_difference, software
-from ..clouds.folder import LAST_FILE, refuse_missing, result_folder
-from ..clouds.format_table import DATA_SETS, format_named
+from ..clouds.folder import LAST_FILE, check_exists, result_folder
+from ..clouds.format_table import DATA_SETS, load_format
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
@@ -303,7 +303,7 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
     DamagedRecordError if the file is damaged or edited; LidarError if there is none.
     """
-    refuse_missing(storage, "specify the output folder of a campaign")
+    check_exists(storage, "specify the output folder of a campaign")
     try:
         record = unseal_json(storage.read(CAMPAIGN_FILE))
         for name, kind in _RECORDED.items():
@@ -381,9 +381,11 @@ def write_shared(
 
 def _renamed_sensors(dataset: DataSet) -> list[str]:
     """Return notes on the sensors of finished jobs that have other names in the data set."""
-    cloud_format = format_named(DATA_SETS[dataset.format])
+    cloud_format = load_format(DATA_SETS[dataset.format])
     sensors_of_jobs = read_index(dataset.storage)["jobs"].values()
-    notes = (note for sensors in sensors_of_jobs for note in cloud_format.renamed([*sensors]))
+    notes = (
+        note for sensors in sensors_of_jobs for note in cloud_format.renaming_notes([*sensors])
+    )
     return list(dict.fromkeys(notes))
 
 

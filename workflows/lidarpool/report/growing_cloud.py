@@ -24,8 +24,8 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.processors import processor_count
-from ..clouds.ply import GrowingPly, real_type
-from ..clouds.ply_rows import RowMaker
+from ..clouds.ply import PlyAppender, position_dtype
+from ..clouds.ply_rows import PlyRowEncoder
 from ..columns.part_blocks import BlockMemory, read_blocks
 from ..columns.parts import StoredCloud
 from ..run.pipeline.stage_messages import Receipt
@@ -78,12 +78,12 @@ class _PartWriter:
         Counts of the points.
     """
 
-    def __init__(self, file: GrowingPly, points: StoredCloud, counts: CloudCounts) -> None:
+    def __init__(self, file: PlyAppender, points: StoredCloud, counts: CloudCounts) -> None:
         self.counts = counts
         self._file = file
         self._points = points
         self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)
-        self._row_maker: RowMaker | None = None  # once the file has its layout
+        self._row_encoder: PlyRowEncoder | None = None  # once the file has its layout
 
     def write(self, part: _RowsOfPart) -> None:
         """Write the points of a part block by block; the first part of a file gives it its layout.
@@ -114,15 +114,15 @@ class _PartWriter:
 
     def _rows_of(self, columns: Mapping[str, AnyArray]) -> memoryview:
         """Return the rows of a block."""
-        if self._row_maker is None:
-            self._row_maker = RowMaker(
+        if self._row_encoder is None:
+            self._row_encoder = PlyRowEncoder(
                 self._file.row,
                 self._points.table,
                 self._memory,
                 self._points.precision_m,
                 self._points.origin,
             )
-        return self._row_maker.make(columns)
+        return self._row_encoder.encode(columns)
 
 
 class CloudWriter:
@@ -140,9 +140,9 @@ class CloudWriter:
     sweeps, scene
         Sweeps and scene of the survey.
     position_type
-        Type of positions in the file (`real_type`).
+        Type of positions in the file (`position_dtype`).
     expected_count
-        Expected number of points (`GrowingPly`).
+        Expected number of points (`PlyAppender`).
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class CloudWriter:
         position_type: np.dtype[np.floating],
         expected_count: int,
     ) -> None:
-        self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
+        self.file = PlyAppender(path, points.table, position_type, sweeps, expected_count)
         self._flushed_bytes = 0  # size of the file at the last flush
         self.threads = min(processor_count(), _MAX_THREADS)
         self._idle = SimpleQueue[_PartWriter]()
@@ -271,10 +271,10 @@ def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -
     OSError
         If the file cannot be written.
     """
-    position_type = real_type(points.bounds, points.precision_m)
+    position_type = position_dtype(points.bounds, points.precision_m)
     count = len(points)
     with CloudWriter(path, points, sweeps, scene, position_type, count) as writer:
-        writer.file.check_room(count)
+        writer.file.check_disk_space(count)
         for name, rows in zip(points.names, points.rows, strict=True):
             if rows:
                 assert points.cells is not None, "of points"
@@ -400,7 +400,7 @@ class GrowingCloud:
             earlier = self._points.cells
             cells = np.stack([np.minimum(cells[0], earlier[0]), np.maximum(cells[1], earlier[1])])
         self._points = replace(self._points, cells=cells)
-        position_type = real_type(self._points.bounds, self._points.precision_m)
+        position_type = position_dtype(self._points.bounds, self._points.precision_m)
         self._appended.append(part)
         parts = [part]
         if self._writer is None or self._writer.file.position_type != position_type:

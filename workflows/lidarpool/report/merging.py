@@ -24,7 +24,7 @@ from ..base.fingerprint import fingerprint
 from ..base.open3d_module import load_open3d
 from ..base.shard import ALL, Shard
 from ..base.software import software
-from ..clouds.folder import LAST_FILE, output_place, refuse_missing, result_folder
+from ..clouds.folder import LAST_FILE, check_exists, output_destination, result_folder
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_seconds import known_seconds, read_seconds
@@ -141,7 +141,7 @@ def merge(
         If shards are missing, damaged, passed twice or unfinished, or come from different runs or
         software versions. The message names the shards.
     """
-    target = output_place(str(out))
+    target = output_destination(str(out))
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
     _check_apart(Storage.at(target), shard_storages)
@@ -199,7 +199,7 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
     Raises LidarError if damaged or unfinished.
     """
-    refuse_missing(storage, "specify the output folder of `lidarpool run --shard`")
+    check_exists(storage, "specify the output folder of `lidarpool run --shard`")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
         run = storage.below(RUN_FOLDER)

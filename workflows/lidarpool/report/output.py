@@ -26,7 +26,7 @@ from ..base import timeline
 from ..base.field_words import describe_changes
 from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
-from ..clouds.format_table import FORMATS, plugin_formats, row_of
+from ..clouds.format_table import FORMATS, format_row, plugin_formats
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
@@ -391,7 +391,7 @@ def _formats(names: Collection[str]) -> list[str]:
 def _known_further(names: Collection[str]) -> list[str]:
     """Return the names that are files or folders of formats or instruments, in order."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
-    return [row_of(name).file for name in _formats(names)] + measured
+    return [format_row(name).file for name in _formats(names)] + measured
 
 
 class _Earlier(NamedTuple):

@@ -22,7 +22,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
-from ..clouds.flight_lines import scanned_lines
+from ..clouds.flight_lines import summarize_flight_lines
 from ..plan.planning import Search
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
@@ -164,7 +164,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "poses": survey.path.stations,
         "duration_s": survey.duration_ns / 1e9,
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
-        "flight_lines": scanned_lines(survey),
+        "flight_lines": summarize_flight_lines(survey),
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),

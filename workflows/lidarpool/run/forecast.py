@@ -41,7 +41,7 @@ from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..clouds.flight_lines import firing_span_s, flight_lines, scanned_lines
+from ..clouds.flight_lines import firing_span_s, flight_lines, summarize_flight_lines
 from ..clouds.navigation_files import instrument_bytes
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from ..scenario.job import Job
@@ -342,7 +342,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     return {
         "seconds": seconds,
         "meters": float(traveled_m[-1]),
-        "lines": scanned_lines(survey),
+        "lines": summarize_flight_lines(survey),
         "sensors": sensors,
     }
 

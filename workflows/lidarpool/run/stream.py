@@ -33,7 +33,7 @@ from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
 from ..clouds.boxes import Boxes
-from ..clouds.kitti import intensity_of
+from ..clouds.kitti import kitti_intensity
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import sweep_of_job
 from ..scenario.campaign import CampaignSpec
@@ -164,9 +164,9 @@ class _StreamedSweeps:
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
         if self.keep.format == "kitti":  # the intensity of files of this format
-            columns["intensity"] = intensity_of(cloud)
+            columns["intensity"] = kitti_intensity(cloud)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
-        boxes = boxes and boxes.inward(sweeps.pose, number)
+        boxes = boxes and boxes.to_sensor_frame(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
         return sweep_of_job(row, sweeps, number, (positions, columns), boxes)
 

@@ -202,8 +202,8 @@ def _color_note(prepared: Prepared) -> str:
 def _without_effect(scenario: Scenario) -> Iterator[str]:
     """Yield notes on settings without effect, and on contradictions between settings."""
     for entry in scenario.output.write:
-        yield from entry.contradictions(scenario.cloud.coordinates)
-        yield from entry.cloud_format.renamed([*scenario.sensors])
+        yield from entry.frame_notes(scenario.cloud.coordinates)
+        yield from entry.cloud_format.renaming_notes([*scenario.sensors])
     written = {entry.format for entry in scenario.output.write}
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (

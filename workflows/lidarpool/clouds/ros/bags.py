@@ -42,7 +42,7 @@ from ..frame_names import survey_start_ns
 from ..job_reader import JobReader
 from ..recording import Recording, RecordingSource, sweep_from_columns
 from ..writing import ExportSpec
-from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
+from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _MAX_DISTANCE_NS = 2e8  # maximum time between a sweep and the first or last pose
@@ -111,12 +111,14 @@ class Rosbag2(CloudFormat):
 
         from .messages import LATCHED_TOPICS, message_store, survey_messages
 
-        laid_out = LaidOut(spec.layout, spec.compensated, spec.organized)
+        message_layout = MessageLayout(spec.layout, spec.compensated, spec.organized)
         # ROS 2 Humble cannot read later versions, because QoS profiles are lists from version 9 on.
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
             bag.set_custom_data("lidarpool", self.sweeps.frame_text(compensated=spec.compensated))
             topics: dict[str, Any] = {}
-            for message in survey_messages(self.cloud, self.sweeps, laid_out, spec.pose_rate_hz):
+            for message in survey_messages(
+                self.cloud, self.sweeps, message_layout, spec.pose_rate_hz
+            ):
                 if message.topic not in topics:
                     latched = (_latched_profile(),) if message.topic in LATCHED_TOPICS else ()
                     topics[message.topic] = bag.add_connection(
@@ -324,7 +326,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         connection.msgcount,
         read_stamps=read_stamps,
         read_poses=read_poses,
-        notes=source.named(unstamped),
+        notes=source.prefix_notes(unstamped),
         compensated=_stated_compensation(source.path),
     )
 

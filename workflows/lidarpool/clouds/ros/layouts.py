@@ -309,7 +309,7 @@ LAYOUTS: dict[str, PointLayout] = {
 
 
 @dataclass(frozen=True)
-class LaidOut:
+class MessageLayout:
     """Layout of points in messages, and how the points are positioned and ordered."""
 
     name: str  # name of the layout in `LAYOUTS`
@@ -327,13 +327,13 @@ class LaidOut:
         return self.layout.row(extra, compensated=self.compensated)
 
 
-def point_rows(
-    laid_out: LaidOut, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
+def encode_points(
+    message_layout: MessageLayout, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
     """Convert the points of a sweep to the layout. `row` is the type of a point in it."""
-    layout = laid_out.layout
+    layout = message_layout.layout
     traits = sensor_traits(sweeps, sweep)
-    if laid_out.compensated:
+    if message_layout.compensated:
         positions = sweeps.compensated(sweep, points).astype(np.float32)
         columns = sweeps.columns_compensated(sweep, points)
     else:
@@ -342,7 +342,7 @@ def point_rows(
     values: dict[str, AnyArray] = dict(zip("xyz", positions.T, strict=True))
     values |= layout.values(Sweep(positions, columns), traits)
     values[layout.ring_field] = layout.rings(columns["channel"], traits)
-    if not laid_out.compensated:
+    if not message_layout.compensated:
         since_ns = since_stamp_ns(points, sweeps, sweep)
         values[layout.time_field] = layout.times(since_ns, message_stamp_ns(sweeps, sweep))
     if "rgb" in (row.names or ()):

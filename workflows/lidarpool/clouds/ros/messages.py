@@ -19,9 +19,9 @@ from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 from ..boxes import Boxes
-from ..frame_names import CARRIER, INSTRUMENTS, WORLD, frame_names, points_topic, survey_start_ns
+from ..frame_names import INSTRUMENTS, VEHICLE, WORLD, frame_names, points_topic, survey_start_ns
 from ..laser_scan import ScanRays
-from .layouts import LaidOut, message_stamp_ns, point_rows, sensor_traits, since_stamp_ns
+from .layouts import MessageLayout, encode_points, message_stamp_ns, sensor_traits, since_stamp_ns
 from .livox import CUSTOM_DEFINITION, CUSTOM_MSG, check_lines, custom_message
 from .organized import organized_rows
 
@@ -60,20 +60,23 @@ def message_store() -> Typestore:
 
 
 def survey_messages(
-    cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut, pose_rate_hz: float | None = None
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    message_layout: MessageLayout,
+    pose_rate_hz: float | None = None,
 ) -> Iterator[RosMessage]:
     """Yield the messages of a cloud, sorted by time."""
     columns = {column.name for column in cloud.table}
-    messages = SurveyMessages(sweeps, laid_out, columns, pose_rate_hz)
-    measured = messages.instruments()
+    messages = SurveyMessages(sweeps, message_layout, columns, pose_rate_hz)
+    measured = messages.instrument_messages()
     waiting = next(measured, None)
-    yield from messages.static()
+    yield from messages.static_messages()
     for sweep, points in enumerate(sweeps.points(cloud)):
         while waiting is not None and waiting.time_ns <= messages.sweep_start_ns(sweep):
             yield waiting
             waiting = next(measured, None)
-        yield messages.clock(messages.sweep_start_ns(sweep))
-        yield from messages.of_sweep(sweep, points)
+        yield messages.clock_message(messages.sweep_start_ns(sweep))
+        yield from messages.sweep_messages(sweep, points)
     while waiting is not None:
         yield waiting
         waiting = next(measured, None)
@@ -86,7 +89,7 @@ class SurveyMessages:
     ----------
     sweeps
         Sweeps of the survey.
-    laid_out
+    message_layout
         Layout of points in messages.
     columns
         Names of the columns in the cloud.
@@ -98,15 +101,15 @@ class SurveyMessages:
     def __init__(
         self,
         sweeps: Sweeps,
-        laid_out: LaidOut,
+        message_layout: MessageLayout,
         columns: Collection[str],
         pose_rate_hz: float | None = None,
     ) -> None:
         self._make = _Messages(message_store().types)
         self._sweeps = sweeps
-        self._laid_out = laid_out
+        self._message_layout = message_layout
         self._columns = {name for name in columns if name != "class" or sweeps.classes}
-        self._row = laid_out.row(self._columns)
+        self._row = message_layout.row(self._columns)
         (field,) = self._make.types_of("sensor_msgs", "PointField")
         self._fields = [
             field(name, offset, POINT_FIELDS[kind.str[1:]], 1)
@@ -116,7 +119,7 @@ class SurveyMessages:
         self._actors = self._frames[len(sweeps.sensors) : -len(INSTRUMENTS)]
         poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         # Frames of the vehicle and the actors, with their poses.
-        self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
+        self._moving = [(VEHICLE, sweeps.carrier), *zip(self._actors, poses, strict=True)]
         self._start_ns = survey_start_ns(sweeps)
         self._pose_rate_hz = pose_rate_hz
         sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=1)[sweeps.sensor]
@@ -127,12 +130,12 @@ class SurveyMessages:
         """Return the start of a sweep in nanoseconds since 1970."""
         return self._start_ns + round(self._sweeps.begins_ns[sweep])
 
-    def static(self) -> Iterator[RosMessage]:
+    def static_messages(self) -> Iterator[RosMessage]:
         """Yield the messages that are only sent once, at the start of the survey."""
         sweeps = self._sweeps
         start_ns = self._start_ns
         on_carrier = [
-            (CARRIER, frame, sweeps.mounts, number)
+            (VEHICLE, frame, sweeps.mounts, number)
             for number, frame in enumerate(self._frames[: len(sweeps.sensors)])
         ]
         on_carrier += _instruments(sweeps)
@@ -146,16 +149,16 @@ class SurveyMessages:
             materials = [named(number, name) for number, name in enumerate(sweeps.materials)]
             yield _sent("/material_info", info(header, materials, 0.0), start_ns)
 
-    def instruments(self) -> Iterator[RosMessage]:
+    def instrument_messages(self) -> Iterator[RosMessage]:
         """Yield the messages of the IMU and the GNSS receiver, sorted by time."""
         return self._make.instrument_messages(self._sweeps, self._start_ns)
 
-    def clock(self, time_ns: int) -> RosMessage:
+    def clock_message(self, time_ns: int) -> RosMessage:
         """Return the clock message for a time in nanoseconds since 1970."""
         (clock,) = self._make.types_of("rosgraph_msgs", "Clock")
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
-    def of_sweep(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
+    def sweep_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
         """Yield the messages that are sent at the start of a sweep, and the frames during it."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
@@ -173,9 +176,9 @@ class SurveyMessages:
         sweeps = self._sweeps
         stamp_ns = message_stamp_ns(sweeps, sweep)
         header = self._make.header(self._frames[sweeps.sensor[sweep]], stamp_ns)
-        rows = point_rows(self._laid_out, self._row, points, sweeps, sweep)
-        if self._laid_out.organized:
-            clouds = organized_rows(self._laid_out, rows, points, sweeps, sweep)
+        rows = encode_points(self._message_layout, self._row, points, sweeps, sweep)
+        if self._message_layout.organized:
+            clouds = organized_rows(self._message_layout, rows, points, sweeps, sweep)
         else:
             clouds = [rows[np.newaxis]]
         contents = {
@@ -184,15 +187,15 @@ class SurveyMessages:
         }
         if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
             contents["scan"] = self._make.laser_scan(rays, header)
-        if self._laid_out.name == "images":
+        if self._message_layout.name == "images":
             ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
             ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
             for plane, image in enumerate(ranges):
                 contents[_numbered("range_image", plane)] = self._make.image(image[::-1], header)
-        if self._laid_out.name == "livox":
+        if self._message_layout.name == "livox":
             check_lines(sensor_traits(sweeps, sweep).channels)
             since_ns = np.zeros(len(points))
-            if not self._laid_out.compensated:
+            if not self._message_layout.compensated:
                 since_ns = since_stamp_ns(points, sweeps, sweep)
             data = custom_message(message_store(), header, stamp_ns, since_ns, rows)
             contents["livox"] = Serialized(CUSTOM_MSG, data)
@@ -214,7 +217,7 @@ class SurveyMessages:
         if not len(since_ns):
             return
         shares = since_ns / sweeps.span_ns(sweep)
-        frames = [(CARRIER, sweeps.carrier_within(sweep, shares))]
+        frames = [(VEHICLE, sweeps.carrier_within(sweep, shares))]
         stays = sweeps.actor_there[:, sweep] & ~sweeps.actor_leaves[:, sweep]
         frames += [
             (self._actors[actor], sweeps.actor_within(actor, sweep, shares))
@@ -254,7 +257,7 @@ class SurveyMessages:
             point_step=self._row.itemsize,
             row_step=width * self._row.itemsize,
             data=rows.reshape(-1).view(np.uint8),
-            is_dense=not self._laid_out.organized,
+            is_dense=not self._message_layout.organized,
         )
 
 
@@ -275,7 +278,7 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
     )
     return [
         (
-            CARRIER,
+            VEHICLE,
             frame,
             SweepPoses(np.array([instrument.position]), np.array([instrument.quaternion])),
             0,

@@ -9,11 +9,11 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .layouts import LaidOut, message_stamp_ns, sensor_traits
+from .layouts import MessageLayout, message_stamp_ns, sensor_traits
 
 
 def organized_rows(
-    laid_out: LaidOut, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
+    message_layout: MessageLayout, rows: Records, points: Cloud, sweeps: Sweeps, sweep: int
 ) -> list[Records]:
     """Arrange the points of a sweep as organized clouds, in the order of the layout's driver.
 
@@ -26,7 +26,7 @@ def organized_rows(
 
     Parameters
     ----------
-    laid_out
+    message_layout
         Layout of the points.
     rows
         Points of the sweep in this layout, with shape (n,).
@@ -47,10 +47,10 @@ def organized_rows(
     image = Image.from_points(sweeps, sweep, points)
     # Points are copied as bytes, because NumPy does not copy the padding between fields.
     point = np.dtype((np.void, rows.dtype.itemsize))
-    without_return = _rays(laid_out, image, rows.dtype, sweeps, sweep).view(point)
+    without_return = _rays(message_layout, image, rows.dtype, sweeps, sweep).view(point)
     planes = np.repeat(without_return[np.newaxis], image.planes, axis=0)
     planes[image.plane, image.row, image.column] = rows.view(point)
-    if laid_out.layout.lines == "firings":
+    if message_layout.layout.lines == "firings":
         lines = planes.transpose(2, 0, 1)
         organized = [np.ascontiguousarray(lines).reshape(-1, image.sensor.channels)]
     else:
@@ -61,17 +61,17 @@ def organized_rows(
 
 
 def _rays(
-    laid_out: LaidOut, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
+    message_layout: MessageLayout, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
 ) -> Records:
     """Return points for all rays as if none had a return, with shape (channels, firings)."""
-    layout = laid_out.layout
+    layout = message_layout.layout
     channels = np.arange(image.sensor.channels)
     rays = np.zeros((len(channels), len(image.firings)), row)
     for axis in "xyz":
         rays[axis] = np.nan
     rays["intensity"] = layout.no_intensity
     rays[layout.ring_field] = layout.rings(channels, sensor_traits(sweeps, sweep))[:, np.newaxis]
-    if not laid_out.compensated:
+    if not message_layout.compensated:
         fired_ns = image.begin_ns + image.sensor.times_ns(image.firings).T
         since_ns = fired_ns - sweeps.begins_ns[sweep]
         rays[layout.time_field] = layout.times(since_ns, message_stamp_ns(sweeps, sweep))

@@ -30,7 +30,7 @@ from ...clouds.shown_sweeps import (
     SweepSequence,
     Transform,
     path_in_world,
-    sendable,
+    viewer_columns,
 )
 from ...columns.parts import read_part
 from ...datasets.job_table import JobRow
@@ -264,6 +264,6 @@ class SurveyFeed:
             topic="/cloud",
             frame="cloud",
             positions=(cloud.positions - origin).astype(np.float32),
-            columns=sendable(cloud.columns),
+            columns=viewer_columns(cloud.columns),
             transforms=[Transform(WORLD, "cloud", origin, np.array([0.0, 0.0, 0.0, 1.0]))],
         )

@@ -14,7 +14,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ...clouds.frame_names import survey_start_ns
-from ...clouds.ros.layouts import LaidOut
+from ...clouds.ros.layouts import MessageLayout
 from ...clouds.ros.messages import RosMessage, SurveyMessages
 from ...clouds.writing import ExportSpec
 from .bridge import Bridge, BridgeOptions
@@ -42,7 +42,7 @@ class Ros2Bridge(Bridge):
     ) -> None:
         super().__init__(sweeps, schedule, options, note)
         self._format = self.format_of(options.settings)
-        self._laid_out = LaidOut(self._format.layout, organized=self._format.organized)
+        self._message_layout = MessageLayout(self._format.layout, organized=self._format.organized)
         self._publisher = RosPublisher(Network.to(options.to))
         self._messages: SurveyMessages | None = None  # messages of the sweeps of a lap
         self._shift_ns = 0  # shift of the lap
@@ -77,9 +77,9 @@ class Ros2Bridge(Bridge):
         if self._messages is None:
             self._columns = {column.name for column in points.table}
             self._messages = self._of_lap(0)
-            for message in self._messages.static():
+            for message in self._messages.static_messages():
                 self._publisher.publish(message)
-        for _ in self._messages.of_sweep(sweep, points):  # compiles what it needs
+        for _ in self._messages.sweep_messages(sweep, points):  # compiles what it needs
             pass
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
@@ -89,7 +89,7 @@ class Ros2Bridge(Bridge):
             self._shift_ns = shift_ns
         if not self._between.is_alive() and not self._stopped.is_set():
             self._between.start()
-        for message in self._messages.of_sweep(sweep, points):
+        for message in self._messages.sweep_messages(sweep, points):
             self._publisher.publish(message)
 
     @property
@@ -117,7 +117,7 @@ class Ros2Bridge(Bridge):
         start_ns = survey_start_ns(self.sweeps) + shift_ns
         return SurveyMessages(
             replace(self.sweeps, start_ns=start_ns),
-            self._laid_out,
+            self._message_layout,
             self._columns,
             self._format.pose_rate_hz,
         )
@@ -136,14 +136,14 @@ class Ros2Bridge(Bridge):
         messages = self._of_lap(0)
         first_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns.min())
         for time_ns in count(first_ns, _CLOCK_NS):
-            yield messages.clock(time_ns)
+            yield messages.clock_message(time_ns)
 
     def _instruments(self) -> Iterator[RosMessage]:
         """Yield the messages of IMU and GNSS receiver, of each lap, or none without instruments."""
         period_ns = self.options.period_ns
         for lap in count() if period_ns else range(1):
             last_message = None
-            for message in self._of_lap(lap * period_ns).instruments():
+            for message in self._of_lap(lap * period_ns).instrument_messages():
                 yield message
                 last_message = message
             if last_message is None:

@@ -20,14 +20,14 @@ from lidarsim.scene.actors import Actor
 from lidarsim.simulator import Scanner
 from lidarsim.sweeps.sweeps import type_of
 
-from ...clouds.frame_names import CARRIER, WORLD, frame_names, points_topic
+from ...clouds.frame_names import VEHICLE, WORLD, frame_names, points_topic
 from ...clouds.shown_sweeps import (
     ActorBoxes,
     ShownSweep,
     Surface,
     Surroundings,
     Transform,
-    sendable,
+    viewer_columns,
 )
 from .viewer import Viewer, open_viewer
 
@@ -178,8 +178,8 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
         positions = (positions - (scene.origin + sensor.position)) @ sensor.rotation_matrix
     frame, *actor_frames = frame_names([mounted.name], [actor.name for actor in scene.actors])
     transforms = [
-        Transform(WORLD, CARRIER, *_position_and_quaternion(carrier, scene.origin)),
-        Transform(CARRIER, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
+        Transform(WORLD, VEHICLE, *_position_and_quaternion(carrier, scene.origin)),
+        Transform(VEHICLE, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
     ]
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     for name, actor_pose in zip(actor_frames, poses, strict=False):
@@ -192,7 +192,7 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
         topic=points_topic(mounted.name, frame),
         frame=frame,
         positions=positions.astype(np.float32),
-        columns=sendable(cloud.columns),
+        columns=viewer_columns(cloud.columns),
         transforms=transforms,
         boxes=_boxes(scanner, cloud, poses, time_ns) if scene.actors else None,
     )
