@@ -576,7 +576,7 @@ class _DataSet:
         }
 
     def _named_files(self, row: _Row) -> list[tuple[str, str]]:
-        """Return the point file and the label file of a sweep, if it exists.
+        """Return the point file of a sweep and, if it exists, its label file.
 
         Each file name is accompanied by a description of the table entry that contains it.
         """

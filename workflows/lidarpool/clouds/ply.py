@@ -317,7 +317,7 @@ def read_cloud(path: str | Path) -> Cloud:
     beside = path.with_name(SWEEPS_FILE)
 
     def load_sweeps() -> Sweeps:
-        """Return the sweeps of the survey, which are stored beside the cloud."""
+        """Return the sweeps of the survey, which are stored next to the cloud."""
         return Sweeps.load(beside)
 
     return Cloud(positions, columns, sweeps=load_sweeps if beside.exists() else None)
