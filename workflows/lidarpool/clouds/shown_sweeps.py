@@ -27,7 +27,7 @@ _SENT_TYPES = {"i8": np.float64, "u8": np.float64, "b1": np.uint8, "f2": np.floa
 
 
 @dataclass(frozen=True, eq=False)
-class Transform:
+class FramePose:
     """Pose of a frame in its parent."""
 
     parent: str
@@ -168,7 +168,7 @@ class ShownSweep:
     frame: str
     positions: Floats32  # (n, 3): meters
     columns: Mapping[str, AnyArray]  # {name: (n,)}: integers of at most 32 bits, or floats
-    transforms: Sequence[Transform]  # poses of the frames at the start of the sweep
+    transforms: Sequence[FramePose]  # poses of the frames at the start of the sweep
     boxes: ActorBoxes | None = None  # None if there are no actors
 
 
@@ -182,7 +182,7 @@ class SweepSequence:
         self._actor_frames = self._frames[len(sweeps.sensors) :][: len(sweeps.actors)]
         mounts = zip(sweeps.mounts.positions, sweeps.mounts.quaternions, strict=True)
         self._mounts = [
-            Transform(VEHICLE, self._frames[number], *mount) for number, mount in enumerate(mounts)
+            FramePose(VEHICLE, self._frames[number], *mount) for number, mount in enumerate(mounts)
         ]
 
     def show(self, sweep: int, points: Cloud) -> ShownSweep:
@@ -200,17 +200,17 @@ class SweepSequence:
             boxes=ActorBoxes.from_points(sweeps, sweep, points) if sweeps.actors else None,
         )
 
-    def _transforms(self, sweep: int) -> list[Transform]:
+    def _transforms(self, sweep: int) -> list[FramePose]:
         """Return the poses of the vehicle, its sensors and the actors that are in the scene."""
         sweeps = self.sweeps
         carrier = sweeps.carrier
         frames = [
-            Transform(WORLD, VEHICLE, carrier.positions[sweep], carrier.quaternions[sweep]),
+            FramePose(WORLD, VEHICLE, carrier.positions[sweep], carrier.quaternions[sweep]),
             *self._mounts,
         ]
         poses = sweeps.actor_poses
         return frames + [
-            Transform(WORLD, frame, poses.positions[actor, sweep], poses.quaternions[actor, sweep])
+            FramePose(WORLD, frame, poses.positions[actor, sweep], poses.quaternions[actor, sweep])
             for actor, frame in enumerate(self._actor_frames)
             if sweeps.actor_there[actor, sweep]
         ]

@@ -24,11 +24,11 @@ from lidarview.viewer.result_views import wait_for_interrupt
 
 from ...clouds.frame_names import WORLD
 from ...clouds.shown_sweeps import (
+    FramePose,
     ShownSweep,
     Surface,
     Surroundings,
     SweepSequence,
-    Transform,
     path_in_world,
     viewer_columns,
 )
@@ -265,5 +265,5 @@ class SurveyFeed:
             frame="cloud",
             positions=(cloud.positions - origin).astype(np.float32),
             columns=viewer_columns(cloud.columns),
-            transforms=[Transform(WORLD, "cloud", origin, np.array([0.0, 0.0, 0.0, 1.0]))],
+            transforms=[FramePose(WORLD, "cloud", origin, np.array([0.0, 0.0, 0.0, 1.0]))],
         )

@@ -15,7 +15,7 @@ from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Records
 from lidarsim.base.errors import LidarError
 
 from ...clouds.frame_names import WORLD
-from ...clouds.shown_sweeps import ActorBoxes, ShownSweep, Surface, Surroundings, Transform
+from ...clouds.shown_sweeps import ActorBoxes, FramePose, ShownSweep, Surface, Surroundings
 from .viewer import LOOPBACK, Address, Viewer
 
 PORT = 8765  # Foxglove's own default
@@ -239,7 +239,7 @@ def _point_cloud(shown: ShownSweep) -> Any:
     )
 
 
-def _transform(transform: Transform, stamp: Any) -> Any:
+def _transform(transform: FramePose, stamp: Any) -> Any:
     x, y, z, w = transform.quaternion.tolist()
     return messages.FrameTransform(
         timestamp=stamp,

@@ -23,10 +23,10 @@ from lidarsim.sweeps.sweeps import type_of
 from ...clouds.frame_names import VEHICLE, WORLD, frame_names, points_topic
 from ...clouds.shown_sweeps import (
     ActorBoxes,
+    FramePose,
     ShownSweep,
     Surface,
     Surroundings,
-    Transform,
     viewer_columns,
 )
 from .viewer import Viewer, open_viewer
@@ -178,13 +178,13 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
         positions = (positions - (scene.origin + sensor.position)) @ sensor.rotation_matrix
     frame, *actor_frames = frame_names([mounted.name], [actor.name for actor in scene.actors])
     transforms = [
-        Transform(WORLD, VEHICLE, *_position_and_quaternion(carrier, scene.origin)),
-        Transform(VEHICLE, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
+        FramePose(WORLD, VEHICLE, *_position_and_quaternion(carrier, scene.origin)),
+        FramePose(VEHICLE, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
     ]
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     for name, actor_pose in zip(actor_frames, poses, strict=False):
         actor_in_world = _position_and_quaternion(actor_pose, scene.origin)
-        transforms.append(Transform(WORLD, name, *actor_in_world))
+        transforms.append(FramePose(WORLD, name, *actor_in_world))
     now_ns = time.time_ns()
     return ShownSweep(
         start_ns=now_ns,
