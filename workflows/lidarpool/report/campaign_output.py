@@ -6,10 +6,11 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
@@ -72,16 +73,32 @@ def run_campaign(
 ) -> CampaignRun:
     """Cast the jobs of a campaign, write the data set, and return a summary."""
     output = DataSetOutput(target, campaign, options, screen, page)
-    with output.lock():
-        if (finished := output.check_existing()) is not None:
-            return finished
+    output.dataset.check_installed()
+    with result_folder(target):
+        earlier = output.check_existing()
+        if earlier.is_complete:
+            return output.finished(earlier)
         with (
             ClusterConnection(campaign, options, screen) as connection,
             open_store(campaign, options, screen) as store,
         ):
-            output.compare_with_store(store)
+            output.compare_with_store(earlier, store)
             committed = cast(store, connection, Listener(page), output.dataset)
             return output.publish(committed)
+
+
+class FinishedDataSet(NamedTuple):
+    """A finished data set that a run continues.
+
+    `record` is the content of CAMPAIGN_FILE; it is empty if there is no such data set, or the file
+    is damaged, as `note` reports. `wrong` are faults of jobs, {number: a clause}.
+    """
+
+    record: Mapping[str, Any] = MappingProxyType({})
+    rows: Sequence[JobRow] = ()
+    wrong: Mapping[int, str] = MappingProxyType({})
+    is_complete: bool = False
+    note: str = ""
 
 
 @dataclass(eq=False)
@@ -99,26 +116,11 @@ class DataSetOutput:
         self._begun_at = time.monotonic()
         storage = replace(Storage.at(self.target), durable=False)
         self.dataset = DataSet(storage, **asdict(self.campaign.keep))
-        # Of a finished data set: its record, rows, and faults of jobs, {number: a clause}.
-        self._record: Mapping[str, Any] | None = None
-        self._rows: list[JobRow] = []
-        self._wrong: dict[int, str] = {}
-        self._lost_record = ""  # a note, if the record was damaged
-
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Lock the target while the body runs."""
-        self.dataset.check_installed()
-        with result_folder(self.target):
-            yield
 
     # -- existing files -----------------------------------------------------------------------
 
-    def check_existing(self) -> CampaignRun | None:
-        """Refuse, remove or check a finished data set.
-
-        Returns its sums if no job is left to do.
-        """
+    def check_existing(self) -> FinishedDataSet:
+        """Refuse, remove or check a finished data set, and return it if the run continues it."""
         storage = self.dataset.storage
         options = self.options
         run_folder = storage.below(RUN_FOLDER)
@@ -135,59 +137,54 @@ class DataSetOutput:
             if starts_anew:
                 _remove_dataset(storage, run_folder)
         if not options.may_continue or CAMPAIGN_FILE not in entries or unfinished:
-            return None
+            return FinishedDataSet()
         try:
-            self._record = check_same(storage, self.campaign)
+            record = check_same(storage, self.campaign)
         except DamagedRecordError:  # the manifests name the campaign of the jobs
-            self._lost_record = f"{CAMPAIGN_FILE} was damaged and has been recreated"
-            return None
-        self._check_shards(self._record["shards"])
-        if not self._is_complete(self._record, verify=options.verify):
-            return None
-        if RUN_FOLDER in entries:  # a killed run may leave files
-            remove_run(run_folder)
-        if (files := file_hashes(self.campaign.files)) != [*map(tuple, self._record["files"])]:
-            # `_check_jobs` has found no job of an older file
-            write_record(storage, {**self._record, "files": files})
-        return self._finished()
-
-    def _check_shards(self, shards: Sequence[str]) -> None:
-        """Raise LidarError unless a finished data set has the shards of this run."""
-        if shards != [str(self.campaign.shard)]:
-            held = listed([*map(shard_in_words, shards)]) or "no shards"
+            return FinishedDataSet(note=f"{CAMPAIGN_FILE} was damaged and has been recreated")
+        shard = str(self.campaign.shard)
+        if record["shards"] != [shard]:
+            held = listed([*map(shard_in_words, record["shards"])]) or "no shards"
             raise LidarError(
-                f"{self.dataset.storage} contains {held}, but this run is "
-                f"{shard_in_words(str(self.campaign.shard))}. Specify another folder with "
-                "`--out`."
+                f"{storage} contains {held}, but this run is {shard_in_words(shard)}. Specify "
+                "another folder with `--out`."
             )
+        finished = self._check_finished(record)
+        if finished.is_complete:
+            if RUN_FOLDER in entries:  # a killed run may leave files
+                remove_run(run_folder)
+            if (files := file_hashes(self.campaign.files)) != [*map(tuple, record["files"])]:
+                # `_check_jobs` has found no job of an older file
+                write_record(storage, {**record, "files": files})
+        return finished
 
-    def _is_complete(self, record: Mapping[str, Any], *, verify: bool) -> bool:
-        """Read the rows of a finished data set, and return True if all jobs are intact."""
+    def _check_finished(self, record: Mapping[str, Any]) -> FinishedDataSet:
+        """Read the rows of a finished data set, and check its jobs."""
         storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
-            rows = (row for row, _ in self.dataset.rows())
             seconds = known_seconds(storage)
-            self._rows += sorted(
-                (replace(row, seconds=seconds.get(row.number)) for row in rows),
+            rows = sorted(
+                (replace(row, seconds=seconds.get(row.number)) for row, _ in self.dataset.rows()),
                 key=lambda row: row.number,
             )
-        has_table = _is_tabled(storage, self._rows)
-        intact_count, self._wrong = _check_jobs(self.dataset, self._rows, verify, self.campaign)
-        numbers = {row.number for row in self._rows}
+        has_table = _is_tabled(storage, rows)
+        intact_count, wrong = _check_jobs(self.dataset, rows, self.options.verify, self.campaign)
+        numbers = {row.number for row in rows}
         for number in self.campaign.shard.jobs(record["campaign"]["count"]):
             if number not in numbers:
                 name = self.campaign.name(number)
-                self._wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
+                wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
         has_all = intact_count == len(self.campaign.numbers)
-        return has_table and has_all and _is_indexed(storage, intact_count)
+        is_complete = has_table and has_all and _is_indexed(storage, intact_count)
+        return FinishedDataSet(record, rows, wrong, is_complete)
 
-    def _finished(self) -> CampaignRun:
+    def finished(self, complete: FinishedDataSet) -> CampaignRun:
         """Report that the data set is complete, and return its sums."""
         self.screen.tell(f"{self.dataset.storage} is already complete")
-        for row in self._rows:
+        for row in complete.rows:
             self.page.ended(row)
-        notes = (*self._warnings_of_empty_jobs(self._rows),)
-        sums = CampaignRun.from_rows(self._rows, self._seconds(), notes=notes)
+        notes = (*self._warnings_of_empty_jobs(complete.rows),)
+        sums = CampaignRun.from_rows(complete.rows, self._seconds(), notes=notes)
         self.page.finish(sums.seconds)
         return sums
 
@@ -208,27 +205,28 @@ class DataSetOutput:
         self.screen.warn(warning)
         return [warning]
 
-    def compare_with_store(self, store: RunStore) -> None:
+    def compare_with_store(self, earlier: FinishedDataSet, store: RunStore) -> None:
         """Compare existing jobs with the run's store, and add jobs that the store lacks."""
         options = self.options
-        storage = self.dataset.storage
-        if self._record is not None:
-            store.cast_with(self._record["backend"], self._record["casting"])
-            rows = [row for row in self._rows if row.number in self.campaign.numbers]
-            store.adopt(rows, sensors=json.dumps(self._record["sensors"]))
+        if record := earlier.record:
+            store.cast_with(record["backend"], record["casting"])
+            rows = [row for row in earlier.rows if row.number in self.campaign.numbers]
+            store.adopt(rows, sensors=json.dumps(record["sensors"]))
         elif options.may_continue:
-            store.notes += [self._lost_record] * bool(self._lost_record)
+            store.notes += [earlier.note] * bool(earlier.note)
             self._take_over(store)
         # Some jobs were perhaps taken over.
-        dataset_files(storage, begun=store.begun or bool(store.committed_in_words))
-        if self._record is None:
-            _, self._wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
+        begun = store.begun or bool(store.committed_in_words)
+        dataset_files(self.dataset.storage, begun=begun)
+        wrong = earlier.wrong
+        if not record:
+            wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)[1]
         if not store.committed_in_words:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
-        store.forget([*self._wrong, *retried])
-        if self._wrong:
-            store.notes.append(f"these jobs are run again: {listed([*self._wrong.values()])}")
+        store.forget([*wrong, *retried])
+        if wrong:
+            store.notes.append(f"these jobs are run again: {listed([*wrong.values()])}")
         for row in store.rows():
             self.page.ended(row)
 
@@ -271,11 +269,16 @@ class DataSetOutput:
             replayed=committed.replayed,
             notes=notes,
         )
-        record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
-        record |= {"fields": dict(store.fields)}
-        record |= {"backend": store.backend, "sensors": sums.sensors}
-        record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
-        record |= {"shards": [str(self.campaign.shard)]}
+        record: dict[str, Any] = {
+            "identity": dict(store.identity),
+            "casting": store.casting,
+            "fields": dict(store.fields),
+            "backend": store.backend,
+            "sensors": sums.sensors,
+            "files": file_hashes(self.campaign.files),
+            "campaign": self.campaign.described,
+            "shards": [str(self.campaign.shard)],
+        }
         write_record(self.dataset.storage, record)  # before the files that it assigns to a campaign
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         sums, _ = write_shared(self.dataset, record, sums, store.rows)
@@ -399,17 +402,13 @@ def _check_jobs(
     """
     intact_count = 0
     wrong = dict[int, str]()
-    jobs_of_file: dict[
-        tuple[str, str], list[str]
-    ] = {}  # {name and hash of a file: jobs made of it}
+    # {name and hash of a file: jobs made of it}
+    jobs_of_file: dict[tuple[str, str], list[str]] = {}
     with explained(f"{dataset.storage} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
-                share = (
-                    ""
-                    if campaign.shard == ALL
-                    else f" in total and this run is shard {campaign.shard}"
-                )
+                share = f" in total and this run is shard {campaign.shard}"
+                share *= campaign.shard != ALL
                 raise LidarError(
                     f"{dataset.storage} contains job {row.name}, which is not part of this "
                     f"run, because the campaign has {plural(campaign.count, 'job')}{share}. "

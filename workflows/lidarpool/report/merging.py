@@ -501,14 +501,14 @@ def _merge_survey(
         )
     output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], built.scenario)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
-    with output.lock():
+    with output.lock() as folder:
         if not options.continues_run:
             output.check_existing(jobs)
         with open_store(jobs, options, screen) as store:
             _take_points(store, shard_folders, notes)
             load_open3d()
             result = Committed(store).result(screen)
-            return output.publish(result, store, screen)[1]
+            return output.publish(folder, result, store, screen)[1]
 
 
 def _take_points(
