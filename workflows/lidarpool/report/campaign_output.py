@@ -167,7 +167,6 @@ class DataSetOutput:
                 (replace(row, seconds=seconds.get(row.number)) for row, _ in self.dataset.rows()),
                 key=lambda row: row.number,
             )
-        has_table = _is_tabled(storage, rows)
         intact_count, wrong = _check_jobs(self.dataset, rows, self.options.verify, self.campaign)
         numbers = {row.number for row in rows}
         for number in self.campaign.shard.jobs(record["campaign"]["count"]):
@@ -175,7 +174,7 @@ class DataSetOutput:
                 name = self.campaign.name(number)
                 wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
         has_all = intact_count == len(self.campaign.numbers)
-        is_complete = has_table and has_all and _is_indexed(storage, intact_count)
+        is_complete = has_all and _has_shared_files(storage, rows, intact_count)
         return FinishedDataSet(record, rows, wrong, is_complete)
 
     def finished(self, complete: FinishedDataSet) -> CampaignRun:
@@ -327,11 +326,16 @@ def read_record(storage: Storage) -> dict[str, Any]:
     return record
 
 
-def _is_tabled(storage: Storage, rows: Sequence[JobRow]) -> bool:
-    """Return True if the table of jobs has these rows, and the checksum in `dataset.json`."""
+def _has_shared_files(storage: Storage, rows: Sequence[JobRow], job_count: int) -> bool:
+    """Return True if the job table has these rows, and the last file lists as many jobs as given.
+
+    The last file has the checksum of the table.
+    """
     with suppress(LidarError):
-        table = read_table(storage, read_index(storage)["table"])
-        return {row.number: row.sha256 for row in table} == {row.number: row.sha256 for row in rows}
+        index = read_index(storage)
+        table = {row.number: row.sha256 for row in read_table(storage, index["table"])}
+        has_table = table == {row.number: row.sha256 for row in rows}
+        return has_table and len(index["jobs"]) == job_count
     return False
 
 
@@ -374,20 +378,15 @@ def write_shared(
     write_table(storage, campaign["names"], rows)
     write_record(storage, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())
-    sums = replace(sums, notes=(*sums.notes, *_renamed_sensors(dataset)))
+    # Notes on sensors that have other names in the data set.
+    cloud_format = format_named(DATA_SETS[dataset.format])
+    sensors_of_jobs = read_index(storage)["jobs"].values()
+    renamed = (note for sensors in sensors_of_jobs for note in cloud_format.renamed([*sensors]))
     saved = sweeps(storage.url)
     picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
-    sums = replace(sums, classes=saved.classes)
+    sums = replace(sums, notes=(*sums.notes, *dict.fromkeys(renamed)), classes=saved.classes)
     versions = record["casting"] or software()
     return sums, write_card(storage, campaign, sums, rows(), versions, picture)
-
-
-def _renamed_sensors(dataset: DataSet) -> list[str]:
-    """Return notes on the sensors of finished jobs that have other names in the data set."""
-    cloud_format = format_named(DATA_SETS[dataset.format])
-    sensors_of_jobs = read_index(dataset.storage)["jobs"].values()
-    notes = (note for sensors in sensors_of_jobs for note in cloud_format.renamed([*sensors]))
-    return list(dict.fromkeys(notes))
 
 
 def _check_jobs(
@@ -430,13 +429,6 @@ def _check_jobs(
                 "with `--out`."
             )
     return intact_count, wrong
-
-
-def _is_indexed(storage: Storage, jobs: int) -> bool:
-    """Return True if the last file of a data set is intact and lists a number of jobs."""
-    with suppress(LidarError):
-        return len(read_index(storage)["jobs"]) == jobs
-    return False
 
 
 def verify(storage: Storage, number: int | None = None) -> str:

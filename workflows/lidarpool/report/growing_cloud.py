@@ -5,15 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class CloudWriter:
     """Writes the points of parts to a PLY file, and counts the points in the same pass.
 
     Parts are appended in scan order, so that the offset of a part is known. Several threads write
-    them, a part each. An error of a thread is raised by the next call.
+    them, a part each. An error of a thread is raised by a later call.
 
     Parameters
     ----------
@@ -123,11 +123,12 @@ class CloudWriter:
         self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
         self._flushed_bytes = 0  # size of the file at the last flush
         self.threads = min(processors(), _MAX_THREADS)
+        self._part_writers = [_PartWriter(self.file, points, scene) for _ in range(self.threads)]
         self._idle = SimpleQueue[_PartWriter]()
-        for _ in range(self.threads):
-            self._idle.put(_PartWriter(self.file, points, scene))
+        for part_writer in self._part_writers:
+            self._idle.put(part_writer)
         self._executor = ThreadPoolExecutor(self.threads, "write cloud")
-        self._errors: list[BaseException] = []
+        self._being_written = deque[Future[None]]()  # one for each part, at most one per thread
 
     def __enter__(self) -> CloudWriter:
         return self
@@ -154,52 +155,43 @@ class CloudWriter:
         OSError
             If the disk is full, or the file cannot be written for another reason.
         """
-        part_writer = self._idle.get()  # bounds the parts in memory
-        if self.file.has_layout and not self._errors:
-            offset = self.file.extend(row_count)
-            if flushes := self.file.size - self._flushed_bytes > _FLUSH_BYTES:
-                self._flushed_bytes = self.file.size
-            self._executor.submit(
-                self._write, part_writer, name, row_count, cell_box, offset, flushes=flushes
-            )
-        else:
-            self._write(part_writer, name, row_count, cell_box)
-        self._raise_error()
+        if not self.file.has_layout:
+            self._write(name, row_count, cell_box)
+            return
+        if len(self._being_written) == self.threads:  # bounds the parts in memory
+            self._being_written.popleft().result()
+        offset = self.file.extend(row_count)
+        is_flushed = self.file.size - self._flushed_bytes > _FLUSH_BYTES
+        if is_flushed:
+            self._flushed_bytes = self.file.size
+        self._being_written.append(
+            self._executor.submit(self._write, name, row_count, cell_box, offset, is_flushed)
+        )
 
-    def _write(self, part_writer: _PartWriter, *part: Any, flushes: bool = False) -> None:
-        """Write a part, unless there was an error, and note an error."""
+    def _write(
+        self, name: str, row_count: int, cell_box: Ints, offset: int = 0, is_flushed: bool = False
+    ) -> None:
+        part_writer = self._idle.get()
         try:
-            if not self._errors:
-                part_writer.write(*part)
-                if flushes:
-                    self.file.flush()
-        except BaseException as error:  # raised by the thread that appends parts
-            self._errors.append(error)
+            part_writer.write(name, row_count, cell_box, offset)
+            if is_flushed:
+                self.file.flush()
         finally:
             self._idle.put(part_writer)
 
-    def _raise_error(self) -> None:
-        if self._errors:
-            raise self._errors[0]
-
-    def wait(self) -> list[_PartWriter]:
-        """Wait until no thread writes, and return the writers of all threads.
-
-        Raises the errors of `append`.
-        """
-        part_writers = [self._idle.get() for _ in range(self.threads)]
-        for part_writer in part_writers:
-            self._idle.put(part_writer)
-        self._raise_error()
-        return part_writers
+    def wait(self) -> None:
+        """Wait until no thread writes. Raises the errors of `append`."""
+        while self._being_written:
+            self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
         """Complete the file, and return the counts of its points.
 
         Raises the errors of `append`.
         """
-        counts, *others = (part_writer.counts for part_writer in self.wait())
+        self.wait()
         self.file.finish()
+        counts, *others = (part_writer.counts for part_writer in self._part_writers)
         for other in others:
             counts.merge(other)
         if counts.point_count != self.file.count:

@@ -170,7 +170,12 @@ class Cluster:
             self._casting = workers.casting
             self.backend = workers.backend
             self.software = workers.software
-            self._check_jobs(first, store)
+            only_job = store.only_job
+            if only_job is not None:  # jobs of campaigns are written in formats of the table
+                check_formats(client, self._pool, first.outputs)
+            store.cast_with(self.backend, self.software)
+            if only_job is not None:  # jobs of a campaign are checked when they begin
+                self.check(only_job.job)
         except LidarError:
             self._release_slots()
             raise
@@ -196,14 +201,6 @@ class Cluster:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
         for name, slots in required_slots.items():
             self.partitions[name].want(max(slots, scan_count) if name == GPU else slots)
-
-    def _check_jobs(self, first: Job, store: RunStore) -> None:
-        """Check formats and memory for a single job, and store the software of the run."""
-        if store.only_job is not None:  # jobs of campaigns are written in formats of the table
-            check_formats(self.client, self._pool, first.outputs)
-        store.cast_with(self.backend, self.software)
-        if store.only_job is not None:  # jobs of a campaign are checked when they begin
-            self.check(store.only_job.job)
 
     def _release_slots(self) -> None:
         """Let partitions shrink that have grown for the run."""
