@@ -301,10 +301,7 @@ def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
 
 
 def read_record(storage: Storage) -> dict[str, Any]:
-    """Read CAMPAIGN_FILE.
-
-    DamagedRecordError if the file is damaged or edited; LidarError if there is none.
-    """
+    """Read CAMPAIGN_FILE, or raise DamagedRecordError, or LidarError if there is none."""
     refuse_missing(storage, "specify the output folder of a campaign")
     try:
         record = unsealed(storage.read(CAMPAIGN_FILE))
@@ -340,10 +337,7 @@ def _has_shared_files(storage: Storage, rows: Sequence[JobRow], job_count: int) 
 
 
 def read_notes(storage: Storage) -> list[str]:
-    """Return the notes in the report of a data set.
-
-    A note says if the report is unusable.
-    """
+    """Return the notes in the report of a data set, or a note that the report is unusable."""
     try:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
@@ -494,10 +488,7 @@ def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
 
 
 def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
-    """Remove a data set and its run.
-
-    Raises LidarError, before any removal, for further files.
-    """
+    """Remove a data set and its run, unless LidarError names further files."""
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
     files = dataset_files(storage, begun=begun)
     with explained(f"{storage} cannot be removed"):

@@ -79,7 +79,6 @@ class CloudCounts:
             )
 
     def _add_limits(self, name: str, lower: float, upper: float) -> None:
-        """Widen the limits of a column."""
         limits = self.limits.get(name, (np.inf, -np.inf))
         # Of 0.0 and -0.0, which are equal, the one that comes first would be the limit.
         self.limits[name] = (min(limits[0], lower) + 0, max(limits[1], upper) + 0)

@@ -180,15 +180,12 @@ class CloudWriter:
             self._idle.put(part_writer)
 
     def wait(self) -> None:
-        """Wait until no thread writes. Raises the errors of `append`."""
+        """Wait until no thread writes, or raise the errors of `append`."""
         while self._being_written:
             self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
-        """Complete the file, and return the counts of its points.
-
-        Raises the errors of `append`.
-        """
+        """Complete the file and return the counts of its points, or raise errors of `append`."""
         self.wait()
         self.file.finish()
         counts, *others = (part_writer.counts for part_writer in self._part_writers)
@@ -323,10 +320,7 @@ class GrowingCloud:
                 self._discard()
 
     def _append(self, part: Receipt) -> None:
-        """Append a part with points.
-
-        If the positions need another type, the file is begun anew.
-        """
+        """Append a part with points, or begin anew if the positions need another type."""
         self._appended.append(part)
         self._check_room(part)
         cells = np.array(part.cell_box, np.int64).reshape(2, 3)
@@ -371,7 +365,6 @@ class GrowingCloud:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
     def _discard(self) -> None:
-        """Remove the file."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None

@@ -180,10 +180,7 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
 
 
 def _read_folder(storage: Storage) -> _ShardFolder:
-    """Read a finished shard, or data set of several shards.
-
-    Raises LidarError if damaged or unfinished.
-    """
+    """Read a finished shard or a data set of several shards, or raise LidarError."""
     refuse_missing(storage, "specify the output folder of `lidarpool run --shard`")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
@@ -200,10 +197,7 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
-    """Read a data set of shards.
-
-    A complete data set has the `shard_count` shards.
-    """
+    """Read a data set of shards, which are `shard_count` shards if it is complete."""
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
@@ -288,10 +282,7 @@ def _check_same_run(
 
 
 def _notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
-    """Return the notes of all folders, and a note on missing shards.
-
-    Raises LidarError for missing shards unless `partial`.
-    """
+    """Return the notes of all folders and on missing shards, which need `partial`."""
     notes = [*dict.fromkeys(note for folder in shard_folders for note in folder.notes)]
     if not (missing := _missing(shard_folders)):
         return notes
@@ -307,7 +298,6 @@ def _notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]
 
 
 def _missing_or_damaged(names: Sequence[str]) -> str:
-    """Return the message about files of shards that cannot be merged."""
     return (
         f"These files are missing or damaged: {listed(names, MAX_NAMED)}. Run their shards "
         "again with `--resume`, or campaigns with `--verify`, and merge again."
@@ -329,7 +319,6 @@ def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
 def _merge_dataset(
     shard_folders: Sequence[_ShardFolder], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
-    """Take the jobs of all folders into a data set, and write its shared files."""
     begun = CAMPAIGN_FILE in target.sizes()
     dataset_files(target, begun=begun)
     earlier = _read_dataset(target, shard_count=shard_folders[0].shards[0].total) if begun else None
@@ -424,10 +413,7 @@ def _add_rows(
 def _take_jobs(
     shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
 ) -> Iterator[JobRow]:
-    """Take the jobs of a shard folder into a data set.
-
-    Yields their rows, and adds files to `damaged`.
-    """
+    """Copy the jobs of a shard folder, yield their rows, and add files to `damaged`."""
     for _, row, wrong in dataset.take(
         shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
     ):
@@ -445,10 +431,7 @@ def _rows_of(earlier: _ShardFolder, dataset: DataSet) -> Iterator[JobRow]:
 
 
 def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
-    """Return the casting times of the jobs of a shard folder, {number: seconds}.
-
-    A note says if they are lost.
-    """
+    """Return the casting times of jobs, {number: seconds}, or add a note that they are lost."""
     if not shard_folder.shards:
         return {}
     try:
@@ -514,10 +497,7 @@ def _merge_survey(
 def _take_points(
     store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
 ) -> None:
-    """Take the points of all folders into the store of a run.
-
-    Raises LidarError that names damaged files.
-    """
+    """Take the points of all folders into a store, or raise LidarError for damaged files."""
     damaged = list[str]()
     only = store.only_job
     mark = store.db.meta["mark"]

@@ -165,7 +165,6 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
 
 
 def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
-    """Describe the columns of the cloud except x, y and z."""
     return [
         {
             "name": column.name,
@@ -255,5 +254,4 @@ def _planning(result: RunResult) -> dict[str, Any] | None:
 
 
 def _finite(value: float) -> float | None:
-    """Return a number, or None if infinite or NaN."""
     return value if math.isfinite(value) else None

@@ -105,10 +105,7 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures.
-
-    The file `cloud` is read on demand.
-    """
+    """Return functions that draw pictures, and read the file `cloud` on demand."""
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
@@ -282,7 +279,6 @@ def _limits(
 
 
 def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
-    """Mark and name start and target."""
     halo = [withStroke(linewidth=2.2 * page.unit, foreground=theme.GROUND)]
     middle = sum(axes.get_xlim()) / 2
     for name, position, marker, size in (

@@ -172,7 +172,6 @@ class _Cluster(NamedTuple):
 def _cluster_of(
     job: Job, options: RunOptions, client: Client | None, mistakes: Mistakes, notes: list[str]
 ) -> _Cluster:
-    """Return the cluster of `client`, or the cluster that `options` describe."""
     required = slots_needed(options, planning=job.planning is not None)
     casting = None
     backend = None
@@ -279,10 +278,7 @@ def _performance(survey: Survey) -> dict[str, str]:
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:
-    """Return the names of the objects that sensors do not see.
-
-    The result lacks sensors that see all.
-    """
+    """Return the names of the objects that a sensor does not see, without sensors that see all."""
     scene = job.scene
     pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
     names = scene.object_names
@@ -340,10 +336,7 @@ def _existing(folder: Path) -> Path:
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:
-    """Return notes on the folder of a result.
-
-    Raises LidarError if the folder cannot be written.
-    """
+    """Return notes on the folder of a result, or raise LidarError if it is not writable."""
     if isinstance(location, Storage):
         location.claim()  # leaves nothing
     elif not (folder := _existing(location)).is_dir():
@@ -381,5 +374,4 @@ def _rest_bytes(job: Job, points: int, planners: int) -> int:
 
 
 def _point_bytes(job: Job) -> int:
-    """Return the bytes of a point in a part."""
     return sum(np.dtype(column.dtype).itemsize for column in job.survey.stored_columns)

@@ -179,10 +179,7 @@ class JobMaker:
             return failed_row(self._campaign, number, reason)
 
     def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
-        """Put a job, row or error into the queue.
-
-        Returns False if the maker was stopped before.
-        """
+        """Put a job, row or error into the queue, or return False if the maker was stopped."""
         while not self._stopped.is_set():
             scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
             self._full = len({id(scene.vertices) for scene in scenes}) > MAX_SCENES

@@ -45,10 +45,7 @@ class TrialPump:
         return len(self.trials) == self.planning.trials
 
     def step(self) -> bool:
-        """Take results and submit more trials, and return True if there were changes.
-
-        LidarError if a trial has failed.
-        """
+        """Take results and submit trials; return True after changes, or raise LidarError."""
         running = self.tasks.running
         if running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
             self._leave_silent_workers()

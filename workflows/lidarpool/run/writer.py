@@ -42,10 +42,7 @@ MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
 class JobFiles(NamedTuple):
-    """Input for writing a job.
-
-    `row` lacks the counts of points.
-    """
+    """Input for writing a job, whose `row` lacks the counts of points."""
 
     row: JobRow
     cloud: StoredCloud
@@ -76,10 +73,7 @@ def write_jobs(
 
 
 def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job.
-
-    Returns its row, or a JobError, or a LidarError if the storage is the cause.
-    """
+    """Write a job, and return its row, a JobError, or a LidarError of the storage."""
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)

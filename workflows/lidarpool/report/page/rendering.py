@@ -375,10 +375,7 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters.
-
-    Names in files may contain characters that reverse a line.
-    """
+    """Replace unprintable characters, such as those that reverse a line."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )

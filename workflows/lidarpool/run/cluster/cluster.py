@@ -228,10 +228,7 @@ class Cluster:
         check_workers(job, self.options, self.backend, self._casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the user.
-
-        Its OSError must not look like an error of the cluster.
-        """
+        """Call a callback of the user, whose OSError must not look like an error of the cluster."""
         try:
             callback(*arguments)
         except BaseException as error:

@@ -269,10 +269,7 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
 
 
 def _root(error: BaseException) -> BaseException:
-    """Return the first cause of an error.
-
-    The answer of a foreign program may cause any error.
-    """
+    """Return the first cause of an error, which may be any error of a foreign program."""
     cause = error.__cause__ or error.__context__
     # An operation that a time-out has cut off says less than the time-out.
     if cause is None or isinstance(cause, asyncio.CancelledError):
