@@ -167,15 +167,14 @@ class DataSetOutput:
                 (replace(row, seconds=seconds.get(row.number)) for row, _ in self.dataset.rows()),
                 key=lambda row: row.number,
             )
-        intact_count, wrong = _check_jobs(self.dataset, rows, self.options.verify, self.campaign)
+        wrong = _check_jobs(self.dataset, rows, self.options.verify, self.campaign)
         numbers = {row.number for row in rows}
         for number in self.campaign.shard.jobs(record["campaign"]["count"]):
             if number not in numbers:
                 name = self.campaign.name(number)
                 wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
-        has_all = intact_count == len(self.campaign.numbers)
-        is_complete = has_all and _has_shared_files(storage, rows, intact_count)
-        return FinishedDataSet(record, rows, wrong, is_complete)
+        has_all = not wrong and len(rows) == len(self.campaign.numbers)
+        return FinishedDataSet(record, rows, wrong, has_all and _has_shared_files(storage, rows))
 
     def finished(self, complete: FinishedDataSet) -> CampaignRun:
         """Report that the data set is complete, and return its sums."""
@@ -219,7 +218,7 @@ class DataSetOutput:
         dataset_files(self.dataset.storage, begun=begun)
         wrong = earlier.wrong
         if not record:
-            wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)[1]
+            wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.committed_in_words:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
@@ -323,8 +322,8 @@ def read_record(storage: Storage) -> dict[str, Any]:
     return record
 
 
-def _has_shared_files(storage: Storage, rows: Sequence[JobRow], job_count: int) -> bool:
-    """Return True if the job table has these rows, and the last file lists as many jobs as given.
+def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
+    """Return True if the job table has these rows, and the last file lists as many jobs.
 
     The last file has the checksum of the table.
     """
@@ -332,7 +331,7 @@ def _has_shared_files(storage: Storage, rows: Sequence[JobRow], job_count: int) 
         index = read_index(storage)
         table = {row.number: row.sha256 for row in read_table(storage, index["table"])}
         has_table = table == {row.number: row.sha256 for row in rows}
-        return has_table and len(index["jobs"]) == job_count
+        return has_table and len(index["jobs"]) == len(rows)
     return False
 
 
@@ -388,12 +387,11 @@ def _check_jobs(
     rows: Iterable[JobRow],
     contents: bool,
     campaign: CampaignSpec | None = None,
-) -> tuple[int, dict[int, str]]:
-    """Count the intact jobs, and describe the faults of the rest, {number: a clause}.
+) -> dict[int, str]:
+    """Describe the faults of jobs, {number: a clause}.
 
     LidarError if a file of the campaign differs from the file that intact jobs are made of.
     """
-    intact_count = 0
     wrong = dict[int, str]()
     # {name and hash of a file: jobs made of it}
     jobs_of_file: dict[tuple[str, str], list[str]] = {}
@@ -411,7 +409,6 @@ def _check_jobs(
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
                 continue
-            intact_count += 1
             for file in manifest["made_of"]:
                 jobs_of_file.setdefault(tuple(file), []).append(row.name)
     current_files = file_hashes(campaign.files) if campaign is not None and jobs_of_file else []
@@ -422,7 +419,7 @@ def _check_jobs(
                 f"{name}: {listed(jobs)}. Restore that version, or specify another folder "
                 "with `--out`."
             )
-    return intact_count, wrong
+    return wrong
 
 
 def verify(storage: Storage, number: int | None = None) -> str:
@@ -438,7 +435,7 @@ def verify(storage: Storage, number: int | None = None) -> str:
     wrong = {} if is_complete else {-1: f"{TABLE_FILE} and {INDEX_FILE} list different jobs"}
     if number is None and CAMPAIGN_FILE in storage.sizes():
         read_record(storage)
-    wrong |= _check_jobs(dataset, rows, True)[1]
+    wrong |= _check_jobs(dataset, rows, True)
     if wrong:
         raise LidarError(
             f"{storage} is damaged: {listed([*wrong.values()])}. To run these jobs again, "

@@ -105,11 +105,6 @@ class SurveyOutput:
         """True if a format has many files, which workers can write."""
         return any(output_format.has_many_files for output_format in self.formats)
 
-    def _formats_sent(self, workers: LidarWorkers | None) -> list[ExportSpec]:
-        """Return the formats that workers write to the storage of the result, if any."""
-        is_sent = workers is not None and isinstance(self.target, Storage)
-        return [entry for entry in self.formats if is_sent and entry.has_many_files]
-
     @property
     def _requested(self) -> Sequence[str]:
         """Columns that the user asked for, without those that only formats need."""
@@ -223,7 +218,9 @@ class SurveyOutput:
         earlier = _earlier(target).files
         further = _further_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
-        sent = self._formats_sent(workers)
+        sent: list[ExportSpec] = []  # formats that workers write to the storage
+        if workers is not None and isinstance(self.target, Storage):
+            sent = [entry for entry in self.formats if entry.has_many_files]
         with (
             explained(
                 f"The result cannot be written to {self.target}",
@@ -236,7 +233,8 @@ class SurveyOutput:
             points = _shown_points(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
             timeline.mark(timeline.CLOUD_WRITTEN)
-            full_scales = self._write_formats(staged, result, sweeps, workers, show)
+            others = [entry for entry in self.formats if entry not in sent]
+            full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
                 _clear(target, further, earlier)
                 for output_format in sent:
@@ -263,35 +261,6 @@ class SurveyOutput:
                 _move(staged, folder, report["files"], earlier, on_written)
         timeline.mark(timeline.IN_PLACE)
         return report
-
-    def _write_formats(
-        self,
-        staged: Path,
-        result: RunResult,
-        sweeps: Sweeps,
-        workers: LidarWorkers | None,
-        show: WritingProgress,
-    ) -> dict[str, float]:
-        """Write formats to a temporary folder, except those that workers write to a storage.
-
-        Returns the intensity that each format with integer intensities stores as its highest
-        integer.
-        """
-        full_scales: dict[str, float] = {}
-        sent = self._formats_sent(workers)
-        for output_format in sorted(self.formats, key=lambda entry: entry.has_many_files):
-            if output_format in sent:
-                continue
-            full_scale = output_format.write(
-                staged / output_format.row.file,
-                _shown_points(result, output_format.row.file, show),
-                sweeps,
-                workers=workers,
-                content=partial(picture_content, result),
-            )
-            if full_scale is not None:
-                full_scales[output_format.format] = full_scale
-        return full_scales
 
     def _report(
         self,
@@ -332,6 +301,32 @@ def _write_cloud(
     with explained(f"{path} cannot be written"):
         counts = None if growing is None else growing.finish(path, points)
         return counts or write_cloud(path, points, sweeps, result.scene)
+
+
+def _write_formats(
+    formats: Sequence[ExportSpec],
+    staged: Path,
+    result: RunResult,
+    sweeps: Sweeps,
+    workers: LidarWorkers | None,
+    show: WritingProgress,
+) -> dict[str, float]:
+    """Write formats to a temporary folder, those of many files last.
+
+    Returns the intensity that each format with integer intensities stores as its highest integer.
+    """
+    full_scales: dict[str, float] = {}
+    for output_format in sorted(formats, key=lambda entry: entry.has_many_files):
+        full_scale = output_format.write(
+            staged / output_format.row.file,
+            _shown_points(result, output_format.row.file, show),
+            sweeps,
+            workers=workers,
+            content=partial(picture_content, result),
+        )
+        if full_scale is not None:
+            full_scales[output_format.format] = full_scale
+    return full_scales
 
 
 def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
