@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,15 @@ class _ShardFolder:
     def numbers(self, shard: Shard) -> range:
         """Return the numbers of the jobs or scans of a shard."""
         return (shard.jobs if "campaign" in self.record else shard.scans)(self.run_size)
+
+    @cached_property
+    def ranges(self) -> Sequence[range]:
+        """Numbers of the jobs or scans of each shard."""
+        return [self.numbers(shard) for shard in self.shards]
+
+    def has(self, number: int) -> bool:
+        """Return True if a job or scan is in one of the shards."""
+        return any(number in numbers for numbers in self.ranges)
 
     @property
     def common(self) -> dict[str, Any]:
@@ -343,7 +352,8 @@ def _merge_dataset(
             seconds: Mapping[int, float] = {}
             if earlier:  # after a killed merge without casting times: no note
                 seconds = known_seconds(target)
-                _add_rows(db, earlier, _rows_of(earlier, dataset), seconds)
+                earlier_rows = (row for row, _ in dataset.rows() if earlier.has(row.number))
+                _add_rows(db, earlier, earlier_rows, seconds)
             for shard_folder in shard_folders:
                 taken = _take_jobs(shard_folder, dataset, damaged)
                 _add_rows(db, shard_folder, taken, {**seconds, **_seconds(shard_folder, notes)})
@@ -388,12 +398,11 @@ def _add_rows(
     A job that has failed there stays as it is. LidarError if the shard folder cannot have such a
     job, or two manifests are of one job.
     """
-    ranges = [shard_folder.numbers(shard) for shard in shard_folder.shards]
     added = set[int]()
     for row in rows:
         number = row.number
         path = shard_folder.storage.path(manifest_file(row.name))
-        if not any(number in numbers for numbers in ranges):
+        if not shard_folder.has(number):
             raise LidarError(
                 f"{path} belongs to job {number}, which is not in shard "
                 f"{listed([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} jobs. "
@@ -422,14 +431,6 @@ def _take_jobs(
             yield row
 
 
-def _rows_of(earlier: _ShardFolder, dataset: DataSet) -> Iterator[JobRow]:
-    """Yield the rows of the shards that a data set had before the merge."""
-    ranges = [earlier.numbers(shard) for shard in earlier.shards]
-    for row, _ in dataset.rows():
-        if any(row.number in numbers for numbers in ranges):
-            yield row
-
-
 def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
     """Return the casting times of jobs, {number: seconds}, or add a note that they are lost."""
     if not shard_folder.shards:
@@ -446,8 +447,8 @@ def _lacking(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str
     return [
         f"the manifest of job {number} in {folder.storage}"
         for folder in shard_folders
-        for shard in folder.shards
-        for number in folder.numbers(shard)
+        for numbers in folder.ranges
+        for number in numbers
         if not db.ended(number)
     ]
 
