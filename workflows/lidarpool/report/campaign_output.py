@@ -72,8 +72,10 @@ def run_campaign(
     page: RunPage,
 ) -> CampaignRun:
     """Cast the jobs of a campaign, write the data set, and return a summary."""
-    output = DataSetOutput(target, campaign, options, screen, page)
-    output.dataset.check_installed()
+    storage = replace(Storage.at(target), durable=False)
+    dataset = DataSet(storage, **asdict(campaign.keep))
+    output = DataSetOutput(dataset, campaign, options, screen, page)
+    dataset.check_installed()
     with result_folder(target):
         earlier = output.check_existing()
         if earlier.is_complete:
@@ -83,7 +85,7 @@ def run_campaign(
             open_store(campaign, options, screen) as store,
         ):
             output.compare_with_store(earlier, store)
-            committed = cast(store, connection, Listener(page), output.dataset)
+            committed = cast(store, connection, Listener(page), dataset)
             return output.publish(committed)
 
 
@@ -103,21 +105,14 @@ class FinishedDataSet(NamedTuple):
 
 @dataclass(eq=False)
 class DataSetOutput:
-    """The data set of a campaign in a folder or storage, as the output of a run."""
+    """The data set of a campaign as the output of a run."""
 
-    target: Path | Storage
+    dataset: DataSet
     campaign: CampaignSpec
     options: RunOptions
     screen: Screen
     page: RunPage
-    dataset: DataSet = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._begun_at = time.monotonic()
-        storage = replace(Storage.at(self.target), durable=False)
-        self.dataset = DataSet(storage, **asdict(self.campaign.keep))
-
-    # -- existing files -----------------------------------------------------------------------
+    begun_at: float = field(default_factory=time.monotonic)  # seconds
 
     def check_existing(self) -> FinishedDataSet:
         """Refuse, remove or check a finished data set, and return it if the run continues it."""
@@ -182,13 +177,9 @@ class DataSetOutput:
         for row in complete.rows:
             self.page.ended(row)
         notes = (*self._warnings_of_empty_jobs(complete.rows),)
-        sums = CampaignRun.from_rows(complete.rows, self._seconds(), notes=notes)
+        sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
         return sums
-
-    def _seconds(self) -> float:
-        """Return the wall time of the run so far."""
-        return time.monotonic() - self._begun_at
 
     def _warnings_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
         """Warn if jobs have no points, and return the warning, if any."""
@@ -243,12 +234,10 @@ class DataSetOutput:
                     rows.append(replace(row, seconds=seconds.get(row.number)))
         store.adopt(rows)
 
-    # -- the end ------------------------------------------------------------------------------
-
     def publish(self, committed: Committed) -> CampaignRun:
         """Write the shared files, and remove the run unless jobs have failed."""
         store = committed.store
-        seconds = self._seconds()
+        seconds = time.monotonic() - self.begun_at
         notes = committed.notes
         warnings = self._warnings_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note

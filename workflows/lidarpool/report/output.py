@@ -68,16 +68,18 @@ def run_survey(
         with (
             ClusterConnection(jobs, options, screen) as connection,
             open_store(jobs, options, screen) as store,
-            growing_cloud(folder, output.target, store) as cloud,
+            staging(folder, output.target) as staged,
         ):
-            load_open3d()  # writes the cloud in the end; a missing library is reported at the start
-            committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
-            result = committed.result(screen)
-            page.finish(result.seconds, result)
-            if not output.in_pieces:
-                connection.close()
-                timeline.mark(timeline.STOPPED)
-            return output.publish(folder, result, store, screen, connection.cluster, cloud)
+            assert store.only_job is not None, "of a survey"
+            with GrowingCloud(staged / CLOUD, store.only_job) as cloud:
+                load_open3d()  # writes the cloud in the end; reported at the start if it is missing
+                committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
+                result = committed.result(screen)
+                page.finish(result.seconds, result)
+                if not output.in_pieces:
+                    connection.close()
+                    timeline.mark(timeline.STOPPED)
+                return output.publish(folder, result, store, screen, connection.cluster, cloud)
 
 
 @dataclass(eq=False)
@@ -280,14 +282,6 @@ class SurveyOutput:
             from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
 
             list(draw_pictures(shown, staged, staged, show=show))
-
-
-@contextmanager
-def growing_cloud(folder: Path, target: Path | Storage, store: RunStore) -> Iterator[GrowingCloud]:
-    """Begin the cloud, with the points of an earlier run; parts are added while casting."""
-    assert store.only_job is not None, "of a survey"
-    with staging(folder, target) as staged, GrowingCloud(staged / CLOUD, store.only_job) as growing:
-        yield growing
 
 
 def _write_cloud(
