@@ -272,7 +272,8 @@ class GrowingCloud:
         """Append the committed parts that are next in scan order, and return at once."""
         parts = self._job.parts
         with suppress(KeyError):  # the next scan is not committed yet
-            while part := parts.part_of(self._next_scan):
+            while True:
+                part = parts.part_of(self._next_scan)
                 self._next_scan = part.stop
                 if part.point_count:
                     self._queue.put(part)

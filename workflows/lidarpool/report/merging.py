@@ -349,14 +349,15 @@ def _merge_dataset(
 
         damaged = list[str]()
         with explained(f"{target} cannot be merged"):
-            seconds: Mapping[int, float] = {}
+            seconds = dict[int, float]()
             if earlier:  # after a killed merge without casting times: no note
-                seconds = known_seconds(target)
+                seconds |= known_seconds(target)
                 earlier_rows = (row for row, _ in dataset.rows() if earlier.has(row.number))
                 _add_rows(db, earlier, earlier_rows, seconds)
             for shard_folder in shard_folders:
                 taken = _take_jobs(shard_folder, dataset, damaged)
-                _add_rows(db, shard_folder, taken, {**seconds, **_seconds(shard_folder, notes)})
+                seconds |= _seconds(shard_folder, notes)
+                _add_rows(db, shard_folder, taken, seconds)
         damaged = damaged or _lacking(all_folders, db)
         if damaged:
             raise LidarError(_missing_or_damaged(damaged))
