@@ -52,6 +52,7 @@ from .campaign_output import (
 from .output import SurveyOutput
 
 MAX_NAMED = 20  # shards or files in a message
+_BATCH_ROWS = 1000  # rows of jobs in a transaction
 _MISSING = "these shards are missing: "  # begins a note
 
 
@@ -72,7 +73,6 @@ class _ShardFolder:
     trials: Sequence[Trial] = ()
 
     def numbers(self, shard: Shard) -> range:
-        """Return the numbers of the jobs or scans of a shard."""
         return (shard.jobs if "campaign" in self.record else shard.scans)(self.run_size)
 
     @cached_property
@@ -400,6 +400,7 @@ def _add_rows(
     job, or two manifests are of one job.
     """
     added = set[int]()
+    batch = list[tuple[int, bool, dict[str, Any]]]()  # a transaction for each row would be slow
     for row in rows:
         number = row.number
         path = shard_folder.storage.path(manifest_file(row.name))
@@ -417,7 +418,11 @@ def _add_rows(
         added.add(number)
         if row.done or not db.ended(number):
             row = replace(row, seconds=seconds.get(number))
-            db.end_jobs([(number, bool(row.error), asdict(row))])
+            batch.append((number, bool(row.error), asdict(row)))
+        if len(batch) == _BATCH_ROWS:
+            db.end_jobs(batch)
+            batch.clear()
+    db.end_jobs(batch)
 
 
 def _take_jobs(
