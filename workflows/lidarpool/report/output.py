@@ -408,10 +408,7 @@ def _move(
     earlier: Collection[str],
     on_written: Callable[[], object],
 ) -> None:
-    """Move all files of a result into place, the report last.
-
-    If the process is killed in between, --resume continues from the run's folder.
-    """
+    """Move all files of a result into place, the report last; a killed run can be resumed."""
     for name in files:  # before its name: parts, the other copy of the points, are removed then
         flush(staged / name)
     with deferred_interrupts():

@@ -171,11 +171,9 @@ class Screen:
         Warnings that were reported, without duplicates.
     """
 
-    warnings: list[str]
-
     def __init__(self, on_progress: Callable[[Progress], None] | None = None) -> None:
         self._on_progress = on_progress
-        self.warnings = []
+        self.warnings: list[str] = []
 
     def tell(self, words: str) -> None:
         """Log a note for the user."""

@@ -170,9 +170,7 @@ class StartedAhead(AbstractContextManager[Client]):
 
 @contextmanager
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Start a cluster and yield its client.
-
-    The cluster ends with the body.
+    """Start the cluster of a file, yield its client, and stop the cluster after the body.
 
     `tell` is called when the cluster has started, and with messages about failing workers.
     LidarError if the cluster does not start.
@@ -188,9 +186,7 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Start a cluster and yield its client.
-
-    The cluster ends with the body.
+    """Start a cluster, yield its client, and stop the cluster after the body.
 
     Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
     all jobs in the queue, and an interrupt while workers are being stopped waits until they are.

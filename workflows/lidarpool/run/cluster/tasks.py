@@ -19,9 +19,7 @@ T = TypeVar("T")
 
 
 class Tasks(Generic[T]):
-    """Submitted tasks of a partition.
-
-    `book` has the records of finished tasks.
+    """Submitted tasks of a partition, and a `book` with the records of finished tasks.
 
     Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
