@@ -26,8 +26,8 @@ from unittest.mock import patch
 import numpy as np
 
 from raybeam import cuda_backend, ploc
+from raybeam.cuda_tables import Layout, lay_out, lay_out_instances
 from raybeam.instances import plain
-from raybeam.layout import Layout, lay_out, lay_out_instances
 from raybeam.mesh import LocalMesh, local_mesh
 
 from .raycast_scenes import Job, jobs

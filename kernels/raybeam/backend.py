@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
-from .crossing import Crossing, Nearest, TimedBodies, cast_crossing
+from .body_rays import Crossing, Nearest, TimedBodies, cast_crossing
 from .device import DeviceHits, DeviceNearest, OtherHits
 from .hits import Counted, Hits, Part, ScanReturns, join_hits
 from .instances import Scene

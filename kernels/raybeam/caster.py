@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints, Ints32
 from .backend import Backend
-from .crossing import Crossing, Nearest, TimedBodies
+from .body_rays import Crossing, Nearest, TimedBodies
 from .device import DeviceHits, DeviceNearest, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transforms

@@ -14,12 +14,12 @@ import numpy as np
 
 from .arrays import AnyArray, Ints, Ints32
 from .backend import Backend, ClosestHits
-from .crossing import TimedBodies
+from .body_rays import TimedBodies
+from .cuda_tables import lay_out, lay_out_instances
 from .device import DeviceHits, DeviceNearest, HitTransfer, OtherHits, PendingCopy, to_device
 from .hits import Counted, ScanReturns
 from .installation import install_command
 from .instances import Scene
-from .layout import lay_out, lay_out_instances
 from .opacity import Masks
 from .pattern import Pattern
 from .poses import Poses
@@ -60,7 +60,7 @@ class CudaBackend(Backend):
     Tables and patterns outlive a call; a call waits for their creation, so that threads with other
     streams may use both. All calls switch to the caster's device and back.
 
-    NumPy builds the tree (layout.py). Building it on the device took as much code as the
+    NumPy builds the tree (cuda_tables.py). Building it on the device took as much code as the
     traversal, and saved a worker two seconds for each million triangles, once.
     """
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from .arrays import Floats, Ints
-from .crossing import Crossing, Nearest
+from .body_rays import Crossing, Nearest
 from .tree import build_tree
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 
 from .arrays import Floats, Floats32, Ints, Ints32
-from .cast_memory import float32s, float64s
+from .cast_record import float32s, float64s
 from .compiled import compiled, inlined, stage
 from .moving_loops import CROSSING, NEAREST, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS

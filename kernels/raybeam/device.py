@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .arrays import AnyArray, Floats, Ints32, UInts32
-from .crossing import BodyHits
+from .body_rays import BodyHits
 from .hits import Part
 
 PINNED_BYTES = 1 << 30  # page-locked, of all outboxes of a process

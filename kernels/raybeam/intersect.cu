@@ -13,10 +13,10 @@
 // Tables of float4 are separate allocations, which the device aligns to 256 bytes.
 //
 // CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
-// of layout.py), and nodes never come near it: a box is as wide as its padding.
+// of cuda_tables.py), and nodes never come near it: a box is as wide as its padding.
 //
 // All lengths are local: coordinates within [-1, 1], see mesh.py; the scene and each mesh have
-// separate local coordinates, see instances.py. layout.py computes the tables, with all meshes in
+// separate local coordinates, see instances.py. cuda_tables.py computes the tables, with all meshes in
 // sequence:
 //   nodes      8 float4 (one 128-byte line) a node: lower x, y, z of four children, then upper x, y,
 //              z, then the children's codes as integer bits, then padding. A code >= 0 is a
@@ -213,7 +213,7 @@ struct BodyRays {
         c = (x * r[2] + y * r[5]) + z * r[8];
     }
 
-    // Compute a ray; return the length of its direction, as `cast_crossing` of crossing.py.
+    // Compute a ray; return the length of its direction, as `cast_crossing` of body_rays.py.
     __device__ __forceinline__ double make(const Scene& scene, int i, Ray& ray) const
     {
         const double* pose = poses + 12 * (Count)row;
@@ -686,7 +686,7 @@ KERNEL cast_table(
 #undef BLOCKS
 #define BLOCKS (NESTED ? (MASKED ? 2 : 3) : 4)
 
-// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of crossing.py. Ray i
+// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of body_rays.py. Ray i
 // meets the bodies at time t = when[i] - first_time, if t is one of `times`: the pose of body k then, 12
 // doubles, is at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
 // during SPAN times: lower and upper corner. `nearest_...` are read and written.

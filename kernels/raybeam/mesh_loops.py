@@ -1,6 +1,6 @@
 """Rays at meshes, their instances and masks, as parts of compiled loops.
 
-`mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_memory.py).
+`mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_record.py).
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from . import cast_memory as memory
-from .cast_memory import float32s, float64s, int64s, uint8s
+from . import cast_record as memory
+from .cast_record import float32s, float64s, int64s, uint8s
 from .compiled import compiled, inlined, stage
 from .triangle_loops import areas, shear
 

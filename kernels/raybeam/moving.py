@@ -23,8 +23,8 @@ import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints, Ints32
 from .backend import BackendUnavailable
+from .body_rays import SPAN, BodyHits, Crossing, Nearest, TimedBodies
 from .caster import RayCaster
-from .crossing import SPAN, BodyHits, Crossing, Nearest, TimedBodies
 from .deforming import Deforming
 from .installation import install_command
 from .scan import Scan, host_rays

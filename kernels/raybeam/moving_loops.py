@@ -13,9 +13,9 @@ import numpy as np
 from numba import types
 
 from .arrays import Floats, Indices, Ints
-from .cast_memory import float64s, int64s
+from .body_rays import Crossing, Nearest
+from .cast_record import float64s, int64s
 from .compiled import compiled, inlined, stage
-from .crossing import Crossing, Nearest
 
 CELL = 64  # rays of a cell
 WIDE = 16  # cells of a wide cell

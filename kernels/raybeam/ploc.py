@@ -5,7 +5,7 @@ filling curve; then each box is compared with its neighbors in that order, and p
 best partners (least area of the common box) are merged. Every step is a few operations on whole
 arrays. Near the root, few clusters are left and neighbors on the curve are seldom the best:
 clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
-divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which takes
+divided from the root down, by a full sweep with the surface area heuristic (sah_builder.py), which takes
 a tenth of a second.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Floats32, Indices, Ints32
-from .sweep import divide
+from .sah_builder import divide
 
 _RADIUS = 8  # neighbors looked at on either side; twice as many gain 1 to 2 % of the tree's cost
 # Clusters that are left to the sweep: an eighth of all boxes, within these limits. Four times the

@@ -1,7 +1,7 @@
 """Rays of a pattern, a tile at a time in compiled loops, with the operations of `plain_rays`.
 
 A ray is a beam of the pattern, or a sub-ray of a beam, cast from a pose. `cast` is a `CAST` record
-(cast_memory.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py).
+(cast_record.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py).
 `floats` and `numbers` point to this memory as float64 and int64. Tables that a `CAST` names come as
 addresses, with one column for each beam or pose. A vector has four rays.
 """
@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray, types
 
-from . import cast_memory as memory
+from . import cast_record as memory
 from .arrays import Floats, Ints
-from .cast_memory import casts_at, float64s, int64s
+from .cast_record import casts_at, float64s, int64s
 from .compiled import WHOLE, compiled, inlined, part, stage
 from .pattern import Pattern
 from .poses import Poses

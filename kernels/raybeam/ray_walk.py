@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from .cast_memory import (
+from .cast_record import (
     BLOCKS,
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,

@@ -13,7 +13,7 @@ import numpy as np
 
 from .arrays import AnyArray, Floats
 from .backend import Backend, ClosestHits
-from .crossing import Crossing, Nearest
+from .body_rays import Crossing, Nearest
 from .hits import Part, join_hits
 from .installation import install_command
 from .instances import Scene
@@ -23,7 +23,7 @@ from .scan import Scan
 from .tile_plan import TilePlan, consecutive, plan_tiles
 
 if TYPE_CHECKING:
-    from .cast_memory import Cast
+    from .cast_record import Cast
 
 _SHARE = 1 << 14  # rays that a thread casts in a call, if there are several threads
 _BODY_RAYS = 64  # rays per tile of rays at bodies
@@ -47,7 +47,7 @@ class TileBackend(Backend):
         return ""
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
-        from . import cast_memory, mesh_loops, tile_casts, tile_memory, tile_tree
+        from . import cast_record, mesh_loops, tile_casts, tile_memory, tile_tree
 
         super().__init__(scene, threads, device)
         self._count = threads or os.cpu_count() or 1
@@ -55,7 +55,7 @@ class TileBackend(Backend):
         self._process = os.getpid()
         self._loops = tile_casts
         self._weigh = mesh_loops.weigh
-        self._memory = cast_memory
+        self._memory = cast_record
         self._tiles = tile_memory.thread_tiles
         self._top_nodes = tile_tree.top_nodes
         self._trees = [tile_tree.tile_tree(mesh.corners) for mesh in scene.meshes]
@@ -64,7 +64,7 @@ class TileBackend(Backend):
         self._meshes = self._mesh_records(scene)
         # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
-        cast = np.zeros(1, cast_memory.CAST)
+        cast = np.zeros(1, cast_record.CAST)
         cast["mesh"] = self._meshes.ctypes.data
         cast["index"] = self._index.ctypes.data
         self._records = self._instance_records(scene)

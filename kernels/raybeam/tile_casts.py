@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from . import cast_memory as memory
-from .cast_memory import (
+from . import cast_record as memory
+from .cast_record import (
     FIRST_ROW_FIELD,
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,

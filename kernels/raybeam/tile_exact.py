@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import LEAF_CORNERS, MASK_HEIGHT, ORDER, float64s, int32s, int64s
+from .cast_record import LEAF_CORNERS, MASK_HEIGHT, ORDER, float64s, int32s, int64s
 from .compiled import WHOLE, inlined, part, stage
 from .mesh_loops import is_opaque
 from .tile_memory import AXIS, KEY, LENGTH, SX, T, U, at, row_at

@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import float32s, float64s, int64s
+from .cast_record import float32s, float64s, int64s
 from .compiled import WHOLE, inlined, part, stage
 from .tile_memory import LENGTH, SUBTILES, T, at, row_at
 from .vectors import (

@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import (
+from .cast_record import (
     BLOCKS,
     LEAF_CORNERS,
     MASK_HEIGHT,

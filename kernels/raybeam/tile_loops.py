@@ -37,7 +37,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from .cast_memory import (
+from .cast_record import (
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,
     MESH_FIELD,

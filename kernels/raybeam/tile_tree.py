@@ -8,7 +8,7 @@ import numpy as np
 
 from .arrays import Floats, Floats32, Ints32
 from .compiled import compiled
-from .layout import stack_need
+from .cuda_tables import stack_need
 from .tree import LEAF_BITS, WideTree, build_top, build_tree
 
 WIDTH = 8

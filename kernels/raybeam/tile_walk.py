@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from .cast_memory import BLOCKS, NODES, float32s, int32s, int64s, uint8s
+from .cast_record import BLOCKS, NODES, float32s, int32s, int64s, uint8s
 from .compiled import WHOLE, inlined, part, stage
 from .tile_frame import FAR, ZERO, limit_depths
 from .tile_leaf import test_leaf

@@ -4,7 +4,7 @@ Numba turns loops over arrays into vector instructions, but not the body of a tr
 it keeps each step of such a loop in memory. A type whose values are LLVM's vectors stays in
 registers. LLVM divides these vectors where a processor's are shorter: SSE and NEON have 4 float32.
 
-A mask is a whole number: bit k belongs to lane k. `cast_memory.pointer` makes pointers, indices
+A mask is a whole number: bit k belongs to lane k. `cast_record.pointer` makes pointers, indices
 count elements, and no address needs to be aligned.
 """
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from raybeam import ploc
-from raybeam.layout import stack_need
-from raybeam.sweep import divide
+from raybeam.cuda_tables import stack_need
+from raybeam.sah_builder import divide
 from raybeam.tree import build_tree
 
 pytest.importorskip("hypothesis")

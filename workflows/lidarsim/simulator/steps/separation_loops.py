@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.cast_memory import float64s, int64s, uint8s
+from raybeam.cast_record import float64s, int64s, uint8s
 from raybeam.compiled import compiled, inlined, stage
 
 from ...base.arrays import Bools, Floats, Ints
