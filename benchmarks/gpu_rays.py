@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from raybeam import Instance, Mesh, Opacity, Pattern, PoseMotion, RayCaster
-from raybeam.scan import Groups, Scan, check_scan
+from raybeam.scan import HitGroups, Scan, check_scan
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
 from .gpu_scenes import Float, beam_directions, city, revolution, track
@@ -74,7 +74,7 @@ def rates(
     hits = sum(int((triangle >= 0).sum()) for _, triangle, _ in hit_parts)
 
     def pack() -> None:
-        groups = Groups(scan.groups, 1)
+        groups = HitGroups(scan.groups, 1)
         for (start, _), hit in zip(parts, hit_parts, strict=True):
             chunk = engine._counted(start, None, hit, groups, engine._no_other_hits)
             engine._pack(chunk, groups, 1.0, engine._no_counters)

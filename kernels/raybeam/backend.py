@@ -10,12 +10,12 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
-from .body_rays import Crossing, Nearest, TimedBodies, cast_crossing
-from .device import DeviceHits, DeviceNearest, OtherHits
-from .hits import Counted, Hits, Part, ScanReturns, join_hits
-from .instances import Scene
+from .body_rays import NearestHits, RayBodyPairs, TimedBodies, cast_pairs
+from .device import DeviceHits, DeviceNearestHits, ExternalHits
+from .hits import HitColumns, Hits, ScanReturns, TallyCounts, join_hits
+from .instances import LocalScene
 from .rays import Rays
-from .scan import Collector, Scan
+from .scan import HitCollector, Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
@@ -84,10 +84,10 @@ class Backend(ABC):
         A share of 1 or more sets no limit.
         """
 
-    def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:
+    def __init__(self, scene: LocalScene, threads: int | None, device: int | None) -> None:
         self._scene = scene
 
-    def update_scene(self, scene: Scene) -> None:
+    def update_scene(self, scene: LocalScene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
         self._scene = scene
 
@@ -100,9 +100,9 @@ class Backend(ABC):
     def closest(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
 
-    def nearest(self, rays: Rays) -> Part:
+    def nearest(self, rays: Rays) -> HitColumns:
         """Return the closest hits of rays, without weights and misses, in ray order."""
-        parts: list[Part] = []
+        parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
             hits = self.closest(rays.part(start, start + self.chunk))
             ray = hits.ray.astype(np.uint32) + np.uint32(start)
@@ -110,19 +110,19 @@ class Backend(ABC):
             parts.append((ray, distance, hits.triangle, hits.instance))
         return join_hits(parts)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        cast_crossing(self.nearest, crossing, nearest)
+        cast_pairs(self.nearest, pairs, nearest)
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
-        """Put rays `start` to `stop` of a scan on the device, as `RayCaster.device_nearest`."""
+    ) -> DeviceNearestHits:
+        """Put rays `start` to `stop` of a scan on the device, as `RayCaster.upload_rays`."""
         raise BackendUnavailable(
             f"Backend {self.name!r} does not support devices. Use cast_crossing."
         )
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         raise BackendUnavailable(
             f"Backend {self.name!r} does not support devices. Use cast_crossing."
@@ -150,7 +150,7 @@ class Backend(ABC):
 
     def scan(self, scan: Scan) -> ScanReturns:
         """Return the kept hits of the rays of a scan, and counts of all hits."""
-        collector = Collector(scan, self._scene.face_count if scan.tally else 0)
+        collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
             if scan.tally:
                 collector.tally(self._scene.tally_rows(instance, triangle))
@@ -160,7 +160,7 @@ class Backend(ABC):
             )
         return collector.result()
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
+    def parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
         """Yield start and stop of each part of a scan, and its hits, numbered from start."""
         for start, stop in scan.chunks(self.chunk):
             hits = self.closest(scan.rays(start, stop))
@@ -173,8 +173,8 @@ class Backend(ABC):
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
         """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does.
 
         BackendUnavailable if this backend has no device.

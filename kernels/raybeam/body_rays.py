@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Indices, Ints, Ints32
-from .hits import Part
+from .hits import HitColumns
 from .rays import Rays
 
 
-class Crossing(NamedTuple):
+class RayBodyPairs(NamedTuple):
     """Pairs of a ray and a body of a common shape, where the ray passes through the body's box.
 
     Attributes
@@ -44,7 +44,7 @@ class Crossing(NamedTuple):
     limits: tuple[float, float]
     frame: Floats
 
-    def contiguous(self) -> Crossing:
+    def contiguous(self) -> RayBodyPairs:
         """Return a copy whose rows, bodies and poses are contiguous, for compiled loops."""
         return self._replace(
             row=np.ascontiguousarray(self.row),
@@ -104,7 +104,7 @@ class BodyHits(NamedTuple):
     triangle: Ints32
 
 
-class Nearest(NamedTuple):
+class NearestHits(NamedTuple):
     """Nearest hits of rays (n,) on moving bodies.
 
     Of bodies at equal distances, the lowest number counts.
@@ -125,16 +125,16 @@ class Nearest(NamedTuple):
     triangle: Ints32
 
     @classmethod
-    def without_hits(cls, limits: Floats) -> Nearest:
+    def without_hits(cls, limits: Floats) -> NearestHits:
         """Create rays without a hit, for hits before distances `limits` (n,), meters."""
         n = len(limits)
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
-    def part(self, start: int, stop: int) -> Nearest:
+    def part(self, start: int, stop: int) -> NearestHits:
         """Return the hits of rays `start` to `stop`, as views of the same memory."""
         span = slice(start, stop)
         distance, body, instance, triangle = self
-        return Nearest(distance[span], body[span], instance[span], triangle[span])
+        return NearestHits(distance[span], body[span], instance[span], triangle[span])
 
     def take(self, hits: BodyHits) -> None:
         """Write those hits on bodies that are nearer than the nearest hits so far."""
@@ -152,15 +152,17 @@ class Nearest(NamedTuple):
         return BodyHits(ray, distance[ray], body[ray], instance[ray], triangle[ray])
 
 
-def cast_crossing(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nearest) -> None:
+def cast_pairs(
+    cast: Callable[[Rays], HitColumns], pairs: RayBodyPairs, nearest: NearestHits
+) -> None:
     """Cast the rays of a crossing in the bodies' axes, and write nearer hits to `nearest`."""
-    rays = _in_body_axes(crossing)
+    rays = _in_body_axes(pairs)
     ray, distance, triangle, instance = cast(rays)
     # Directions of a sensor that turns during a pose are not quite of unit length.
     x, y, z = rays.directions.T[:, ray]
     distance = distance / np.sqrt((x * x + y * y) + z * z)
-    row = crossing.row[ray]
-    body = crossing.body[ray]
+    row = pairs.row[ray]
+    body = pairs.body[ray]
     nearer = _nearer_hits(nearest, row, distance, body)
     row = row[nearer]
     nearest.distance[row] = distance[nearer]
@@ -169,20 +171,20 @@ def cast_crossing(cast: Callable[[Rays], Part], crossing: Crossing, nearest: Nea
     nearest.triangle[row] = triangle[nearer]
 
 
-def _in_body_axes(crossing: Crossing) -> Rays:
+def _in_body_axes(pairs: RayBodyPairs) -> Rays:
     """Return the ray of each pair, relative to the body's position and in the body's axes."""
-    poses = crossing.poses[:, crossing.pose]
-    origins = crossing.rays[:3, crossing.row] - poses[:3]
-    directions = crossing.rays[3:, crossing.row]
+    poses = pairs.poses[:, pairs.pose]
+    origins = pairs.rays[:3, pairs.row] - poses[:3]
+    directions = pairs.rays[3:, pairs.row]
     inverse = poses[3:].reshape(3, 3, -1).transpose(1, 0, 2)
     origins, directions = (
         np.stack([(x * a + y * b) + z * c for a, b, c in inverse])
         for x, y, z in (origins, directions)
     )
-    return Rays(origins.T, directions.T, *crossing.limits)
+    return Rays(origins.T, directions.T, *pairs.limits)
 
 
-def _nearer_hits(nearest: Nearest, row: Ints, distance: Floats, body: Ints) -> Indices:
+def _nearer_hits(nearest: NearestHits, row: Ints, distance: Floats, body: Ints) -> Indices:
     """Return the hits (m,) that are nearer than known hits, the nearest of each ray last."""
     limit = nearest.distance[row]
     lower_body = (distance == limit) & (body < nearest.body[row])

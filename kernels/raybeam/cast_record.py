@@ -15,7 +15,7 @@ from .poses import Poses
 
 # A cast: addresses of arrays that the loops read or write, and numbers. Address 0: no array. A ray
 # belongs to a row of the pattern, which is a beam, or a sub-ray of a beam. Local: centered and
-# scaled, as `Frame` describes.
+# scaled, as `LocalFrame` describes.
 CAST = np.dtype(
     [
         ("mesh", "i8"),  # `MESH` records
@@ -38,7 +38,7 @@ CAST = np.dtype(
         ("has_axis", "i8"),  # whether `axis` defines the directions across and up of sub-rays
         ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
         ("axis", "f8", 3),
-        ("center", "f8", 3),  # the next two fields are of the scene's `Frame`
+        ("center", "f8", 3),  # the next two fields are of the scene's `LocalFrame`
         ("scale", "f8"),
         ("shares_origin", "i8"),  # whether all rays start at the position of a single pose
         ("tile", "i8"),  # memory of a tile, at a multiple of 64
@@ -119,7 +119,7 @@ def whole_vectors(subrays: int) -> int:
     return 1 if subrays == 1 else -(-subrays // 8) * 8
 
 
-class Cast:
+class CastRecord:
     """A `CAST` record, and references to the arrays whose addresses are in the record."""
 
     def __init__(self, base: AnyArray) -> None:

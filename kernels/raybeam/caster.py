@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints, Ints32
 from .backend import Backend
-from .body_rays import Crossing, Nearest, TimedBodies
-from .device import DeviceHits, DeviceNearest, OtherHits
-from .hits import Counted, Hits, ScanReturns
+from .body_rays import NearestHits, RayBodyPairs, TimedBodies
+from .device import DeviceHits, DeviceNearestHits, ExternalHits
+from .hits import Hits, ScanReturns, TallyCounts
 from .instances import Instance, Mesh, check_instances, check_transforms
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
@@ -158,22 +158,22 @@ class RayCaster:
         """Number of instances."""
         return len(self._scene.mesh)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
-        self.engine.cast_crossing(crossing, nearest)
+        self.engine.cast_pairs(pairs, nearest)
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
+    ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
 
         `time_index` (n,) contains the index of the time of each ray. Only hits at a distance of
         less than `end` meters are recorded. Raises BackendUnavailable if this backend does not use
         a device.
         """
-        return self.engine.device_nearest(scan, start, stop, time_index, end)
+        return self.engine.upload_rays(scan, start, stop, time_index, end)
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays at bodies with this shape on the device, and record closer hits in `nearest`.
 
         Raises BackendUnavailable if this backend does not use a device.
@@ -361,8 +361,8 @@ class RayCaster:
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
         """Cast a scan and pass its hits to a function on the CUDA device.
 
         Parameters
@@ -376,7 +376,7 @@ class RayCaster:
             Table and length of the scan's tally. The table is int64 (instances, 2): hits on
             triangle t of instance i are counted in row ``table[i, 0] + table[i, 1] * t`` of the
             tally. None for the rows of `ScanReturns.tally`.
-        other_hits
+        external_hits
             Hits that replace more distant hits of the caster. They are assigned to an additional
             instance after the last one. With a tally, the table in `counters` must have a row for
             this instance.
@@ -394,4 +394,4 @@ class RayCaster:
         BackendUnavailable
             If the backend of this caster is not cuda.
         """
-        return self.engine.visit(scan, use, counters, other_hits)
+        return self.engine.visit(scan, use, counters, external_hits)

@@ -15,16 +15,16 @@ import numpy as np
 from .arrays import AnyArray, Ints, Ints32
 from .backend import Backend, ClosestHits
 from .body_rays import TimedBodies
-from .cuda_tables import lay_out, lay_out_instances
-from .device import DeviceHits, DeviceNearest, HitTransfer, OtherHits, PendingCopy, to_device
-from .hits import Counted, ScanReturns
+from .cuda_tables import build_instance_tables, build_mesh_tables
+from .device import DeviceHits, DeviceNearestHits, ExternalHits, HitTransfer, PendingCopy, to_device
+from .hits import ScanReturns, TallyCounts
 from .installation import install_command
-from .instances import Scene
-from .opacity import Masks
+from .instances import LocalScene
+from .opacity import MaskTables
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
-from .scan import Groups, Scan, host_rays
+from .scan import HitGroups, Scan, host_rays
 
 T = TypeVar("T")
 
@@ -43,7 +43,7 @@ class _CastChunk(NamedTuple):
     start: int  # number of the first ray
     rays: tuple[Any, Any]  # origins and directions, float64 (3, n) each
     hits: tuple[Any, Any, Any]  # local distance, row and instance, (n,) each
-    other_hits: tuple[Any, ...]  # arguments of the kernel `pack`
+    external_hits: tuple[Any, ...]  # arguments of the kernel `pack`
     sums: Any  # int32 (n,): number of hits up to each ray
     span: slice  # groups of the rays
     later_starts: Ints  # first ray of each of these groups but the first, counted from `start`
@@ -112,16 +112,18 @@ class CudaBackend(Backend):
         with _device(cupy, device):
             cupy.get_default_memory_pool().set_limit(fraction=share)
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
         super().__init__(scene, threads, device)
         self._cupy = cupy = self.load_cupy()
         self._device = _device(cupy, device)
-        layout = lay_out(scene.meshes)
+        layout = build_mesh_tables(scene.meshes)
         self._roots = layout.roots
         self._stack = layout.stack
         self._masked = layout.masks is not None
         with self._device:
-            masks = layout.masks or Masks(*NO_MASKS)
+            masks = layout.masks or MaskTables(*NO_MASKS)
             tables: tuple[AnyArray, ...] = (
                 layout.nodes,
                 layout.triangles,
@@ -137,10 +139,10 @@ class CudaBackend(Backend):
             self._no_other_hits = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         self.update_scene(scene)
 
-    def update_scene(self, scene: Scene) -> None:
+    def update_scene(self, scene: LocalScene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
         super().update_scene(scene)
-        layout = lay_out_instances(scene, self._roots)
+        layout = build_instance_tables(scene, self._roots)
         with self._device:
             # In steps, so that scenes share compiled kernels.
             stack = -(-max(self._stack + layout.stack, 1) // _STACK_STEP) * _STACK_STEP
@@ -179,7 +181,7 @@ class CudaBackend(Backend):
         with self._device:
             table = self._ray_table(rays)
             hits = self._cast(table, n, (rays.t_min, rays.t_max))
-            groups = Groups(np.zeros(1, np.int64), 1)
+            groups = HitGroups(np.zeros(1, np.int64), 1)
             chunk = self._counted(0, table, hits, groups, self._no_other_hits)
             packed = self._pack(chunk, groups, 1.0, self._no_counters)
             u, v = self._weights(hits, table, packed[0])
@@ -231,19 +233,19 @@ class CudaBackend(Backend):
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
         """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does."""
         cp = self._cupy
         scene = self._scene
-        groups = Groups(scan.groups, scan.keep_every)
+        groups = HitGroups(scan.groups, scan.keep_every)
         with self._device:
             counting = self._no_counters
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
             chunks = (
-                self._cast_chunk(scan, start, stop, groups, other_hits)
+                self._cast_chunk(scan, start, stop, groups, external_hits)
                 for start, stop in scan.chunks(self.chunk)
             )
             try:
@@ -255,10 +257,10 @@ class CudaBackend(Backend):
                 raise
             return groups.hit_counts, self._nonzero_counters(counting[2]) if scan.tally else None
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
-        """Put rays `start` to `stop` (n) of a scan on the device, as `RayCaster.device_nearest`."""
+    ) -> DeviceNearestHits:
+        """Put rays `start` to `stop` (n) of a scan on the device, as `RayCaster.upload_rays`."""
         cp = self._cupy
         n = stop - start
         with self._device:
@@ -266,7 +268,7 @@ class CudaBackend(Backend):
                 rays = self._make_rays(scan, start, stop)
             else:  # the kernel has no sub-rays
                 rays = cp.asarray(host_rays(scan, start, stop))
-            return DeviceNearest(
+            return DeviceNearestHits(
                 rays=rays,
                 time_index=cp.asarray(time_index),
                 distance=cp.full(n, end, np.float64),
@@ -276,7 +278,7 @@ class CudaBackend(Backend):
                 cupy=cp,
             )
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
         cp = self._cupy
         n = len(nearest.time_index)
@@ -304,19 +306,23 @@ class CudaBackend(Backend):
                 nearest.triangle,
             )
 
-    def _nonzero_counters(self, tally: Any) -> Counted:
+    def _nonzero_counters(self, tally: Any) -> TallyCounts:
         """Copy the counters that are not 0 to the host, a small part of a tally."""
         rows = self._cupy.flatnonzero(tally)
         return rows.get(), tally[rows].get()
 
     def _replace(
-        self, hits: tuple[Any, Any, Any], start: int, n: int, other_hits: OtherHits | None
+        self, hits: tuple[Any, Any, Any], start: int, n: int, external_hits: ExternalHits | None
     ) -> tuple[Any, ...]:
-        """Replace hits of a cast behind `other_hits`, and return arguments of the kernel `pack`."""
-        if other_hits is None:
+        """Replace hits of a cast behind `external_hits`, and return arguments of the kernel `pack`."""
+        if external_hits is None:
             return self._no_other_hits
-        span = slice(*np.searchsorted(other_hits.ray, [start, start + n]))
-        tables = (other_hits.ray[span], other_hits.distance[span], other_hits.triangle[span])
+        span = slice(*np.searchsorted(external_hits.ray, [start, start + n]))
+        tables = (
+            external_hits.ray[span],
+            external_hits.distance[span],
+            external_hits.triangle[span],
+        )
         ray, meters, triangle = map(self._cupy.asarray, tables)
         count = np.int64(len(ray))
         scale = np.float64(self._scene.frame.scale)
@@ -413,12 +419,17 @@ class CudaBackend(Backend):
         return t, row, instance
 
     def _cast_chunk(
-        self, scan: Scan, start: int, stop: int, groups: Groups, other_hits: OtherHits | None
+        self,
+        scan: Scan,
+        start: int,
+        stop: int,
+        groups: HitGroups,
+        external_hits: ExternalHits | None,
     ) -> _CastChunk:
         """Cast rays `start` to `stop` of a scan, and count the hits, without waiting."""
         rays = _table(self._make_rays(scan, start, stop))
         hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
-        replacing = self._replace(hits, start, stop - start, other_hits)
+        replacing = self._replace(hits, start, stop - start, external_hits)
         return self._counted(start, rays, hits, groups, replacing)
 
     def _counted(
@@ -426,8 +437,8 @@ class CudaBackend(Backend):
         start: int,
         rays: tuple[Any, Any],
         hits: tuple[Any, Any, Any],
-        groups: Groups,
-        other_hits: tuple[Any, ...],
+        groups: HitGroups,
+        external_hits: tuple[Any, ...],
     ) -> _CastChunk:
         """Count the hits of a cast up to each ray, and start to copy counts of groups to the host.
 
@@ -442,7 +453,7 @@ class CudaBackend(Backend):
             start=start,
             rays=rays,
             hits=hits,
-            other_hits=other_hits,
+            external_hits=external_hits,
             sums=sums,
             span=span,
             later_starts=later_starts,
@@ -452,7 +463,7 @@ class CudaBackend(Backend):
     def _pack(
         self,
         chunk: _CastChunk,
-        groups: Groups,
+        groups: HitGroups,
         scale: float,
         counting: tuple[Any, np.int32, Any],
     ) -> tuple[Any, Any, Any, Any]:
@@ -479,7 +490,7 @@ class CudaBackend(Backend):
             np.int64(n),
             np.float64(scale),
             np.int64(chunk.start),
-            *chunk.other_hits,
+            *chunk.external_hits,
             cp.asarray(table.astype(np.int32)),
             np.int32(len(kept_counts)),
             np.int32(min(groups.keep_every, _MAX_INT)),

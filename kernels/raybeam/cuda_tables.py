@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import AnyArray, Floats, Floats32, Ints, Ints32
-from .instances import Scene
+from .instances import LocalScene
 from .mesh import LocalMesh
-from .opacity import Masks, join_masks
+from .opacity import MaskTables, join_masks
 from .tree import WideTree, build_top, build_tree, join
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
@@ -19,7 +19,7 @@ _FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflow
 
 
 @dataclass(frozen=True)
-class Layout:
+class MeshTables:
     """Tables of meshes, with the columns that the head of intersect.cu describes.
 
     Attributes
@@ -46,7 +46,7 @@ class Layout:
     faces: Ints32
     roots: Ints
     stack: int
-    masks: Masks | None
+    masks: MaskTables | None
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class InstanceTables:
     instances
         float64 (n, 20): matrix, box, root and mesh of each instance.
     frame
-        float64 (10,): `Frame.table` of the scene.
+        float64 (10,): `LocalFrame.table` of the scene.
     stack
         Maximum nodes of `top` that wait.
     """
@@ -71,24 +71,24 @@ class InstanceTables:
     stack: int
 
 
-def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
+def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
     """Build the trees over meshes, and return all tables of the meshes."""
     trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
     tree, roots = join(trees)
     corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     faces = [mesh.index[t.order] for mesh, t in zip(meshes, trees, strict=True)]
-    return Layout(
+    return MeshTables(
         nodes=_nodes(tree),
         triangles=_joined([_records(table) for table in corners]),
         corners=_joined(corners).reshape(-1, 9),
         faces=_joined(faces),
         roots=roots,
-        stack=max(map(stack_need, trees)),
+        stack=max(map(max_stack_depth, trees)),
         masks=join_masks([mesh.opacity for mesh in meshes], [tree.order for tree in trees]),
     )
 
 
-def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
+def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
     """Build the tree over the instances, and return the tables, or dummies for a plain scene."""
     if scene.matrices is None:
         return InstanceTables(
@@ -103,7 +103,7 @@ def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
     instances[:, 18] = roots[scene.mesh]
     instances[:, 19] = scene.mesh
     # One more for the root of the top.
-    return InstanceTables(_nodes(tree), instances, scene.frame.table, stack_need(tree) + 1)
+    return InstanceTables(_nodes(tree), instances, scene.frame.table, max_stack_depth(tree) + 1)
 
 
 def _joined(tables: list[AnyArray]) -> AnyArray:
@@ -149,7 +149,7 @@ def _records(corners: Floats) -> Floats32:
     return table.reshape(-1, 12)
 
 
-def stack_need(tree: WideTree) -> int:
+def max_stack_depth(tree: WideTree) -> int:
     """Return the maximum of waiting nodes on a descent: siblings at each level above."""
     used = (tree.lower[:, 0] <= tree.upper[:, 0]).sum(axis=1)
     waiting = np.zeros(len(tree.child), np.int64)  # one number for each node

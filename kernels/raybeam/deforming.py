@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from .arrays import Floats, Ints
-from .body_rays import Crossing, Nearest
+from .body_rays import NearestHits, RayBodyPairs
 from .tree import build_tree
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ _LEAF_SIZE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Deforming:
-    """A mesh whose vertices move linearly between frames, for use as a shape in `Moving`.
+class DeformingMesh:
+    """A mesh whose vertices move linearly between frames, for use as a shape in `MovingBodies`.
 
     Frame numbers start at 0, and frame 1.5 is halfway between the second and the third frame. The
     mesh keeps its shape before the first and after the last frame.
@@ -48,14 +48,14 @@ class Deforming:
         """Lower and upper corner of the bounding box of all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays at bodies with this shape, and record closer hits in `nearest`.
 
         Ties are resolved in favor of the lowest triangle index.
         """
         from . import deforming_loops as loops
 
-        loops.cast_crossing(crossing.contiguous(), self._tree, nearest)
+        loops.cast_pairs(pairs.contiguous(), self._tree, nearest)
 
     @cached_property
     def _tree(self) -> DeformingTree:

@@ -10,7 +10,7 @@ from numba import types
 from .arrays import Floats, Floats32, Ints, Ints32
 from .cast_record import float32s, float64s
 from .compiled import compiled, inlined, stage
-from .moving_loops import CROSSING, NEAREST, named_tuple_type, pose_rotation, to_body_axes
+from .moving_loops import NEAREST_HITS, PAIRS, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS
 from .triangle_loops import areas, same_sign, shear
 
@@ -134,26 +134,26 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
     )
 
 
-@compiled(types.void(CROSSING, _TREE, NEAREST))
-def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast the pairs of a `Crossing` on a deforming mesh, and write nearer hits to a `Nearest`.
+@compiled(types.void(PAIRS, _TREE, NEAREST_HITS))
+def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+    """Cast the pairs of a `RayBodyPairs` on a deforming mesh, and write nearer hits to a `NearestHits`.
 
-    Each ray meets the mesh in its shape at `Crossing.frame`. Nodes are visited nearest first;
+    Each ray meets the mesh in its shape at `RayBodyPairs.frame`. Nodes are visited nearest first;
     `waits` are the distances of the nodes on the stack.
     """
-    rays = crossing.rays
-    poses = crossing.poses
-    body = crossing.body
+    rays = pairs.rays
+    poses = pairs.poses
+    body = pairs.body
     vertices, faces, order, child, boxes = tree
     distance, bodies, instance, triangle = nearest
     stack = np.empty(_STACK, np.int64)
     waits = np.empty(_STACK)
     enters = np.empty(WIDTH)
-    t_min, t_max = crossing.limits
+    t_min, t_max = pairs.limits
     last = np.int64(len(vertices) - 2)
     for n in range(len(body)):
-        k = crossing.row[n]
-        p = crossing.pose[n]
+        k = pairs.row[n]
+        p = pairs.pose[n]
         rotation = pose_rotation(poses, p)
         x = rays[0, k] - poses[0, p]
         y = rays[1, k] - poses[1, p]
@@ -164,9 +164,9 @@ def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # n
         inverse = _inverse(u), _inverse(v), _inverse(w)
         axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
         sheared_ray = a, b, c, d, e, f
-        frame = np.int64(max(crossing.frame[n], 0.0))
+        frame = np.int64(max(pairs.frame[n], 0.0))
         frame = frame if frame < last else last
-        share = min(max(crossing.frame[n] - frame, 0.0), 1.0)
+        share = min(max(pairs.frame[n] - frame, 0.0), 1.0)
         frame_boxes = boxes.ctypes.data + _BOX * len(child) * frame
         best = min(distance[k], t_max)
         hit_triangle = np.int64(-1)

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 from .arrays import AnyArray, Floats, Ints32, UInts32
 from .body_rays import BodyHits
-from .hits import Part
+from .hits import HitColumns
 
 PINNED_BYTES = 1 << 30  # page-locked, of all outboxes of a process
 _MAX_PENDING = 2  # copies: a copy runs while the arrays of the next are computed
@@ -51,13 +51,13 @@ class DeviceHits:
         """
         return self.make_rays(self.ray)
 
-    def get(self) -> Part:
+    def get(self) -> HitColumns:
         """Copy the hits to the host."""
         return self.ray.get(), self.distance.get(), self.triangle.get(), self.instance.get()
 
 
 @dataclass(frozen=True, eq=False)
-class OtherHits:
+class ExternalHits:
     """Hits of a scan's rays on surfaces outside the caster, such as moving bodies.
 
     Attributes
@@ -76,7 +76,7 @@ class OtherHits:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceNearest:
+class DeviceNearestHits:
     """Rays on a CUDA device, and their nearest hits on moving bodies so far, as CuPy arrays.
 
     Attributes
@@ -86,7 +86,7 @@ class DeviceNearest:
     time_index
         int32 (n,): number of each ray's time.
     distance, body, instance, triangle
-        (n,): as in `Nearest`.
+        (n,): as in `NearestHits`.
     cupy
         The module.
     """
@@ -145,7 +145,7 @@ class _Pinned:
 _pinned = _Pinned()
 
 
-def host_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
+def pinned_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
     """Return an array (count,) in page-locked memory, for the device to write to directly.
 
     The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
@@ -178,7 +178,7 @@ class PendingCopy:
 
     def __init__(self, cupy: Any, array: Any) -> None:
         stream = cupy.cuda.get_current_stream()
-        self._values = host_array(cupy, len(array), array.dtype)
+        self._values = pinned_array(cupy, len(array), array.dtype)
         array.get(stream=stream, out=self._values, blocking=False)
         self._copied = stream.record()
         self._source = array  # the device still reads the array
@@ -189,7 +189,7 @@ class PendingCopy:
         return self._values
 
 
-class Outbox:
+class CopyQueue:
     """Queue of copies of arrays to the host, in a separate stream, while the device goes on.
 
     Parameters
@@ -207,7 +207,7 @@ class Outbox:
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
         """Start to copy arrays that the current stream computes: pairs of source and target.
 
-        Targets are arrays from `host_array`.
+        Targets are arrays from `pinned_array`.
         """
         self._stream.wait_event(self._cupy.cuda.get_current_stream().record())
         for source, target in pairs:
@@ -240,9 +240,9 @@ class HitTransfer:
     """
 
     def __init__(self, cupy: Any, max_hits: int, *, nested: bool) -> None:
-        self._outbox = Outbox(cupy)
+        self._outbox = CopyQueue(cupy)
         kinds = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
-        self._arrays = [host_array(cupy, max_hits, kind) for kind in kinds]
+        self._arrays = [pinned_array(cupy, max_hits, kind) for kind in kinds]
         self._max_hits = max_hits
         self._count = 0
 
@@ -254,18 +254,18 @@ class HitTransfer:
         self._outbox.send([(column, array[rows]) for column, array in pairs])
         self._count += len(hits)
 
-    def finish(self) -> Part:
+    def finish(self) -> HitColumns:
         """Wait for all copies, and return the hits."""
         self._outbox.wait()
         ray, distance, triangle, *instances = (
-            filled(array, self._count, self._max_hits) for array in self._arrays
+            trim_to_count(array, self._count, self._max_hits) for array in self._arrays
         )
         instance = instances[0] if instances else np.zeros(self._count, np.int32)
         return ray, distance, triangle, instance
 
 
-def filled(array: AnyArray, count: int, room: int) -> AnyArray:
-    """Return the first `count` values of an array from `host_array`, which has `room` values.
+def trim_to_count(array: AnyArray, count: int, room: int) -> AnyArray:
+    """Return the first `count` values of an array from `pinned_array`, which has `room` values.
 
     If less than half of the room is in use, the values are a copy: the page-locked memory is given
     back.

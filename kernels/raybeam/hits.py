@@ -9,10 +9,10 @@ import numpy as np
 from .arrays import Bools, Floats, Ints, Ints32, UInts32
 
 # Ray, distance, triangle and instance of hits, as in `ScanReturns`.
-Part = tuple[UInts32, Floats, Ints32, Ints32]
+HitColumns = tuple[UInts32, Floats, Ints32, Ints32]
 
 # Numbers of the counters of a tally that are not 0, ascending, and their hits.
-Counted = tuple[Ints, Ints]
+TallyCounts = tuple[Ints, Ints]
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class ScanReturns:
         return len(self.ray)
 
 
-def join_hits(parts: list[Part]) -> Part:
+def join_hits(parts: list[HitColumns]) -> HitColumns:
     """Join the hits of parts, in order, without a copy of a single part."""
     if len(parts) == 1:
         return parts[0]

@@ -1,12 +1,12 @@
 """Meshes, their instances, and the scene of a caster.
 
-Rays are cast in two levels. The scene and each mesh have local coordinates (`Frame`). At an
+Rays are cast in two levels. The scene and each mesh have local coordinates (`LocalFrame`). At an
 instance, a matrix transforms the ray from the scene's to the mesh's coordinates, and the direction
 is made a unit vector again, so the properties of rays and meshes in [-1, 1] hold: every error
 bound, and that no ray slips between two triangles. The distance is divided by the length of the
 direction before that.
 
-All backends do these operations in float64, in the order of `Scene.enter`, without a fused
+All backends do these operations in float64, in the order of `LocalScene.enter`, without a fused
 multiply-add.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
-from .mesh import Frame, LocalMesh, center_and_scale, local_mesh
+from .mesh import LocalFrame, LocalMesh, center_and_scale, local_mesh
 from .opacity import Opacity
 from .poses import determinants
 from .tree import PAD
@@ -89,9 +89,9 @@ class MeshFrames:
     Attributes
     ----------
     scale
-        float64 (n,): `Frame.scale`.
+        float64 (n,): `LocalFrame.scale`.
     center
-        float64 (n, 3): `Frame.center`, meters.
+        float64 (n, 3): `LocalFrame.center`, meters.
     middle
         float64 (n, 3): middle of the mesh's box, relative to `center`, meters.
     half
@@ -105,7 +105,7 @@ class MeshFrames:
 
     @classmethod
     def of_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
-        """Return the frames of the meshes of instances, for arguments as in `Scene`."""
+        """Return the frames of the meshes of instances, for arguments as in `LocalScene`."""
         frames = [local.frame for local in meshes]
         scale = np.array([frame.scale for frame in frames])[mesh]
         lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
@@ -115,7 +115,7 @@ class MeshFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LocalScene:
     """Instances and meshes in the representation used by backends.
 
     Attributes
@@ -139,7 +139,7 @@ class Scene:
 
     meshes: tuple[LocalMesh, ...]
     mesh: Indices
-    frame: Frame
+    frame: LocalFrame
     matrices: Floats | None
     boxes: Floats
     mesh_frames: MeshFrames | None = None
@@ -165,7 +165,7 @@ class Scene:
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
-    def moved(self, transforms: Floats) -> Scene:
+    def moved(self, transforms: Floats) -> LocalScene:
         """Return a copy of the scene with new transforms of shape (n, 3, 4).
 
         The scene must be nested, and the transforms must already have been validated.
@@ -206,14 +206,14 @@ class Scene:
         return moved, np.stack([u / length, v / length, w / length], axis=1), length
 
 
-def plain(mesh: LocalMesh) -> Scene:
+def plain(mesh: LocalMesh) -> LocalScene:
     """Return the plain scene of a single mesh without a transform."""
     frame = mesh.frame
     boxes = np.stack([frame.lower, frame.upper])[None]
-    return Scene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
+    return LocalScene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
 
 
-def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
+def check_instances(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
     """Return the scene of instances, and their transforms (n, 3, 4).
 
     Raises
@@ -316,13 +316,13 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
 
 def _nested_scene(
     meshes: tuple[LocalMesh, ...], mesh: Indices, mesh_frames: MeshFrames, transforms: Floats
-) -> Scene:
+) -> LocalScene:
     """Return a nested scene: instances with transforms.
 
     Parameters
     ----------
     meshes, mesh
-        Meshes, and the number of each instance's mesh, intp (n,), as in `Scene`.
+        Meshes, and the number of each instance's mesh, intp (n,), as in `LocalScene`.
     mesh_frames
         Frames of these meshes.
     transforms
@@ -340,7 +340,7 @@ def _nested_scene(
     matrices = np.empty((len(mesh), 3, 4))
     matrices[:, :, :3] = inverse * (scale / frame.scale)[:, None, None]
     matrices[:, :, 3] = _product(inverse, offset) * scale[:, None]
-    return Scene(
+    return LocalScene(
         meshes=meshes,
         mesh=mesh,
         frame=frame,
@@ -350,7 +350,7 @@ def _nested_scene(
     )
 
 
-def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:
+def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFrame, Floats]:
     """Return the frame of a scene, and its boxes (n, 2, 3) of instances, local.
 
     Boxes have their centers at ``center + shift``, and halves of their sides `half`: (n, 3) each.
@@ -362,7 +362,7 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[Frame, Fl
     boxes = np.stack([local - half * unit, local + half * unit], axis=1)
     lower = boxes[:, 0].min(axis=0) - PAD
     upper = boxes[:, 1].max(axis=0) + PAD
-    return Frame(origin, unit, lower, upper), boxes
+    return LocalFrame(origin, unit, lower, upper), boxes
 
 
 def _product(matrices: Floats, vectors: Floats) -> Floats:

@@ -26,7 +26,7 @@
 //              the second corner and band of c, edge to the third and band of t.
 //   corners    9 doubles a triangle, in the same order.
 //   faces      the caller's number of each triangle.
-//   uvs, masks, opacity  as in `Masks` of opacity.py.
+//   uvs, masks, opacity  as in `MaskTables` of opacity.py.
 //   frame      10 doubles: center (3), scale, lower corner of the scene's box (3), upper corner (3).
 //   top        as nodes, over the instances: a leaf holds the number of an instance.
 //   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), lower corner of the
@@ -213,7 +213,7 @@ struct BodyRays {
         c = (x * r[2] + y * r[5]) + z * r[8];
     }
 
-    // Compute a ray; return the length of its direction, as `cast_crossing` of body_rays.py.
+    // Compute a ray; return the length of its direction, as `cast_pairs` of body_rays.py.
     __device__ __forceinline__ double make(const Scene& scene, int i, Ray& ray) const
     {
         const double* pose = poses + 12 * (Count)row;
@@ -308,7 +308,7 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
-// Return whether the mesh's mask stops a ray that passes inside a triangle, as `Masks.opaque`.
+// Return whether the mesh's mask stops a ray that passes inside a triangle, as `MaskTables.opaque`.
 __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, const Exact& hit)
 {
     const Count* record = scene.opacity + 4 * (Count)mesh;
@@ -686,7 +686,7 @@ KERNEL cast_table(
 #undef BLOCKS
 #define BLOCKS (NESTED ? (MASKED ? 2 : 3) : 4)
 
-// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of body_rays.py. Ray i
+// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_pairs` of body_rays.py. Ray i
 // meets the bodies at time t = when[i] - first_time, if t is one of `times`: the pose of body k then, 12
 // doubles, is at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
 // during SPAN times: lower and upper corner. `nearest_...` are read and written.

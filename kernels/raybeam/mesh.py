@@ -25,7 +25,7 @@ _BLOCK = 1 << 16  # triangles that are processed together
 
 
 @dataclass(frozen=True)
-class Frame:
+class LocalFrame:
     """Local coordinates: moved to the center of a box and scaled into [-1, 1].
 
     The translation makes coordinates of hundreds of kilometers accurate enough in float32; the
@@ -103,7 +103,7 @@ class LocalMesh:
         Opacity of the triangles; None if all are opaque.
     """
 
-    frame: Frame
+    frame: LocalFrame
     corners: Floats
     index: Ints32
     face_count: int
@@ -145,7 +145,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     by_triangle = corners.reshape(-1, 9)
     lower = by_triangle.min(axis=0).reshape(3, 3).min(axis=0) - PAD
     upper = by_triangle.max(axis=0).reshape(3, 3).max(axis=0) + PAD
-    frame = Frame(center, scale, lower, upper)
+    frame = LocalFrame(center, scale, lower, upper)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(
         frame=frame,

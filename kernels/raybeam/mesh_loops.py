@@ -20,7 +20,7 @@ i32_1 = types.int32[::1]
 
 @stage
 def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray from the scene's to the mesh's local coordinates, as `Scene.enter`.
+    """Transform a ray from the scene's to the mesh's local coordinates, as `LocalScene.enter`.
 
     `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
     the length of the direction before it was made a unit vector.
@@ -53,7 +53,7 @@ def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
 
 @stage
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`.
+    """Return whether the mask of a mesh stops a ray in a triangle, as `MaskTables.opaque`.
 
     `mesh` points to a `MESH`, `triangle` is the row in its corners.
     """

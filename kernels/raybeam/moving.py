@@ -23,9 +23,9 @@ import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints, Ints32
 from .backend import BackendUnavailable
-from .body_rays import SPAN, BodyHits, Crossing, Nearest, TimedBodies
+from .body_rays import SPAN, BodyHits, NearestHits, RayBodyPairs, TimedBodies
 from .caster import RayCaster
-from .deforming import Deforming
+from .deforming import DeformingMesh
 from .installation import install_command
 from .scan import Scan, host_rays
 
@@ -42,7 +42,7 @@ _NO_FRAMES = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
+class MovingBodies:
     """Moving bodies, each with a shape and a pose at every time.
 
     Attributes
@@ -62,10 +62,10 @@ class Moving:
     frames
         Function of body indices (m,) and times (m,) that returns the frame number of the shape of
         each body, float64 (m,). It is only called for deforming bodies. Frame 1.5 is halfway
-        between frames 1 and 2 of a `Deforming` mesh. None if there are no deforming bodies.
+        between frames 1 and 2 of a `DeformingMesh` mesh. None if there are no deforming bodies.
     """
 
-    shapes: tuple[RayCaster | Deforming, ...]
+    shapes: tuple[RayCaster | DeformingMesh, ...]
     boxes: Floats
     shape: Indices
     presence: Floats
@@ -98,9 +98,9 @@ class Moving:
         return np.asarray((first <= times) & (times <= last))
 
 
-def hits_on(
-    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
-) -> Nearest:
+def nearest_body_hits(
+    moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
+) -> NearestHits:
     """Return the nearest hit of each ray of a scan on a body.
 
     Parameters
@@ -125,7 +125,7 @@ def hits_on(
     from . import moving_loops as loops  # numba takes half a second to import
 
     end = _end(scan)
-    nearest = Nearest.without_hits(
+    nearest = NearestHits.without_hits(
         np.full(len(scan), end) if limits is None else np.minimum(limits, end)
     )
     on_device = moving.on_device
@@ -141,16 +141,16 @@ def hits_on(
     return nearest
 
 
-def listed_hits_on(moving: Moving, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
-    """Return the hits of `hits_on`, for the same arguments, without the rays that hit no body.
+def body_hits(moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
+    """Return the hits of `nearest_body_hits`, for the same arguments, without the rays that hit no body.
 
     Without host memory for each ray, if all shapes are on a device.
     """
     if not moving.on_device.all():
-        return hits_on(moving, scan, times).hits()
+        return nearest_body_hits(moving, scan, times).hits()
     parts = [*_hits_on_device(moving, scan, times, np.arange(len(moving.shape)))]
     if not parts:
-        return Nearest.without_hits(np.zeros(0)).hits()
+        return NearestHits.without_hits(np.zeros(0)).hits()
     return BodyHits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -160,7 +160,7 @@ def _end(scan: Scan) -> float:
 
 
 def _hits_on_device(
-    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
+    moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
 ) -> Iterator[BodyHits]:
     """Yield the nearest hits of consecutive rays of a scan on bodies (b,) on a device."""
     if not len(bodies):
@@ -173,7 +173,7 @@ def _hits_on_device(
         distinct_times, time_index = _distinct(times(np.arange(start, stop, dtype=np.int64)))
         caster = casters[int(shape[0])]
         assert isinstance(caster, RayCaster)
-        nearest = caster.device_nearest(scan, start, stop, time_index, _end(scan))
+        nearest = caster.upload_rays(scan, start, stop, time_index, _end(scan))
         for first in range(0, len(distinct_times), step):
             poses, boxes = _poses_and_boxes(moving, bodies, distinct_times[first : first + step])
             for number, caster in casters.items():
@@ -202,7 +202,7 @@ def _distinct(times: Floats) -> tuple[Floats, Ints32]:
     return distinct_times, inverse.astype(np.int32)
 
 
-def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
     """Return the poses and the boxes of bodies (b,) at times (t,).
 
     `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of bodies.
@@ -224,7 +224,7 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
     return poses, np.moveaxis(np.concatenate(boxes), 0, -1)
 
 
-def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
+def _corners(moving: MovingBodies, shape: Indices, poses: Floats) -> Floats:
     """Return the lower and upper corners (2, 3, m) of boxes around shapes (m,) at poses (12, m).
 
     The boxes are along the axes of the scene, meters, with a margin for rounding errors.
@@ -243,7 +243,7 @@ def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
     return corners
 
 
-def near_boxes(
+def pair_cells_with_boxes(
     rays: Floats, times: Floats, boxes: Floats, presence: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
     """Return pairs of a cell of rays and a static box that may meet.
@@ -270,8 +270,8 @@ def near_boxes(
     """
     from . import moving_loops as loops
 
-    cells = loops.cells_of(rays, times, loops.CELL)
-    wide_cells = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
+    cells = loops.make_cells(rays, times, loops.CELL)
+    wide_cells = loops.make_cells(rays, times, loops.CELL * loops.WIDE)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
     spheres = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), presence])
     sample_of_cell = np.zeros((len(cells), 2), np.int64)
@@ -280,7 +280,7 @@ def near_boxes(
     for first in range(0, len(boxes), _BOXES):
         span = slice(first, first + _BOXES)
         samples = loops.BodySamples(sample_of_cell, sampled[span], spheres[span])
-        cell, box = loops.cells_near_bodies(wide_cells, cells, samples, reach)
+        cell, box = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         parts.append(np.stack([cell, box + first]))
     cell, box = np.concatenate(parts, axis=1)
     return cell, box, loops.CELL
@@ -312,7 +312,7 @@ class _CellPoses(NamedTuple):
 
 
 class _RayPairs(NamedTuple):
-    """Pairs of a ray and a body whose box the ray passes, as in `Crossing`."""
+    """Pairs of a ray and a body whose box the ray passes, as in `RayBodyPairs`."""
 
     row: Ints  # (m,), number of the ray in the chunk
     body: Ints  # (m,), number of the body
@@ -324,7 +324,13 @@ class _Chunk:
     """Consecutive rays of a scan: float64 (6, n), their times (n,), and their nearest hits (n,)."""
 
     def __init__(
-        self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
+        self,
+        loops: Any,
+        moving: MovingBodies,
+        scan: Scan,
+        rays: Floats,
+        times: Floats,
+        nearest: NearestHits,
     ) -> None:
         self._loops = loops
         self._moving = moving
@@ -343,14 +349,14 @@ class _Chunk:
     def _cast_near_cells(self, bodies: Ints) -> None:
         """Cast the cells on bodies (b,) near them: first on near bodies, where rays then end."""
         loops = self._loops
-        cells = loops.cells_of(self._rays, self._times, loops.CELL)
-        wide_cells = loops.cells_of(self._rays, self._times, loops.CELL * loops.WIDE)
+        cells = loops.make_cells(self._rays, self._times, loops.CELL)
+        wide_cells = loops.make_cells(self._rays, self._times, loops.CELL * loops.WIDE)
         samples = self._samples(bodies, cells)
         centers = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
         order = np.argsort((centers**2).sum(axis=1), kind="stable")
         samples = samples._replace(boxes=samples.boxes[order], spheres=samples.spheres[order])
         reach = float(self._nearest.distance.max())
-        cell, sampled_body = loops.cells_near_bodies(wide_cells, cells, samples, reach)
+        cell, sampled_body = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         body = bodies[order][sampled_body]
         spans = cells[:, loops.BEGIN : loops.END + 1]
         for start in range(0, len(cell), CHUNK_PAIRS):
@@ -409,10 +415,10 @@ class _Chunk:
             body = pairs.body[rows]
             caster = moving.shapes[number]
             frame = _NO_FRAMES
-            if isinstance(caster, Deforming):
+            if isinstance(caster, DeformingMesh):
                 assert moving.frames is not None, "of bodies that deform"
                 frame = moving.frames(body, self._times[row])
-            crossing = Crossing(
+            ray_body_pairs = RayBodyPairs(
                 rays=self._rays,
                 row=row,
                 body=body,
@@ -422,7 +428,7 @@ class _Chunk:
                 limits=limits,
                 frame=frame,
             )
-            caster.cast_crossing(crossing, self._nearest)
+            caster.cast_pairs(ray_body_pairs, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
         """Return pairs of a cell and a body (m,) with the body's pose and the margin of its box."""
@@ -449,7 +455,7 @@ class _Chunk:
         moving = self._moving
         times = self._times
         shape = moving.shape[pairs.body]
-        cell_pairs = loops.CellPairs(pairs.cell, pairs.pose, shape, pairs.pads)
+        cell_pairs = loops.CellBodyPairs(pairs.cell, pairs.pose, shape, pairs.pads)
         boxes = moving.boxes.reshape(-1, 6)
         row, pair = loops.rays_through_boxes(
             self._rays, self._nearest.distance, cell_pairs, pairs.poses, boxes
@@ -475,7 +481,7 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m) of `Moving.poses`."""
+    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m) of `MovingBodies.poses`."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 
 from .arrays import Floats, Indices, Ints
-from .body_rays import Crossing, Nearest
+from .body_rays import NearestHits, RayBodyPairs
 from .cast_record import float64s, int64s
 from .compiled import compiled, inlined, stage
 
@@ -62,7 +62,7 @@ class BodySamples(NamedTuple):
     spheres: Floats
 
 
-class CellPairs(NamedTuple):
+class CellBodyPairs(NamedTuple):
     """Pairs of a cell of rays and a body.
 
     Attributes
@@ -89,16 +89,16 @@ def named_tuple_type(kind: type, *fields: types.Type) -> types.Type:
 
 
 _SAMPLES = named_tuple_type(BodySamples, _i64_2, types.float64[:, :, ::1], _f64_2)
-_PAIRS = named_tuple_type(CellPairs, _i64_1, _i64_1, _i64_1, _f64_1)
+_PAIRS = named_tuple_type(CellBodyPairs, _i64_1, _i64_1, _i64_1, _f64_1)
 LIMITS = types.UniTuple(types.float64, 2)
-CROSSING = named_tuple_type(
-    Crossing, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1
+PAIRS = named_tuple_type(
+    RayBodyPairs, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1
 )
-NEAREST = named_tuple_type(Nearest, _f64_1, _i64_1, _i32_1, _i32_1)
+NEAREST_HITS = named_tuple_type(NearestHits, _f64_1, _i64_1, _i32_1, _i32_1)
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
-def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Return cells (c, 15): each is `size` consecutive rays (6, n), fired at times (n,).
 
     The constants `AXIS` to `MAX_SINE` are the columns of cells.
@@ -175,7 +175,7 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR091
 def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Return whether rays of a cell may meet a body in its box.
 
-    `cell` points to a row of `cells_of`, `box` and `sphere` point to rows of `BodySamples`. `reach`
+    `cell` points to a row of `make_cells`, `box` and `sphere` point to rows of `BodySamples`. `reach`
     is the greatest distance at which a ray ends, meters.
     """
     radius = sphere[0]
@@ -249,7 +249,7 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
     return count
 
 
-def cells_near_bodies(
+def pair_cells_with_bodies(
     wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
     """Return pairs of a cell and a body that its rays may meet, by body, then by cell.
@@ -257,7 +257,7 @@ def cells_near_bodies(
     Parameters
     ----------
     wide_cells, cells
-        float64 (w, 15) and (c, 15), from `cells_of`: cells of `WIDE` times as many rays, and cells
+        float64 (w, 15) and (c, 15), from `make_cells`: cells of `WIDE` times as many rays, and cells
         of `CELL` rays. Most wide cells rule out all their cells at once.
     samples
         The bodies.
@@ -415,7 +415,7 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
 
 
 def rays_through_boxes(
-    rays: Floats, reaches: Floats, pairs: CellPairs, poses: Floats, boxes: Floats
+    rays: Floats, reaches: Floats, pairs: CellBodyPairs, poses: Floats, boxes: Floats
 ) -> tuple[Indices, Indices]:
     """Return the rays of cells that pass through boxes of bodies, and the pair of each.
 

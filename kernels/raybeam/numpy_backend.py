@@ -19,7 +19,7 @@ import numpy as np
 from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, ClosestHits
-from .instances import Scene
+from .instances import LocalScene
 from .mesh import ACROSS, TINY, clip
 from .opacity import join_masks
 from .rays import Rays
@@ -211,7 +211,9 @@ class NumpyBackend(Backend):
         """Return "": NumPy is always usable."""
         return ""
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
         super().__init__(scene, threads, device)
         meshes = scene.meshes
         trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
@@ -225,7 +227,7 @@ class NumpyBackend(Backend):
         self._face = np.concatenate([mesh.index for mesh in meshes])[tree.order]
         self.update_scene(scene)
 
-    def update_scene(self, scene: Scene) -> None:
+    def update_scene(self, scene: LocalScene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
         super().update_scene(scene)
         if scene.nested:

@@ -1,7 +1,7 @@
 """Masks that make parts of triangles transparent: leaves, fences, nets.
 
 A triangle that a ray passes inside counts only where the mask is true. All backends compute the
-position in the mask in float64 with the operations of `Masks.opaque`, in that order.
+position in the mask in float64 with the operations of `MaskTables.opaque`, in that order.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
 
 
 @dataclass(frozen=True, eq=False)
-class Masks:
+class MaskTables:
     """Opacities of several meshes as tables.
 
     Attributes
@@ -132,7 +132,7 @@ class Masks:
         return stopped
 
 
-def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Masks | None:
+def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> MaskTables | None:
     """Join the opacities of meshes, with triangles in given orders, or None if all are opaque.
 
     A mask that meshes share, as the same memory, is stored once.
@@ -155,4 +155,4 @@ def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Ma
             uv.append(opacity.uv[order])
             rows += len(order)
         triangles += len(order)
-    return Masks(np.concatenate(uv), np.concatenate(mask), records) if rows else None
+    return MaskTables(np.concatenate(uv), np.concatenate(mask), records) if rows else None

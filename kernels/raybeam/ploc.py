@@ -5,8 +5,8 @@ filling curve; then each box is compared with its neighbors in that order, and p
 best partners (least area of the common box) are merged. Every step is a few operations on whole
 arrays. Near the root, few clusters are left and neighbors on the curve are seldom the best:
 clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
-divided from the root down, by a full sweep with the surface area heuristic (sah_builder.py), which takes
-a tenth of a second.
+divided from the root down, by a full sweep with the surface area heuristic (sah_builder.py), which
+takes a tenth of a second.
 """
 
 from __future__ import annotations

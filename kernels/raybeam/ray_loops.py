@@ -562,7 +562,7 @@ def compiled_rays(
     The arguments are as in `pattern_rays.checked_rays`. Origins are None if all rays start at the
     position of a single pose.
     """
-    cast = memory.Cast(np.zeros(1, memory.CAST))
+    cast = memory.CastRecord(np.zeros(1, memory.CAST))
     record = cast.record
     cast.set_pattern(pattern, poses, first)
     record["scale"] = 1.0  # local coordinates are meters, about the origin of the scene

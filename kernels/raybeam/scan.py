@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Floats, Indices, Integers, Ints, Ints32
-from .hits import Part, ScanReturns, join_hits
+from .hits import HitColumns, ScanReturns, join_hits
 from .pattern import Pattern
 from .pattern_rays import checked_rays
 from .poses import PoseMotion, Poses, check_poses
@@ -136,7 +136,7 @@ def host_rays(scan: Scan, start: int, stop: int) -> Floats:
     return rays
 
 
-class Groups:
+class HitGroups:
     """Counts of the hits in each group of rays of a scan that keeps every n-th hit of a group.
 
     Parameters
@@ -187,7 +187,7 @@ class Groups:
         return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
 
 
-class Collector(Groups):
+class HitCollector(HitGroups):
     """Collects the hits of a scan, chunk after chunk in ray order.
 
     Parameters
@@ -200,7 +200,7 @@ class Collector(Groups):
     Examples
     --------
     >>> pattern = Pattern([[1, 0, 0]] * 10)
-    >>> collector = Collector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
+    >>> collector = HitCollector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
     >>> ray = np.array([1, 2, 3, 6, 7])
     >>> ray[collector.keep(ray, 0, 10)].tolist()
     [1, 3, 6]
@@ -209,7 +209,7 @@ class Collector(Groups):
     def __init__(self, scan: Scan, face_count: int) -> None:
         super().__init__(scan.groups, scan.keep_every)
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
-        self._parts: list[Part] = []
+        self._parts: list[HitColumns] = []
 
     def keep(self, ray: Integers, start: int, stop: int) -> slice | Indices:
         """Count the hits of rays `start` to `stop`, and select the hits to keep.

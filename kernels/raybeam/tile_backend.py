@@ -13,17 +13,17 @@ import numpy as np
 
 from .arrays import AnyArray, Floats
 from .backend import Backend, ClosestHits
-from .body_rays import Crossing, Nearest
-from .hits import Part, join_hits
+from .body_rays import NearestHits, RayBodyPairs
+from .hits import HitColumns, join_hits
 from .installation import install_command
-from .instances import Scene
+from .instances import LocalScene
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
 from .tile_plan import TilePlan, consecutive, plan_tiles
 
 if TYPE_CHECKING:
-    from .cast_record import Cast
+    from .cast_record import CastRecord
 
 _SHARE = 1 << 14  # rays that a thread casts in a call, if there are several threads
 _BODY_RAYS = 64  # rays per tile of rays at bodies
@@ -46,7 +46,9 @@ class TileBackend(Backend):
             return f"numba is not installed; run {install_command('numba')}"
         return ""
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
         from . import cast_record, mesh_loops, tile_casts, tile_memory, tile_tree
 
         super().__init__(scene, threads, device)
@@ -74,7 +76,7 @@ class TileBackend(Backend):
         self._plans: dict[tuple[int, int, int], tuple[ref[AnyArray], TilePlan]] = {}
         self.update_scene(scene)
 
-    def _mesh_records(self, scene: Scene) -> AnyArray:
+    def _mesh_records(self, scene: LocalScene) -> AnyArray:
         """Return a `MESH` record for each mesh of a scene."""
         records = np.zeros(len(scene.meshes), self._memory.MESH)
         for record, mesh, tree, corners in zip(
@@ -91,7 +93,7 @@ class TileBackend(Backend):
                 record["mask_height"], record["mask_width"] = opacity.mask.shape
         return records
 
-    def _instance_records(self, scene: Scene) -> AnyArray:
+    def _instance_records(self, scene: LocalScene) -> AnyArray:
         """Return an `INSTANCE` record for each instance of a scene, without matrices."""
         records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
         first_rows = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
@@ -99,7 +101,7 @@ class TileBackend(Backend):
         records["first"] = first_rows[scene.mesh]
         return records
 
-    def update_scene(self, scene: Scene) -> None:
+    def update_scene(self, scene: LocalScene) -> None:
         """Replace the scene by a scene of the same instances with new transforms."""
         super().update_scene(scene)
         frame = scene.frame
@@ -126,21 +128,21 @@ class TileBackend(Backend):
         t = distance * self._scene.frame.scale  # local; exact, since the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast pairs of a ray and a body on this scene, the shape that the bodies share.
 
         Hits nearer than those in `nearest` replace these.
         """
         record = self._base.copy()
         scale = self._scene.frame.scale
-        record["t_min"], record["t_max"] = self._reach(crossing.limits, scale)
+        record["t_min"], record["t_max"] = self._reach(pairs.limits, scale)
         record["tile"] = self._tile(_BODY_RAYS)
-        self._loops.cast_crossing(record, crossing.contiguous(), nearest)
+        self._loops.cast_pairs(record, pairs.contiguous(), nearest)
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
+    def parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
         """Yield ranges of rays of a scan, and the hits of each range.
 
-        Yields start and stop of the range, and a `Part`: hits in ray order, whose rays are numbered
+        Yields start and stop of the range, and a `HitColumns`: hits in ray order, whose rays are numbered
         from start.
         """
         cast = self._scan_cast(scan)
@@ -176,8 +178,8 @@ class TileBackend(Backend):
         t_min, t_max = limits
         return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
 
-    def _ray_cast(self, rays: Rays) -> Cast:
-        """Return the `Cast` of rays that are not of a pattern.
+    def _ray_cast(self, rays: Rays) -> CastRecord:
+        """Return the `CastRecord` of rays that are not of a pattern.
 
         Each ray becomes a beam, seen from a single pose.
         """
@@ -186,15 +188,15 @@ class TileBackend(Backend):
         if len(rays.origins) == 1:
             position = rays.origins
             origins = None
-        cast = self._memory.Cast(self._base)
+        cast = self._memory.CastRecord(self._base)
         poses = Poses(position, None, max(len(rays), 1))
         cast.set_beams(rays.directions, origins, poses, 0)
         self._set_limits(cast, (rays.t_min, rays.t_max))
         return cast
 
-    def _scan_cast(self, scan: Scan) -> Cast:
-        """Return the `Cast` of a scan, whose loops also write the rays to `scan.room`, if any."""
-        cast = self._memory.Cast(self._base)
+    def _scan_cast(self, scan: Scan) -> CastRecord:
+        """Return the `CastRecord` of a scan, whose loops also write the rays to `scan.room`, if any."""
+        cast = self._memory.CastRecord(self._base)
         cast.set_pattern(scan.pattern, scan.poses, scan.first)
         if scan.room is not None:
             cast.record["directions_out"] = scan.room[-3:].ctypes.data
@@ -206,12 +208,12 @@ class TileBackend(Backend):
         self._set_limits(cast, (scan.t_min, scan.t_max))
         return cast
 
-    def _set_limits(self, cast: Cast, limits: tuple[float, float]) -> None:
+    def _set_limits(self, cast: CastRecord, limits: tuple[float, float]) -> None:
         """Write the limits of distances, meters, to a cast."""
         record = cast.record
         record["t_min"], record["t_max"] = self._reach(limits, self._scene.frame.scale)
 
-    def _cast(self, cast: Cast, start: int, stop: int, plan: TilePlan) -> Part:
+    def _cast(self, cast: CastRecord, start: int, stop: int, plan: TilePlan) -> HitColumns:
         """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
 
         Distances are in meters; `triangle` is the row in the caller's faces, or the row of the
@@ -223,7 +225,7 @@ class TileBackend(Backend):
         triangle = np.empty(n, np.int32)
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
-        def cast_share(begin: int) -> Part:
+        def cast_share(begin: int) -> HitColumns:
             """Return the hits of `share` rays from `begin`, as views of the memory of all rays."""
             record = cast.record.copy()
             row = begin - start

@@ -20,9 +20,9 @@ from .cast_record import (
 )
 from .compiled import compiled, inlined, stage
 from .moving_loops import (
-    CROSSING,
-    NEAREST,
+    NEAREST_HITS,
     PADS_M,
+    PAIRS,
     box_corners,
     passes_box,
     pose_rotation,
@@ -193,8 +193,8 @@ def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the hits of a tile's first `filled` rays to a `Nearest`, where they are nearer."""
+def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the hits of a tile's first `filled` rays to a `NearestHits`, where they are nearer."""
     numbers = int64s(cast.tile)
     floats = float64s(cast.tile)
     index = int32s(cast.index)
@@ -207,8 +207,8 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
     for lane in range(filled):
         key = numbers[key_at + lane]
         pair = numbers[pair_at + lane]
-        ray = crossing.row[pair]
-        body = crossing.body[pair]
+        ray = pairs.row[pair]
+        body = pairs.body[pair]
         meters = floats[t_at + lane] * meter / floats[norm_at + lane]
         nearer = meters < distance[ray] or (meters == distance[ray] and body < bodies[ray])
         if key < 0 or not nearer:
@@ -224,9 +224,9 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
         triangle[ray] = index[row]
 
 
-@compiled(types.void(memory.CASTS, CROSSING, NEAREST))
-def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`.
+@compiled(types.void(memory.CASTS, PAIRS, NEAREST_HITS))
+def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Cast the pairs of a `RayBodyPairs` with a `CAST`, and write nearer hits to a `NearestHits`.
 
     A pair whose ray misses the body's box, or ends before the box, takes no lane of a tile.
     """
@@ -234,12 +234,12 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
     tile = cast.tile
     numbers = int64s(tile)
     floats = float64s(tile)
-    rays = crossing.rays
-    poses = crossing.poses
-    row = crossing.row
-    bodies = crossing.body
+    rays = pairs.rays
+    poses = pairs.poses
+    row = pairs.row
+    bodies = pairs.body
     floats[_T_MIN] = cast.t_min
-    corners = box_corners(float64s(crossing.box.ctypes.data))
+    corners = box_corners(float64s(pairs.box.ctypes.data))
     pair_at = row_at(NUMBER, _TILE_RAYS)
     norm_at = row_at(NORM, _TILE_RAYS)
     t_at = row_at(T, _TILE_RAYS)
@@ -249,7 +249,7 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
         body = bodies[pair]
         while filled < _TILE_RAYS and pair < len(row) and bodies[pair] == body:
             k = row[pair]
-            p = crossing.pose[pair]
+            p = pairs.pose[pair]
             rotation = pose_rotation(poses, p)
             x = rays[0, k] - poses[0, p]
             y = rays[1, k] - poses[1, p]
@@ -267,7 +267,7 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
         if filled != 0:
             _fill_up(tile, filled)
             cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled)
-            _write_hits(cast, crossing, nearest, filled)
+            _write_hits(cast, pairs, nearest, filled)
 
 
 # Whether this process compiled the loops; otherwise numba loaded the code of an earlier process.

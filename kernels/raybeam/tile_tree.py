@@ -8,7 +8,7 @@ import numpy as np
 
 from .arrays import Floats, Floats32, Ints32
 from .compiled import compiled
-from .cuda_tables import stack_need
+from .cuda_tables import max_stack_depth
 from .tree import LEAF_BITS, WideTree, build_top, build_tree
 
 WIDTH = 8
@@ -78,7 +78,7 @@ def top_nodes(boxes: Floats) -> tuple[Floats32, int]:
 
 def _stack(tree: WideTree) -> int:
     """Return the maximum of nodes that wait during a traversal, with a node's children."""
-    return stack_need(tree) + 2 * WIDTH
+    return max_stack_depth(tree) + 2 * WIDTH
 
 
 def _nodes(tree: WideTree, child: Ints32) -> Floats32:

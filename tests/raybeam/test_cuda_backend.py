@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raybeam import Pattern, device
-from raybeam.device import Outbox
+from raybeam.device import CopyQueue
 from raybeam.instances import plain
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
@@ -48,8 +48,8 @@ def test_page_locked_memory_is_bounded_and_comes_back(source_backend, monkeypatc
         return bytearray(size)
 
     monkeypatch.setattr(cupy.cuda, "alloc_pinned_memory", allocate)
-    outbox = Outbox(cupy)
-    rooms = [device.host_array(cupy, 1000, np.uint8) for _ in range(3)]
+    outbox = CopyQueue(cupy)
+    rooms = [device.pinned_array(cupy, 1000, np.uint8) for _ in range(3)]
     assert locked == [1000, 1000]
     sent = [cupy.asarray(np.full(1000, number, np.uint8)) for number in range(3)]
     outbox.send([*zip(sent, rooms, strict=True)])
@@ -57,7 +57,7 @@ def test_page_locked_memory_is_bounded_and_comes_back(source_backend, monkeypatc
     assert [room[0] for room in rooms] == [0, 1, 2]  # the third, too
     view = rooms[0][:10]
     del rooms
-    assert device.host_array(cupy, 1000, np.uint8).nbytes == 1000
+    assert device.pinned_array(cupy, 1000, np.uint8).nbytes == 1000
     assert len(locked) == 3  # of the two that were read, one is held by a view
     del view
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from raybeam import Moving, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
-from raybeam.moving import hits_on
+from raybeam import MovingBodies, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
+from raybeam.moving import nearest_body_hits
 from raybeam.pattern_rays import plain_rays
 from raybeam.poses import check_poses
 from raybeam.scan import check_scan
@@ -137,9 +137,9 @@ def test_sub_rays_hit_what_moves(shapes, kind):
         table[[3, 7, 11]] = 1
         return table
 
-    alone = Moving((shape,), corners[None], np.zeros(1, int), np.array([[-1.0, 1.0]]), stand)
+    alone = MovingBodies((shape,), corners[None], np.zeros(1, int), np.array([[-1.0, 1.0]]), stand)
     scan = check_scan(given, **where)
-    found = hits_on(alone, scan, lambda ray: 1e-6 * ray)
+    found = nearest_body_hits(alone, scan, lambda ray: 1e-6 * ray)
     expected = shape.scan(given, **where)
     ray = np.flatnonzero(found.body >= 0)
     assert np.array_equal(ray, expected.ray) and len(ray) > 100

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from raybeam import ploc
-from raybeam.cuda_tables import stack_need
+from raybeam.cuda_tables import max_stack_depth
 from raybeam.sah_builder import divide
 from raybeam.tree import build_tree
 
@@ -16,7 +16,7 @@ def test_copies_of_one_triangle_make_a_flat_tree(copies):
     corners = np.repeat(np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]), copies, axis=0)
     low = np.zeros((3, copies), np.float32)
     assert len(ploc.build(low, low + np.float32(1)).rounds) <= 12
-    assert stack_need(build_tree(corners, 4, 4)) <= 24
+    assert max_stack_depth(build_tree(corners, 4, 4)) <= 24
 
 
 def test_a_row_of_boxes_does_not_take_a_round_each():

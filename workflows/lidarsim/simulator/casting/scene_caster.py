@@ -13,9 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from raybeam import Deforming, Instance, Moving, Pattern, RayCaster, ScanReturns, available_backends
-from raybeam.device import OtherHits
-from raybeam.moving import hits_on, listed_hits_on
+from raybeam import (
+    DeformingMesh,
+    Instance,
+    MovingBodies,
+    Pattern,
+    RayCaster,
+    ScanReturns,
+    available_backends,
+)
+from raybeam.device import ExternalHits
+from raybeam.moving import body_hits, nearest_body_hits
 from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import Bools, Floats, Indices, Ints, Ints32
@@ -53,7 +61,7 @@ class _ActorShapes(NamedTuple):
     an instance of the shape's caster.
     """
 
-    casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
+    casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the frame of the mesh
     boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, meters
     part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
     shape: Indices  # (a,): shape of each actor
@@ -281,7 +289,7 @@ class SceneCaster:
         static_distance = np.full(len(scan), np.inf)
         static_distance[static_hits.ray] = static_hits.distance
         moving, shapes = self._moving_actors(poses)
-        nearest = hits_on(moving, scan, poses.times, static_distance)
+        nearest = nearest_body_hits(moving, scan, poses.times, static_distance)
         joined = surface_loops.JoinedHits(
             np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
         )
@@ -296,17 +304,17 @@ class SceneCaster:
         )
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
-    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
+    def on_actors(self, scan: Scan, poses: CastPoses) -> ExternalHits:
         """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
         if self._shapes is None:
-            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
+            return ExternalHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         moving, shapes = self._moving_actors(poses)
-        ray, distance, actor, instance, triangle = listed_hits_on(moving, scan, poses.times)
+        ray, distance, actor, instance, triangle = body_hits(moving, scan, poses.times)
         part_triangle = shapes.part_triangles[shapes.shape[actor], instance]
         triangle = triangle + part_triangle + self._actor_triangles[actor]
-        return OtherHits(ray.astype(np.uint32), distance, triangle)
+        return ExternalHits(ray.astype(np.uint32), distance, triangle)
 
-    def _moving_actors(self, poses: CastPoses) -> tuple[Moving, _ActorShapes]:
+    def _moving_actors(self, poses: CastPoses) -> tuple[MovingBodies, _ActorShapes]:
         """Return the actors as moving bodies, and their shapes."""
         shapes = self._shapes
         assert shapes is not None, "without actors"
@@ -319,7 +327,7 @@ class SceneCaster:
         presence_ns = trajectories.presence_ns
         if self._unseen_actors is not None:
             presence_ns = np.where(self._unseen_actors[:, None], _NEVER_NS, presence_ns)
-        moving = Moving(
+        moving = MovingBodies(
             shapes.casters,
             shapes.boxes,
             shapes.shape,
@@ -446,7 +454,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):
         row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]
     casters = tuple(
-        Deforming(mesh.animation.vertices, mesh.faces)
+        DeformingMesh(mesh.animation.vertices, mesh.faces)
         if mesh.animation
         else RayCaster.from_instances([Instance(mesh_of(part)) for part in mesh_parts], **options)
         for mesh, mesh_parts in zip(meshes, parts_of_meshes, strict=True)
