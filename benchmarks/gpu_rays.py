@@ -83,7 +83,7 @@ def rates(
         "rays": (milliseconds, rays),
         "cast": (milliseconds, cast),
         "pack": (milliseconds, pack),
-        "to_device": (wall_milliseconds, lambda: caster.visit(scan, len)),
+        "to_device": (wall_milliseconds, lambda: caster.scan_on_device(scan, len)),
         "to_host": (wall_milliseconds, lambda: engine.scan(scan)),
     }
     times = {name: clock(session, call) for name, (clock, call) in calls.items() if name in stages}
@@ -190,7 +190,7 @@ def moving(session: Session) -> Rows:
         with split.timed("rays"):
             hits.rays()
 
-    caster.visit(scan, use)
+    caster.scan_on_device(scan, use)
     took = split.milliseconds()["rays"]
     yield "rays of the hits", {"ms": took, "grays_s": len(scan) / took / 1e6}
 
@@ -241,7 +241,7 @@ def large(session: Session) -> Rows:
     hits_per_revolution = int(caster.scan(Pattern(directions), MIDDLE).hit_counts.sum())
     last = []
     start = time.perf_counter()
-    hits, _ = caster.visit(scan, lambda hits: last.append(hits.ray[-1:]))
+    hits, _ = caster.scan_on_device(scan, lambda hits: last.append(hits.ray[-1:]))
     took = time.perf_counter() - start
     yield (
         "many rays",

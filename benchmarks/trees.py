@@ -27,7 +27,7 @@ import numpy as np
 
 from raybeam import cuda_backend, ploc
 from raybeam.cuda_tables import MeshTables, build_instance_tables, build_mesh_tables
-from raybeam.instances import plain
+from raybeam.instances import single_mesh_scene
 from raybeam.mesh import LocalMesh, local_mesh
 
 from .raycast_scenes import Job, jobs
@@ -72,7 +72,7 @@ def count(library: ctypes.CDLL, layout: MeshTables, mesh: LocalMesh, job: Job) -
     n = directions.shape[1]
     distance = np.empty(n)
     triangle = np.empty(n, np.int32)
-    instance_layout = build_instance_tables(plain(mesh), layout.roots)
+    instance_layout = build_instance_tables(single_mesh_scene(mesh), layout.roots)
     instance_tables = (instance_layout.frame, instance_layout.top, instance_layout.instances)
     counters_before = _read_counters(library)
     hits = 0

@@ -54,24 +54,24 @@ class Backend(ABC):
     A backend is created with the scene, the maximum number of CPU threads (None for the default of
     the backend) and the number of the CUDA device (None for the current device); a backend without
     threads or device ignores the number. The constructor builds the trees of the meshes, and calls
-    `update_scene` for all that depends on transforms. A backend must implement `closest`; it may
+    `update_scene` for all that depends on transforms. A backend must implement `closest_hits`; it may
     override `scan` to be faster.
     """
 
     name: ClassVar[str]
-    # Maximum rays of a call of `closest`: limits the memory. The result of a ray does not depend
+    # Maximum rays of a call of `closest_hits`: limits the memory. The result of a ray does not depend
     # on its chunk.
     chunk: ClassVar[int]
 
-    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device (`visit`)
+    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device (`scan_on_device`)
 
     @classmethod
     @abstractmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why this backend cannot be used and the remedy, or "" if it can be used."""
 
     @classmethod
-    def build(cls) -> str:
+    def versions(cls) -> str:
         """Return the versions besides NumPy's that the bits of results depend on, "" for none."""
         return ""
 
@@ -97,14 +97,14 @@ class Backend(ABC):
         return False
 
     @abstractmethod
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
 
-    def nearest(self, rays: Rays) -> HitColumns:
+    def hit_columns(self, rays: Rays) -> HitColumns:
         """Return the closest hits of rays, without weights and misses, in ray order."""
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
-            hits = self.closest(rays.part(start, start + self.chunk))
+            hits = self.closest_hits(rays.part(start, start + self.chunk))
             ray = hits.ray.astype(np.uint32) + np.uint32(start)
             distance = hits.t / self._scene.frame.scale
             parts.append((ray, distance, hits.triangle, hits.instance))
@@ -112,7 +112,7 @@ class Backend(ABC):
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        cast_pairs(self.nearest, pairs, nearest)
+        cast_pairs(self.hit_columns, pairs, nearest)
 
     def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
@@ -139,7 +139,7 @@ class Backend(ABC):
             np.full(n, -1, np.int32),
         )
         for start in range(0, n, self.chunk):
-            chunk_hits = self.closest(rays.part(start, start + self.chunk))
+            chunk_hits = self.closest_hits(rays.part(start, start + self.chunk))
             row = start + chunk_hits.ray.astype(np.int64)
             hits.distance[row] = chunk_hits.t / self._scene.frame.scale
             hits.triangle[row] = chunk_hits.triangle
@@ -151,7 +151,7 @@ class Backend(ABC):
     def scan(self, scan: Scan) -> ScanReturns:
         """Return the kept hits of the rays of a scan, and counts of all hits."""
         collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
-        for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
+        for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
                 collector.tally(self._scene.tally_rows(instance, triangle))
             selected = collector.keep(ray, start, stop)
@@ -160,22 +160,22 @@ class Backend(ABC):
             )
         return collector.result()
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
+    def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
         """Yield start and stop of each part of a scan, and its hits, numbered from start."""
         for start, stop in scan.chunks(self.chunk):
-            hits = self.closest(scan.rays(start, stop))
+            hits = self.closest_hits(scan.rays(start, stop))
             distance = hits.t / self._scene.frame.scale
             ray = hits.ray.astype(np.uint32, copy=False)
             yield start, stop, (ray, distance, hits.triangle, hits.instance)
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
         external_hits: ExternalHits | None = None,
     ) -> tuple[Ints, TallyCounts | None]:
-        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does.
+        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.scan_on_device` does.
 
         BackendUnavailable if this backend has no device.
         """

@@ -14,11 +14,11 @@ from .backend import Backend
 from .body_rays import NearestHits, RayBodyPairs, TimedBodies
 from .device import DeviceHits, DeviceNearestHits, ExternalHits
 from .hits import Hits, ScanReturns, TallyCounts
-from .instances import Instance, Mesh, check_instances, check_transforms
+from .instances import Instance, Mesh, build_scene, check_transforms
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
 from .rays import check_rays
-from .registry import choose
+from .registry import choose_backend
 from .scan import Scan, check_scan
 
 
@@ -123,8 +123,8 @@ class RayCaster:
     ) -> None:
         if threads is not None and index(threads) < 1:
             raise ValueError(f"threads must be at least 1 or None, but is {threads}.")
-        engine = choose(backend)
-        self._scene, self._transforms = check_instances(instances)
+        engine = choose_backend(backend)
+        self._scene, self._transforms = build_scene(instances)
         self._engine = engine(self._scene, threads, device)
         self._moved = False
         self._lock = threading.Lock()
@@ -140,7 +140,7 @@ class RayCaster:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can remain on a CUDA device, as `visit` requires."""
+        """Whether hits can remain on a CUDA device, as `scan_on_device` requires."""
         return self._engine.on_device
 
     @property
@@ -180,7 +180,7 @@ class RayCaster:
         """
         self.engine.cast_bodies(bodies, nearest)
 
-    def move(self, number: int | ArrayLike, transform: ArrayLike) -> None:
+    def set_transforms(self, number: int | ArrayLike, transform: ArrayLike) -> None:
         """Set new transforms of instances for all subsequent casts.
 
         Only the acceleration structure over the instances is rebuilt, which happens once before the
@@ -207,7 +207,7 @@ class RayCaster:
         >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
         >>> instances = [Instance(mesh), Instance(mesh)]
         >>> caster = RayCaster.from_instances(instances, backend="numpy")
-        >>> caster.move([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
+        >>> caster.set_transforms([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
         """
         single = np.ndim(number) == 0
         numbers = np.asarray([index(number)] if single else number)  # type: ignore[arg-type]
@@ -232,7 +232,7 @@ class RayCaster:
         """Ray-casting engine, updated with the current transforms if instances have moved."""
         with self._lock:
             if self._moved:
-                self._scene = self._scene.moved(self._transforms)
+                self._scene = self._scene.with_transforms(self._transforms)
                 self._engine.update_scene(self._scene)
                 self._moved = False
         return self._engine
@@ -278,7 +278,7 @@ class RayCaster:
         groups: ArrayLike | None = None,
         tally: bool = False,
         motion: PoseMotion | None = None,
-        room: Floats | None = None,
+        out: Floats | None = None,
     ) -> ScanReturns:
         """Cast a ray pattern from a pose or a series of poses.
 
@@ -317,7 +317,7 @@ class RayCaster:
         motion
             Motion of the lidar while the rays that share a pose are fired, if these rays have
             different delays.
-        room
+        out
             Output array for the origins and directions of all rays, as returned by `pattern_rays`:
             float64 (6, rays), contiguous, or (3, rays) for the directions only. None if they are
             not needed.
@@ -352,11 +352,11 @@ class RayCaster:
                 groups=groups,
                 tally=tally,
                 motion=motion,
-                room=room,
+                out=out,
             )
         )
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
@@ -394,4 +394,4 @@ class RayCaster:
         BackendUnavailable
             If the backend of this caster is not cuda.
         """
-        return self.engine.visit(scan, use, counters, external_hits)
+        return self.engine.scan_on_device(scan, use, counters, external_hits)

@@ -72,7 +72,7 @@ class CudaBackend(Backend):
     chunk: ClassVar[int] = 1 << 21
 
     @classmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
         if importlib.util.find_spec("cupy") is None:
             command = install_command("cupy-cuda12x")
@@ -175,7 +175,7 @@ class CudaBackend(Backend):
 
         return cupy
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         n = len(rays)
         with self._device:
@@ -213,13 +213,13 @@ class CudaBackend(Backend):
         """Return the kept hits of the rays of a scan, and counts of all hits."""
         if scan.pattern.sub_rays is not None:  # the kernel has no sub-rays
             return super().scan(scan)
-        if scan.room is not None:
+        if scan.out is not None:
             scan.rays(0, len(scan))  # writes the rays
         with self._device:
             max_hits = -(-len(scan) // scan.keep_every) + len(scan.groups)
             transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.nested)
             try:
-                hit_counts, counted = self.visit(scan, transfer.send)
+                hit_counts, counted = self.scan_on_device(scan, transfer.send)
             finally:  # else the device would write to memory that goes back to the pool
                 ray, distance, triangle, instance = transfer.finish()
         tally = None
@@ -228,14 +228,14 @@ class CudaBackend(Backend):
             tally[counted[0]] = counted[1]
         return ScanReturns(ray, distance, triangle, hit_counts, tally, instance)
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
         external_hits: ExternalHits | None = None,
     ) -> tuple[Ints, TallyCounts | None]:
-        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does."""
+        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.scan_on_device` does."""
         cp = self._cupy
         scene = self._scene
         groups = HitGroups(scan.groups, scan.keep_every)

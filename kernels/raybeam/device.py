@@ -264,10 +264,10 @@ class HitTransfer:
         return ray, distance, triangle, instance
 
 
-def trim_to_count(array: AnyArray, count: int, room: int) -> AnyArray:
-    """Return the first `count` values of an array from `pinned_array`, which has `room` values.
+def trim_to_count(array: AnyArray, count: int, capacity: int) -> AnyArray:
+    """Return the first `count` values of an array from `pinned_array`, which has `capacity` values.
 
-    If less than half of the room is in use, the values are a copy: the page-locked memory is given
+    If less than half of the capacity is in use, the values are a copy: the page-locked memory is given
     back.
     """
-    return array[:count].copy() if 2 * count < room else array[:count]
+    return array[:count].copy() if 2 * count < capacity else array[:count]

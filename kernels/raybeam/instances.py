@@ -92,19 +92,19 @@ class MeshFrames:
         float64 (n,): `LocalFrame.scale`.
     center
         float64 (n, 3): `LocalFrame.center`, meters.
-    middle
+    box_center
         float64 (n, 3): middle of the mesh's box, relative to `center`, meters.
-    half
+    box_half_size
         float64 (n, 3): halves of the sides of the mesh's box, meters.
     """
 
     scale: Floats
     center: Floats
-    middle: Floats
-    half: Floats
+    box_center: Floats
+    box_half_size: Floats
 
     @classmethod
-    def of_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
+    def from_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
         """Return the frames of the meshes of instances, for arguments as in `LocalScene`."""
         frames = [local.frame for local in meshes]
         scale = np.array([frame.scale for frame in frames])[mesh]
@@ -165,7 +165,7 @@ class LocalScene:
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
-    def moved(self, transforms: Floats) -> LocalScene:
+    def with_transforms(self, transforms: Floats) -> LocalScene:
         """Return a copy of the scene with new transforms of shape (n, 3, 4).
 
         The scene must be nested, and the transforms must already have been validated.
@@ -206,14 +206,14 @@ class LocalScene:
         return moved, np.stack([u / length, v / length, w / length], axis=1), length
 
 
-def plain(mesh: LocalMesh) -> LocalScene:
+def single_mesh_scene(mesh: LocalMesh) -> LocalScene:
     """Return the plain scene of a single mesh without a transform."""
     frame = mesh.frame
     boxes = np.stack([frame.lower, frame.upper])[None]
     return LocalScene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
 
 
-def check_instances(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
+def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
     """Return the scene of instances, and their transforms (n, 3, 4).
 
     Raises
@@ -237,8 +237,8 @@ def check_instances(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
             f"The instances have {total:,} triangles, but the limit is {MAX_TRIANGLES:,}."
         )
     if len(listed) == 1 and listed[0].transform is None:
-        return plain(meshes[0]), transforms
-    frames = MeshFrames.of_instances(meshes, mesh)
+        return single_mesh_scene(meshes[0]), transforms
+    frames = MeshFrames.from_instances(meshes, mesh)
     return _nested_scene(meshes, mesh, frames, transforms), transforms
 
 
@@ -332,8 +332,8 @@ def _nested_scene(
     scale = mesh_frames.scale
     # Center of each mesh's coordinates in the scene, meters: large numbers are subtracted first.
     center = _product(rotation_scale, mesh_frames.center) + transforms[:, :, 3]
-    shift = _product(rotation_scale, mesh_frames.middle)
-    half = _product(np.abs(rotation_scale), mesh_frames.half)
+    shift = _product(rotation_scale, mesh_frames.box_center)
+    half = _product(np.abs(rotation_scale), mesh_frames.box_half_size)
     frame, boxes = _scene_frame(center, shift, half)
     offset = frame.center - center
     inverse = _inverse(rotation_scale)

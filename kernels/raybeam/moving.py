@@ -78,19 +78,19 @@ class MovingBodies:
         return np.array([shape.on_device for shape in self.shapes], np.bool_)[self.shape]
 
     @cached_property
-    def middle(self) -> Floats:
+    def box_centers(self) -> Floats:
         """Centers of the bounding boxes in the frames of the shapes, in meters. Shape (s, 3)."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
-    def half(self) -> Floats:
+    def box_half_sizes(self) -> Floats:
         """Half side lengths of the bounding boxes of the shapes, in meters. Shape (s, 3)."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
-    def radius(self) -> Floats:
+    def radii(self) -> Floats:
         """Radii of the bounding spheres of the boxes, in meters. Shape (s,)."""
-        return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
+        return np.asarray(np.sqrt((self.box_half_sizes**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
         """Return whether each body (m,) is present at its time (m,)."""
@@ -231,8 +231,8 @@ def _corners(moving: MovingBodies, shape: Indices, poses: Floats) -> Floats:
     """
     from .moving_loops import PADS_M
 
-    middle = moving.middle[shape].T
-    half = moving.half[shape].T
+    middle = moving.box_centers[shape].T
+    half = moving.box_half_sizes[shape].T
     corners = np.empty((2, *middle.shape))
     for axis in range(3):
         x, y, z = poses[3 + 3 * axis : 6 + 3 * axis]
@@ -378,7 +378,7 @@ class _Chunk:
         boxes = self._sampled_boxes(bodies, times)
         change = np.abs(np.diff(boxes, axis=1))
         slack = 2 * change.sum(axis=2).max(axis=1) + loops.PADS_M
-        radius = moving.radius[moving.shape[bodies]]
+        radius = moving.radii[moving.shape[bodies]]
         spheres = np.column_stack([radius, slack, moving.presence[bodies]])
         samples: BodySamples = loops.BodySamples(sample_of_cell, boxes, spheres)
         return samples
@@ -390,8 +390,8 @@ class _Chunk:
         table = moving.poses(body, times.ravel())
         rotations = _rotations(table)
         shape = moving.shape[body]
-        centers = table[:3].T + _rotated(rotations, moving.middle[shape])
-        halves = rotations.transpose(0, 2, 1) * moving.half[shape][..., None]
+        centers = table[:3].T + _rotated(rotations, moving.box_centers[shape])
+        halves = rotations.transpose(0, 2, 1) * moving.box_half_sizes[shape][..., None]
         boxes = np.empty((*times.shape, 12))
         boxes[..., :3] = centers.reshape(len(bodies), -1, 3)
         boxes[..., 3:] = halves.reshape(len(bodies), -1, 9)

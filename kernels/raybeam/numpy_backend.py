@@ -54,7 +54,7 @@ class _Best:
 
 @dataclass(frozen=True)
 class _Query:
-    """Rays of a call of `closest` that meet the scene's box, and their closest hits.
+    """Rays of a call of `closest_hits` that meet the scene's box, and their closest hits.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class NumpyBackend(Backend):
     chunk: ClassVar[int] = 1 << 16
 
     @classmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return "": NumPy is always usable."""
         return ""
 
@@ -237,7 +237,7 @@ class NumpyBackend(Backend):
             self._lower = np.array([frame.lower for frame in frames])[scene.mesh].T
             self._upper = np.array([frame.upper for frame in frames])[scene.mesh].T
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         frame = self._scene.frame
         origins = np.broadcast_to(frame.to_local(rays.origins), rays.directions.shape)

@@ -89,7 +89,7 @@ class Pattern:
         if sub_rays is not None and offsets is not None:
             self.offsets = np.ascontiguousarray(np.asarray(offsets, np.float64).T)
 
-    def divided(
+    def with_sub_rays(
         self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
         """Return a copy with sub-rays, for all beams or for the beams `beam_indices` (m,).

@@ -61,31 +61,31 @@ class Poses:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def look_up(self, ray: Ints, room: Floats) -> RayPoses:
-        """Look up the poses of rays (m,), into the memory `room`, float64 (18, m)."""
+    def look_up(self, ray: Ints, out: Floats) -> RayPoses:
+        """Look up the poses of rays (m,), into the memory `out`, float64 (18, m)."""
         pose = ray // self.rays_per_pose
         delay = np.zeros(1)
         rates = None
         velocities = None
         if self.motion is not None:
             delay = self.motion.delays.take(ray - pose * self.rays_per_pose)
-            velocities = self._per_ray(self.motion.velocities, pose, room[12:15])
+            velocities = self._per_ray(self.motion.velocities, pose, out[12:15])
             if self.motion.rates.any():
-                rates = self._per_ray(self.motion.rates, pose, room[15:])
+                rates = self._per_ray(self.motion.rates, pose, out[15:])
         rotations = self.rotations
         if rotations is not None:
-            rotations = self._per_ray(rotations, pose, room[:9])
+            rotations = self._per_ray(rotations, pose, out[:9])
         return RayPoses(
-            self._per_ray(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
+            self._per_ray(self.positions, pose, out[9:12]), rotations, delay, velocities, rates
         )
 
-    def _per_ray(self, table: Floats, pose: Indices, room: Floats) -> Floats:
+    def _per_ray(self, table: Floats, pose: Indices, out: Floats) -> Floats:
         columns = np.moveaxis(table, 0, -1).reshape(-1, len(self))
         if len(self) == 1:
             return columns
-        for column, row in zip(columns, room, strict=True):
+        for column, row in zip(columns, out, strict=True):
             column.take(pose, out=row, mode="clip")  # other modes use a buffer
-        return room
+        return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ def available_backends() -> dict[str, str]:
     >>> available_backends()["numpy"]
     ''
     """
-    return {backend.name: backend.missing() for backend in BACKENDS}
+    return {backend.name: backend.unavailable_reason() for backend in BACKENDS}
 
 
-def backend_build(name: str) -> str:
+def backend_versions(name: str) -> str:
     """Return the versions that the bits of a backend's results depend on, besides NumPy's.
 
     Two processes with equal versions of these and of NumPy give the same hits, to the bit.
@@ -34,10 +34,10 @@ def backend_build(name: str) -> str:
     ValueError, BackendUnavailable
         If no backend has that name, or the backend cannot be used on this machine.
     """
-    return choose(name).build()
+    return choose_backend(name).versions()
 
 
-def choose(name: str) -> type[Backend]:
+def choose_backend(name: str) -> type[Backend]:
     """Return the backend with a name or, for "auto", the first backend that can be used.
 
     Raises
@@ -48,11 +48,11 @@ def choose(name: str) -> type[Backend]:
         If the backend cannot be used on this machine.
     """
     if name == "auto":
-        return next(backend for backend in BACKENDS if not backend.missing())
+        return next(backend for backend in BACKENDS if not backend.unavailable_reason())
     by_name = {backend.name: backend for backend in BACKENDS}
     if name not in by_name:
         raise ValueError(f"Unknown backend {name!r}. The backends are auto, {', '.join(by_name)}.")
-    reason = by_name[name].missing()
+    reason = by_name[name].unavailable_reason()
     if reason:
         raise BackendUnavailable(
             f"Backend {name!r} cannot be used: {reason}. Use 'auto' to select an available backend."

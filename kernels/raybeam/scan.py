@@ -41,7 +41,7 @@ class Scan:
         int64 (g,): number of the first ray of each group; ascending, from 0.
     tally
         Whether to count hits by triangle.
-    room
+    out
         float64 (6, count): output for origins and directions of all rays; (3, count) for
         directions alone, None for no output.
     """
@@ -55,7 +55,7 @@ class Scan:
     keep_every: int
     groups: Ints
     tally: bool
-    room: Floats | None = None
+    out: Floats | None = None
 
     def __len__(self) -> int:
         return self.count
@@ -66,13 +66,13 @@ class Scan:
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `room`, if any."""
+        """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `out`, if any."""
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
-        if self.room is not None:
-            self.room[-3:, start:stop] = directions.T
-            if len(self.room) > 3:
-                self.room[:3, start:stop] = origins.T
+        if self.out is not None:
+            self.out[-3:, start:stop] = directions.T
+            if len(self.out) > 3:
+                self.out[:3, start:stop] = origins.T
         return Rays(origins, directions, self.t_min, self.t_max)
 
 
@@ -89,7 +89,7 @@ def check_scan(
     groups: ArrayLike | None = None,
     tally: bool = False,
     motion: PoseMotion | None = None,
-    room: Floats | None = None,
+    out: Floats | None = None,
 ) -> Scan:
     """Check the arguments of a scan.
 
@@ -121,14 +121,14 @@ def check_scan(
         keep_every=index(keep_every),
         groups=np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally=tally,
-        room=room,
+        out=out,
     )
 
 
 def host_rays(scan: Scan, start: int, stop: int) -> Floats:
     """Return origins, meters, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
-    if scan.room is not None:  # the caster has written the rays
-        return np.ascontiguousarray(scan.room[:, start:stop])
+    if scan.out is not None:  # the caster has written the rays
+        return np.ascontiguousarray(scan.out[:, start:stop])
     scan_rays = scan.rays(start, stop)
     rays = np.empty((6, stop - start))
     rays[:3] = scan_rays.origins.T

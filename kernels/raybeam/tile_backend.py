@@ -40,7 +40,7 @@ class TileBackend(Backend):
     chunk: ClassVar[int] = 1 << 17  # rays; hits take 20 bytes a ray, until chunks are joined
 
     @classmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why numba cannot be used and the remedy, or "" if it can be used."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed; run {install_command('numba')}"
@@ -114,7 +114,7 @@ class TileBackend(Backend):
             base["top"] = self._top.ctypes.data
             self._records["matrix"] = scene.matrices
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         cast = self._ray_cast(rays)
         cast.record["index"] = 0  # hits get the row of the corners, which `weigh` needs
@@ -139,7 +139,7 @@ class TileBackend(Backend):
         record["tile"] = self._tile(_BODY_RAYS)
         self._loops.cast_pairs(record, pairs.contiguous(), nearest)
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
+    def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
         """Yield ranges of rays of a scan, and the hits of each range.
 
         Yields start and stop of the range, and a `HitColumns`: hits in ray order, whose rays are numbered
@@ -195,16 +195,16 @@ class TileBackend(Backend):
         return cast
 
     def _scan_cast(self, scan: Scan) -> CastRecord:
-        """Return the `CastRecord` of a scan, whose loops also write the rays to `scan.room`, if any."""
+        """Return the `CastRecord` of a scan, whose loops also write the rays to `scan.out`, if any."""
         cast = self._memory.CastRecord(self._base)
         cast.set_pattern(scan.pattern, scan.poses, scan.first)
-        if scan.room is not None:
-            cast.record["directions_out"] = scan.room[-3:].ctypes.data
+        if scan.out is not None:
+            cast.record["directions_out"] = scan.out[-3:].ctypes.data
             cast.record["ray_count"] = len(scan)
-            if len(scan.room) > 3:
-                cast.record["origins_out"] = scan.room.ctypes.data
+            if len(scan.out) > 3:
+                cast.record["origins_out"] = scan.out.ctypes.data
                 if cast.record["shares_origin"]:
-                    scan.room[:3] = scan.poses.positions.T
+                    scan.out[:3] = scan.poses.positions.T
         self._set_limits(cast, (scan.t_min, scan.t_max))
         return cast
 

@@ -236,7 +236,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
         return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
 
     monkeypatch.setattr(moving_loops, "rays_through_boxes", every_ray)
-    monkeypatch.setattr(moving_loops, "cells_near_bodies", every_cell)
+    monkeypatch.setattr(moving_loops, "pair_cells_with_bodies", every_cell)
     every = made(survey, scene)
     assert asked
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)

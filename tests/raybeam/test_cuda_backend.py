@@ -8,7 +8,7 @@ import pytest
 
 from raybeam import Pattern, device
 from raybeam.device import CopyQueue
-from raybeam.instances import plain
+from raybeam.instances import single_mesh_scene
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
@@ -30,7 +30,7 @@ def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, 
     cupy = source_backend.load_cupy()
     monkeypatch.setattr(type(cupy.empty(1)), "set", copy)
     monkeypatch.setattr(cupy.cuda.Stream, "synchronize", synchronize)
-    engine = source_backend(plain(mesh))
+    engine = source_backend(single_mesh_scene(mesh))
     engine.scan(check_scan(Pattern(np.eye(3)), [0, 0, 0]))
     assert len(read) > 1
     assert all(read)
@@ -64,7 +64,7 @@ def test_page_locked_memory_is_bounded_and_comes_back(source_backend, monkeypatc
 
 def test_an_error_after_which_all_calls_fail_is_told_from_others(source_backend, monkeypatch):
     cupy = source_backend.load_cupy()
-    engine = source_backend(plain(local_mesh(np.eye(3), np.array([[0, 1, 2]]))))
+    engine = source_backend(single_mesh_scene(local_mesh(np.eye(3), np.array([[0, 1, 2]]))))
     assert not engine.device_lost
 
     def synchronize(self):

@@ -44,7 +44,7 @@ def visited(caster, scan, counters=None, others=None):
         rays.append([np.asarray(a.get()) for a in hits.rays()])
         assert len(hits) == len(found[-1][0])
 
-    counted = caster.visit(scan, use, counters, others)
+    counted = caster.scan_on_device(scan, use, counters, others)
     joined = [np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True)]
     return joined, [np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)], *counted
 
@@ -105,7 +105,7 @@ def test_other_backends_have_no_device(shapes):
     caster = RayCaster(*shapes["cube"](), backend="numpy")
     assert not caster.on_device
     with pytest.raises(BackendUnavailable, match="Use scan"):
-        caster.visit(scan_of(), print)
+        caster.scan_on_device(scan_of(), print)
 
 
 def test_the_example_of_the_page(played_cuda, capsys):  # noqa: F811

@@ -111,7 +111,7 @@ def test_rays_at_many_instances(backend, shapes):
     casters = [RayCaster.from_instances(instances, each, threads=1) for each in ("numpy", backend)]
     hits = []
     for caster in casters:
-        caster.move(0, instance(shell, "two angles").transform)
+        caster.set_transforms(0, instance(shell, "two angles").transform)
         hits.append(caster.cast(ORIGIN, packets(60)))
     assert hits[0].hit.all() and np.array_equal(hits[1].distance, hits[0].distance)
 
@@ -175,7 +175,9 @@ def test_sub_rays(backend, shapes):
     beams = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
     around = np.radians(60 * np.arange(6))
     angles = 1e-3 * np.stack([np.cos(around), np.sin(around)], axis=-1)
-    pattern = Pattern(beams.reshape(-1, 3)).divided(SubRays(np.concatenate([[[0, 0]], angles])))
+    pattern = Pattern(beams.reshape(-1, 3)).with_sub_rays(
+        SubRays(np.concatenate([[[0, 0]], angles]))
+    )
     _, directions = pattern_rays(pattern, np.arange(len(pattern)), ORIGIN)
     assert ((directions > -1e-18) & (directions < 0)).any()
     want, got = (

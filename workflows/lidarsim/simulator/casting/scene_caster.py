@@ -207,14 +207,14 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
-        room: Floats | None = None,
+        out: Floats | None = None,
     ) -> ScanReturns:
         """Cast rays of a pattern as `RayCaster.scan`, at actors too.
 
         The arguments are as in `RayCaster.scan`; if there are actors, `poses` have a clock.
         `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
         `t_min` to `t_max`, meters; of each group of rays every n-th is returned, by `keep_every`.
-        `groups` are the first rays of the groups. `room` (6, n) receives origins and
+        `groups` are the first rays of the groups. `out` (6, n) receives origins and
         directions of all rays; without actors also (3, n), directions alone.
 
         Returns
@@ -225,14 +225,14 @@ class SceneCaster:
             `instance` is 0.
         """
         window = (0, len(pattern)) if window is None else window
-        if room is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
-            room = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
+        if out is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
+            out = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
         common: dict[str, Any] = {
             **poses.caster_arguments,
             "window": window,
             "t_min": t_min,
             "t_max": t_max,
-            "room": room,
+            "out": out,
         }
         trees = self._static.trees
         if self._instances is None and self._shapes is None and not trees.origins:

@@ -203,7 +203,7 @@ class DeviceColumns:
             self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
         )
         try:
-            hit_counts, tally = seen.caster.caster.visit(
+            hit_counts, tally = seen.caster.caster.scan_on_device(
                 scan, transfer.make, seen.counters, actor_hits
             )
         finally:  # else the device would write to memory that goes back to the pool
@@ -258,7 +258,7 @@ class DeviceColumns:
                 images.append(hits.cupy.full(len(image), np.inf, np.float32))
             images[0][hits.ray] = hits.distance
 
-        seen.caster.caster.visit(scan, take, external_hits=_actor_hits(seen, scan, poses))
+        seen.caster.caster.scan_on_device(scan, take, external_hits=_actor_hits(seen, scan, poses))
         for device_image in images:
             device_image.get(out=image)
 
