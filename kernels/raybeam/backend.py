@@ -104,7 +104,7 @@ class Backend(ABC):
         """Return the closest hits of rays, without weights and misses, in ray order."""
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
-            hits = self.closest_hits(rays.part(start, start + self.chunk))
+            hits = self.closest_hits(rays.normalized(start, start + self.chunk))
             ray = hits.ray.astype(np.uint32) + np.uint32(start)
             distance = hits.t / self._scene.frame.scale
             parts.append((ray, distance, hits.triangle, hits.instance))
@@ -139,7 +139,7 @@ class Backend(ABC):
             np.full(n, -1, np.int32),
         )
         for start in range(0, n, self.chunk):
-            chunk_hits = self.closest_hits(rays.part(start, start + self.chunk))
+            chunk_hits = self.closest_hits(rays.normalized(start, start + self.chunk))
             row = start + chunk_hits.ray.astype(np.int64)
             hits.distance[row] = chunk_hits.t / self._scene.frame.scale
             hits.triangle[row] = chunk_hits.triangle
@@ -153,9 +153,9 @@ class Backend(ABC):
         collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
-                collector.tally(self._scene.tally_rows(instance, triangle))
-            selected = collector.keep(ray, start, stop)
-            collector.add(
+                collector.count_triangles(self._scene.tally_rows(instance, triangle))
+            selected = collector.select_kept(ray, start, stop)
+            collector.add_hits(
                 start, ray[selected], distance[selected], triangle[selected], instance[selected]
             )
         return collector.result()

@@ -125,18 +125,18 @@ class NearestHits(NamedTuple):
     triangle: Ints32
 
     @classmethod
-    def without_hits(cls, limits: Floats) -> NearestHits:
+    def empty(cls, limits: Floats) -> NearestHits:
         """Create rays without a hit, for hits before distances `limits` (n,), meters."""
         n = len(limits)
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
-    def part(self, start: int, stop: int) -> NearestHits:
+    def view(self, start: int, stop: int) -> NearestHits:
         """Return the hits of rays `start` to `stop`, as views of the same memory."""
         span = slice(start, stop)
         distance, body, instance, triangle = self
         return NearestHits(distance[span], body[span], instance[span], triangle[span])
 
-    def take(self, hits: BodyHits) -> None:
+    def update(self, hits: BodyHits) -> None:
         """Write those hits on bodies that are nearer than the nearest hits so far."""
         nearer = np.flatnonzero(hits.distance < self.distance[hits.ray])
         ray = hits.ray[nearer]
@@ -145,7 +145,7 @@ class NearestHits(NamedTuple):
         self.instance[ray] = hits.instance[nearer]
         self.triangle[ray] = hits.triangle[nearer]
 
-    def hits(self) -> BodyHits:
+    def compact(self) -> BodyHits:
         """Return the hits, without the rays that hit no body."""
         ray = np.flatnonzero(self.body >= 0)
         distance, body, instance, triangle = self

@@ -32,9 +32,9 @@ CAST = np.dtype(
         ("rays_per_pose", "i8"),
         ("first", "i8"),  # row of ray 0 in the pattern, counted in sub-rays
         ("subrays", "i8"),  # sub-rays of each beam
-        ("shares", "i8"),  # float64 (5, lanes_per_beam): `SubRays.loop_table`
+        ("sub_ray_table", "i8"),  # float64 (5, lanes_per_beam): `SubRays.loop_table`
         ("lanes_per_beam", "i8"),  # lanes of a beam in a tile: `subrays` in whole vectors
-        ("offsets", "i8"),  # float64 (2, rows): angles of beams, added to the angles in `shares`
+        ("offsets", "i8"),  # float64 (2, rows): angles of beams, added to the angles in `sub_ray_table`
         ("has_axis", "i8"),  # whether `axis` defines the directions across and up of sub-rays
         ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
         ("axis", "f8", 3),
@@ -173,7 +173,7 @@ class CastRecord:
         if sub_rays is None:
             return 0.0
         record["subrays"] = len(sub_rays)
-        record["shares"] = self.address_of(sub_rays.loop_table(pattern.offsets))
+        record["sub_ray_table"] = self.address_of(sub_rays.loop_table(pattern.offsets))
         record["lanes_per_beam"] = whole_vectors(len(sub_rays))
         record["has_starts"] = sub_rays.starts is not None
         record["offsets"] = self.address_of(pattern.offsets)

@@ -26,7 +26,7 @@ try:
     from numba.core.types.misc import unliteral
     from numba.types import ExternalFunction
 
-    from .loop_files import LoopFiles, remove_unfinished, tell_not_kept
+    from .loop_files import LoopFiles, remove_unfinished, warn_not_cached
 except ImportError:
     njit = None
 
@@ -51,9 +51,9 @@ COMPILING_EACH_TIME = (
     "compiling the ray-casting loops, which takes about 20 s in each process. To cache the "
     "compiled loops, set NUMBA_CACHE_DIR to a writable folder"
 )
-_TOLD_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
-_compiling_s = [0.0]  # what this process has waited for loops that were not compiled
-_waits = [False]  # whether the loop at hand is compiled, here or in another process
+_LOG_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
+_seconds_spent = [0.0]  # what this process has waited for loops that were not compiled
+_is_compiling = [False]  # whether the loop at hand is compiled, here or in another process
 HAS_CACHE = _has_cache()  # whether compiled loops are kept for later processes
 
 
@@ -61,7 +61,7 @@ _IMPORTS = re.compile(r"^\s*from (\.+)([\w.]*) import (?:\(([^)]*)\)|(.*))$", re
 
 
 @cache
-def _imported(path: Path) -> tuple[Path, ...]:
+def _imported_files(path: Path) -> tuple[Path, ...]:
     """Return the files that a module names in its relative imports."""
     files: list[Path] = []
     # Not by `ast`, which takes ten times as long in each process that starts.
@@ -74,7 +74,7 @@ def _imported(path: Path) -> tuple[Path, ...]:
 
 
 @cache
-def _stamp(path: Path) -> tuple[int, ...]:
+def _source_stamp(path: Path) -> tuple[int, ...]:
     """Return a value that changes with each source file that a loop may depend on.
 
     Numba itself watches only the file of the loop. Its constants and callees come from the modules
@@ -87,7 +87,7 @@ def _stamp(path: Path) -> tuple[int, ...]:
         source = unread.pop()
         if source not in sources:
             sources.add(source)
-            unread += _imported(source)
+            unread += _imported_files(source)
     sources.update(Path(__file__).parent.glob("*.py"))
     stats = [source.stat() for source in sorted(sources)]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
@@ -95,9 +95,9 @@ def _stamp(path: Path) -> tuple[int, ...]:
 
 _WAIT_S = 60.0  # total for processes that compile: a process may have been stopped
 _STEP_S = 0.02
-_held = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
-_locked = [""]  # folder whose lock this process has
-_patience = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vain
+_lock_depth = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
+_locked_folder = [""]  # folder whose lock this process has
+_wait_left_s = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vain
 
 
 @contextmanager
@@ -111,45 +111,45 @@ def _compile_lock(folder: str) -> Iterator[None]:
         collects = gc.isenabled()
         gc.disable()  # an eighth of the time: numba keeps most of the objects of a compilation
         try:
-            if fcntl is not None and not _held[0]:
+            if fcntl is not None and not _lock_depth[0]:
                 Path(folder).mkdir(parents=True, exist_ok=True)
                 file = (Path(folder) / "raybeam.lock").open("a")
-                while _patience[0] > 0:
+                while _wait_left_s[0] > 0:
                     try:
                         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                        _locked[0] = folder
+                        _locked_folder[0] = folder
                         break
                     except BlockingIOError:
-                        _waits[0] = True
+                        _is_compiling[0] = True
                         time.sleep(_STEP_S)
-                        _patience[0] -= _STEP_S
+                        _wait_left_s[0] -= _STEP_S
         except OSError:  # a file system without locks
             pass
-        _held[0] += 1
+        _lock_depth[0] += 1
         try:
             yield
         finally:
-            _held[0] -= 1
+            _lock_depth[0] -= 1
             (gc.enable if collects else gc.disable)()
             if file is not None:
-                _locked[0] = ""
+                _locked_folder[0] = ""
                 with suppress(OSError):
                     fcntl.flock(file, fcntl.LOCK_UN)  # for a forked child, too
                 file.close()
 
 
-def _tell_if_long(seconds: float) -> None:
+def _log_if_slow(seconds: float) -> None:
     """Count the time that a loop has taken, and log once that loops are being compiled.
 
     Loops are compiled when modules are imported, one after the other: after the first second it is
     certain that many of them are.
     """
-    if not _waits[0]:
+    if not _is_compiling[0]:
         return
-    _waits[0] = False
-    before_s = _compiling_s[0]
-    _compiling_s[0] += seconds
-    if before_s < _TOLD_AFTER_S <= _compiling_s[0]:
+    _is_compiling[0] = False
+    before_s = _seconds_spent[0]
+    _seconds_spent[0] += seconds
+    if before_s < _LOG_AFTER_S <= _seconds_spent[0]:
         _log.info(COMPILING if HAS_CACHE else COMPILING_EACH_TIME)
 
 
@@ -160,7 +160,7 @@ def _cached(dispatcher: Any, function: Any) -> Any:
         return dispatcher
     dispatcher.enable_caching()
     cache = dispatcher._cache
-    stamp = _stamp(Path(function.__code__.co_filename))
+    stamp = _source_stamp(Path(function.__code__.co_filename))
     cache._cache_file = LoopFiles(cache._cache_path, cache._impl.filename_base, stamp)
     cache.load_overload = partial(_load_compiled, cache)
     cache.save_overload = partial(_save_compiled, cache)
@@ -179,12 +179,12 @@ def _timed(compile_now: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that compiles or loads a loop, and counts the time."""
 
     def compile_and_count(*signature: Any) -> Any:
-        if _held[0]:  # a loop that the loop at hand calls
+        if _lock_depth[0]:  # a loop that the loop at hand calls
             return compile_now(*signature)
         started_s = time.perf_counter()
-        _waits[0] = not HAS_CACHE
+        _is_compiling[0] = not HAS_CACHE
         code = compile_now(*signature)
-        _tell_if_long(time.perf_counter() - started_s)
+        _log_if_slow(time.perf_counter() - started_s)
         return code
 
     return compile_and_count
@@ -200,17 +200,17 @@ def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
     rtsys.initialize(target_context)  # compiled code may allocate memory
     code = cache._load_overload(signature, target_context)
     if code is None:
-        _waits[0] = True
+        _is_compiling[0] = True
     return code
 
 
 def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
     """Keep compiled code on disk, if the disk has room and the folder can be written."""
-    remove_unfinished(cache._cache_path, is_locked=_locked[0] == cache._cache_path)
+    remove_unfinished(cache._cache_path, is_locked=_locked_folder[0] == cache._cache_path)
     try:
         cache._save_overload(signature, code)
     except OSError as error:
-        tell_not_kept(cache._cache_path, error)
+        warn_not_cached(cache._cache_path, error)
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
@@ -229,7 +229,7 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-def part(signature: Any) -> Callable[[Any], Any]:
+def called_by_address(signature: Any) -> Callable[[Any], Any]:
     """Compile a function that compiled code calls by its address.
 
     As a stage it would be compiled again with each of its callers, and with the callers of these.
@@ -248,13 +248,13 @@ def part(signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-WHOLE = (types.int64,) if njit is not None else ()  # argument of a part: a number or an address
+INT64 = (types.int64,) if njit is not None else ()  # argument of a part: a number or an address
 _parts: list[Any] = []  # whose addresses compiled code holds
 
 
 def inlined(function: Any) -> Any:
     """Compile a function as a part of its compiled callers."""
-    return _inner(function, forceinline=True)
+    return _compile_inner(function, forceinline=True)
 
 
 def stage(function: Any) -> Any:
@@ -262,10 +262,10 @@ def stage(function: Any) -> Any:
 
     As parts of a longer function the loops do not.
     """
-    return _inner(function)
+    return _compile_inner(function)
 
 
-def _inner(function: Any, **options: Any) -> Any:
+def _compile_inner(function: Any, **options: Any) -> Any:
     """Compile a function for calls by compiled functions only.
 
     Python may call its `py_func`.

@@ -147,7 +147,7 @@ class CudaBackend(Backend):
             # In steps, so that scenes share compiled kernels.
             stack = -(-max(self._stack + layout.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _compiled(
-                self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
+                self._cupy, self._device.id, compiler_options(stack, scene.nested, self._masked)
             )
             tables = (layout.frame, layout.top, layout.instances)
             self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
@@ -447,7 +447,7 @@ class CudaBackend(Backend):
         cp = self._cupy
         n = len(hits[1])
         sums = cp.cumsum(hits[1] != -1, dtype=np.int32)
-        span, later_starts = groups.spans(start, start + n)
+        span, later_starts = groups.find_groups(start, start + n)
         cuts = PendingCopy(cp, sums[cp.asarray(np.append(later_starts, n) - 1)])
         return _CastChunk(
             start=start,
@@ -475,7 +475,7 @@ class CudaBackend(Backend):
         cp = self._cupy
         n = len(chunk.hits[1])
         cuts = np.append(0, chunk.cuts.values()).astype(np.int64)
-        first_kept, kept_counts = groups.count(chunk.span, np.diff(cuts))
+        first_kept, kept_counts = groups.count_hits(chunk.span, np.diff(cuts))
         offsets = np.cumsum(kept_counts) - kept_counts
         starts = np.append(0, chunk.later_starts)
         table = np.minimum([starts, cuts[:-1] + first_kept, offsets], _MAX_INT)
@@ -547,13 +547,13 @@ def _pose_span(poses: Poses, start: int, stop: int) -> slice:
     return slice(start // poses.rays_per_pose, -(-stop // poses.rays_per_pose))
 
 
-def source() -> str:
+def kernel_source() -> str:
     """Return the text of intersect.cu, with its name for the compiler's messages."""
     text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
     return f'#line 1 "intersect.cu"\n{text}'
 
 
-def flags(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
+def compiler_options(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
     """Return the compiler options of intersect.cu.
 
     `stack` is the maximum of nodes that wait in a traversal; `nested` is true for instances,
@@ -564,9 +564,9 @@ def flags(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def _compiled(cupy: Any, device: int, flags: tuple[str, ...]) -> Any:
+def _compiled(cupy: Any, device: int, options: tuple[str, ...]) -> Any:
     """Compile the kernels for the current device, with the number `device`, once."""
-    module = cupy.RawModule(code=source(), options=flags)
+    module = cupy.RawModule(code=kernel_source(), options=options)
     module.compile()
     return module
 

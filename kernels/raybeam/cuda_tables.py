@@ -10,7 +10,7 @@ from .arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from .instances import LocalScene
 from .mesh import LocalMesh
 from .opacity import MaskTables, join_masks
-from .tree import WideTree, build_top, build_tree, join
+from .tree import WideTree, build_instance_tree, build_tree, join_trees
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
 _LEAF_SIZE = 4
@@ -74,7 +74,7 @@ class InstanceTables:
 def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
     """Build the trees over meshes, and return all tables of the meshes."""
     trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
-    tree, roots = join(trees)
+    tree, roots = join_trees(trees)
     corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     faces = [mesh.index[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     return MeshTables(
@@ -94,7 +94,7 @@ def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
         return InstanceTables(
             np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0
         )
-    tree = build_top(scene.boxes, _WIDTH)
+    tree = build_instance_tree(scene.boxes, _WIDTH)
     instances = np.zeros((len(scene.mesh), 20))
     instances[:, :12] = scene.matrices
     frames = [mesh.frame for mesh in scene.meshes]

@@ -69,5 +69,5 @@ class DeformingMesh:
         tree = build_tree(local[faces], loops.WIDTH, _LEAF_SIZE)
         boxes = np.empty((len(vertices) - 1, len(tree.child), 6, loops.WIDTH), np.float32)
         pad = _PAD * float(np.abs(box).max())
-        loops.fit(vertices, faces, tree.order, tree.child, pad, boxes)
+        loops.fit_boxes(vertices, faces, tree.order, tree.child, pad, boxes)
         return loops.DeformingTree(vertices, faces, tree.order, tree.child, boxes)

@@ -12,7 +12,7 @@ from .cast_record import float32s, float64s
 from .compiled import compiled, inlined, stage
 from .moving_loops import NEAREST_HITS, PAIRS, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS
-from .triangle_loops import areas, same_sign, shear
+from .triangle_loops import intersect_plane, same_sign, shear_ray
 
 WIDTH = 8  # children of a node
 _STACK = 512  # nodes still to visit: far more than on any descent in a tree of 2**28 triangles
@@ -58,7 +58,7 @@ _TREE = named_tuple_type(
 
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
-def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
+def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
     """Compute the boxes of all nodes of a `DeformingTree` between each frame and the next.
 
     The boxes are written to `boxes`. They extend beyond the triangles by `pad`, in meters.
@@ -162,7 +162,7 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
         u, v, w = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
         origin = x, y, z
         inverse = _inverse(u), _inverse(v), _inverse(w)
-        axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
+        axis, a, b, c, d, e, f = shear_ray(x, y, z, u, v, w)
         sheared_ray = a, b, c, d, e, f
         frame = np.int64(max(pairs.frame[n], 0.0))
         frame = frame if frame < last else last
@@ -203,7 +203,7 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
                         _corner(vertices, frame, share, faces[face, 1], axis),
                         _corner(vertices, frame, share, faces[face, 2], axis),
                     )
-                    a, b, c, det, t = areas(corners, sheared_ray)
+                    a, b, c, det, t = intersect_plane(corners, sheared_ray)
                     if det == 0 or not same_sign(a, b, c) or not t_min <= t <= best:
                         continue
                     if t < best or hit_triangle < 0 or face < hit_triangle:

@@ -99,7 +99,7 @@ class DeviceNearestHits:
     triangle: Any
     cupy: Any
 
-    def hits(self) -> BodyHits:
+    def compact(self) -> BodyHits:
         """Copy the hits to the host, without the rays that hit no body."""
         ray = self.cupy.flatnonzero(self.body >= 0)
         columns = (self.distance, self.body, self.instance, self.triangle)
@@ -129,14 +129,14 @@ class _Pinned:
         self._lock = threading.RLock()  # a finalizer may run while its thread holds the lock
         self._bytes = 0
 
-    def take(self, size: int) -> bool:
+    def reserve(self, size: int) -> bool:
         """Count bytes and return True, unless there would be too many."""
         with self._lock:
             fits = self._bytes + size <= PINNED_BYTES
             self._bytes += size * fits
             return fits
 
-    def give_back(self, size: int) -> None:
+    def release(self, size: int) -> None:
         """Count bytes that are no longer in use."""
         with self._lock:
             self._bytes -= size
@@ -153,15 +153,15 @@ def pinned_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
     but page-locked memory is lost to all other processes of the machine.
     """
     size = max(count * np.dtype(kind).itemsize, 1)
-    if not _pinned.take(size):
+    if not _pinned.reserve(size):
         return np.empty(count, kind)
     try:
         memory = cupy.cuda.alloc_pinned_memory(size)
     except BaseException:
-        _pinned.give_back(size)
+        _pinned.release(size)
         raise
     array = np.frombuffer(memory, kind, count)
-    weakref.finalize(array, _pinned.give_back, size)  # views of the array keep the array
+    weakref.finalize(array, _pinned.release, size)  # views of the array keep the array
     return array
 
 

@@ -6,7 +6,7 @@ is made a unit vector again, so the properties of rays and meshes in [-1, 1] hol
 bound, and that no ray slips between two triangles. The distance is divided by the length of the
 direction before that.
 
-All backends do these operations in float64, in the order of `LocalScene.enter`, without a fused
+All backends do these operations in float64, in the order of `LocalScene.to_mesh_coordinates`, without a fused
 multiply-add.
 """
 
@@ -177,7 +177,7 @@ class LocalScene:
         """Return the tally row of each triangle (k,) in its instance (k,)."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
-    def enter(
+    def to_mesh_coordinates(
         self, instance: Indices, origins: Floats, directions: Floats
     ) -> tuple[Floats, Floats, Floats]:
         """Transform each ray to the mesh coordinates of its instance (m,), in a nested scene.

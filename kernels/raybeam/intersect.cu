@@ -250,7 +250,7 @@ struct BodyRays {
 };
 
 // Transform a ray from the scene's to an instance's coordinates. Return the length of its direction
-// there, with the operations of `Scene.enter`.
+// there, with the operations of `LocalScene.to_mesh_coordinates`.
 __device__ __forceinline__ double enter_mesh(const Scene& scene, int instance, Ray& ray)
 {
     if (!NESTED) return 1.0;
@@ -308,7 +308,7 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
-// Return whether the mesh's mask stops a ray that passes inside a triangle, as `MaskTables.opaque`.
+// Return whether the mesh's mask stops a ray that passes inside a triangle, as `MaskTables.is_opaque`.
 __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, const Exact& hit)
 {
     const Count* record = scene.opacity + 4 * (Count)mesh;

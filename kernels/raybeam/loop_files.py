@@ -50,7 +50,7 @@ class LoopFiles(IndexDataCacheFile):
             return None
         code = self._content(name)
         if code is None or _checksum(code) != checksum:
-            self._tell_damaged(name)
+            self._warn_damaged(name)
             return None
         return pickle.loads(code)  # noqa: S301 - fits its checksum
 
@@ -79,7 +79,7 @@ class LoopFiles(IndexDataCacheFile):
         checksum = content[: hashlib.sha256().digest_size]
         pickled = content[len(checksum) :]
         if _checksum(pickled) != checksum:
-            self._tell_damaged(self._index_name)
+            self._warn_damaged(self._index_name)
             return {}
         file = io.BytesIO(pickled)
         if pickle.load(file) != self._version:  # noqa: S301 - fits its checksum
@@ -107,18 +107,18 @@ class LoopFiles(IndexDataCacheFile):
         with self._open_for_write(path) as file:
             file.write(content)
 
-    def _tell_damaged(self, name: str) -> None:
+    def _warn_damaged(self, name: str) -> None:
         """Say that a file is not used."""
-        _tell_once(
+        _warn_once(
             "Compiled loops in %s are damaged and will be compiled again. The first one is %s.",
             self._cache_path,
             name,
         )
 
 
-def tell_not_kept(folder: str, error: OSError) -> None:
+def warn_not_cached(folder: str, error: OSError) -> None:
     """Say that compiled code cannot be written, so that each process compiles."""
-    _tell_once(
+    _warn_once(
         "Compiled loops cannot be stored in %s, so each process compiles them: %s.",
         folder,
         error.strerror or str(error),
@@ -143,11 +143,11 @@ def _checksum(content: bytes) -> bytes:
     return hashlib.sha256(content).digest()
 
 
-_told = set[tuple[str, str]]()  # messages of this process, and the folders that they name
+_warned = set[tuple[str, str]]()  # messages of this process, and the folders that they name
 
 
-def _tell_once(message: str, folder: str, example: str) -> None:
+def _warn_once(message: str, folder: str, example: str) -> None:
     """Log a warning on a folder with an example, once for all loops of the folder."""
-    if (message, folder) not in _told:
-        _told.add((message, folder))
+    if (message, folder) not in _warned:
+        _warned.add((message, folder))
         _log.warning(message, folder, example)

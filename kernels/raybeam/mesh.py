@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Bools, Floats, Ints, Ints32
 from .opacity import LocalOpacity, Opacity, check_opacity
-from .rays import finite_rows, real_rows, refuse_rows
+from .rays import are_finite, as_real_rows, check_rows
 from .tree import PAD
 
 # Every traversal in float32 starts inside the box of a scene or mesh: a ray from outside is first
@@ -57,7 +57,7 @@ class LocalFrame:
         return np.concatenate([self.center, [self.scale], self.lower, self.upper])
 
 
-def clip(
+def clip_to_box(
     lower: Floats, upper: Floats, origins: Floats, directions: Floats
 ) -> tuple[Floats, Floats]:
     """Return local distances at which rays enter (0 from inside) and leave a box: (n,) each.
@@ -124,9 +124,9 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     opacity
         Mask of the opaque parts of the triangles; None if all are opaque.
     """
-    points = real_rows("vertices", vertices)
+    points = as_real_rows("vertices", vertices)
     rows = _check_faces(faces, len(points))
-    refuse_rows("Vertex", points, finite_rows, "finite")
+    check_rows("Vertex", points, are_finite, "finite")
     points = points.astype(np.float64)
     is_used = np.zeros(len(points), np.bool_)
     is_used[rows.reshape(-1)] = True

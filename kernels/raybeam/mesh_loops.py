@@ -11,7 +11,7 @@ from numba import types
 from . import cast_record as memory
 from .cast_record import float32s, float64s, int64s, uint8s
 from .compiled import compiled, inlined, stage
-from .triangle_loops import areas, shear
+from .triangle_loops import intersect_plane, shear_ray
 
 f64_1 = types.float64[::1]
 f64_2 = types.float64[:, ::1]
@@ -19,8 +19,8 @@ i32_1 = types.int32[::1]
 
 
 @stage
-def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray from the scene's to the mesh's local coordinates, as `LocalScene.enter`.
+def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Transform a ray from the scene's to the mesh's local coordinates, as `LocalScene.to_mesh_coordinates`.
 
     `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
     the length of the direction before it was made a unit vector.
@@ -36,7 +36,7 @@ def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
+def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
     """Return the three corners of a triangle, each as three coordinates with `axis` last.
 
     `triangle` is the row in `table`.
@@ -53,7 +53,7 @@ def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
 
 @stage
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether the mask of a mesh stops a ray in a triangle, as `MaskTables.opaque`.
+    """Return whether the mask of a mesh stops a ray in a triangle, as `MaskTables.is_opaque`.
 
     `mesh` points to a `MESH`, `triangle` is the row in its corners.
     """
@@ -73,13 +73,13 @@ def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 
 
 @compiled(types.void(memory.CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
-def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     casts, origins, directions, triangle_row, instance, u, v
 ):
     """Write the weights `u` and `v` (m,) of the second and third corner for hits of a `CAST`.
 
     Rays (m, 3) are local to the scene; origins are (1, 3) if all rays share their origin.
-    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `trace` wrote
+    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `cast_rays` wrote
     with `index` 0.
     """
     mesh = casts[0].mesh
@@ -100,12 +100,12 @@ def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
             record = int64s(address)
             mesh_address = record[memory.MESH_FIELD]
             row = row - record[memory.FIRST_ROW_FIELD]
-            ox, oy, oz, dx, dy, dz, _ = enter_instance(
+            ox, oy, oz, dx, dy, dz, _ = to_mesh_coordinates(
                 float64s(address), ox=ox, oy=oy, oz=oz, dx=dx, dy=dy, dz=dz
             )
-        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
-        corners = corners_of(float64s(int64s(mesh_address)[0]), row, axis)
-        a, b, c, det, _ = areas(corners, (p, q, r, sx, sy, sz))
+        axis, p, q, r, sx, sy, sz = shear_ray(ox, oy, oz, dx, dy, dz)
+        corners = triangle_corners(float64s(int64s(mesh_address)[0]), row, axis)
+        a, b, c, det, _ = intersect_plane(corners, (p, q, r, sx, sy, sz))
         sign = -1.0 if det < 0 else 1.0  # areas of a hit have the sign of `det`, or are 0
         a = max(sign * a, 0.0)
         b = max(sign * b, 0.0)

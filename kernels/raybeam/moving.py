@@ -125,18 +125,18 @@ def nearest_body_hits(
     from . import moving_loops as loops  # numba takes half a second to import
 
     end = _end(scan)
-    nearest = NearestHits.without_hits(
+    nearest = NearestHits.empty(
         np.full(len(scan), end) if limits is None else np.minimum(limits, end)
     )
     on_device = moving.on_device
     for hits in _hits_on_device(moving, scan, times, np.flatnonzero(on_device)):
-        nearest.take(hits)
+        nearest.update(hits)
     bodies = np.flatnonzero(~on_device)
     if len(bodies):
         for start, stop in scan.chunks(CHUNK_RAYS):
             rays = host_rays(scan, start, stop)
             ray_times = times(np.arange(start, stop, dtype=np.int64))
-            chunk = _Chunk(loops, moving, scan, rays, ray_times, nearest.part(start, stop))
+            chunk = _Chunk(loops, moving, scan, rays, ray_times, nearest.view(start, stop))
             chunk.cast(bodies)
     return nearest
 
@@ -147,10 +147,10 @@ def body_hits(moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats])
     Without host memory for each ray, if all shapes are on a device.
     """
     if not moving.on_device.all():
-        return nearest_body_hits(moving, scan, times).hits()
+        return nearest_body_hits(moving, scan, times).compact()
     parts = [*_hits_on_device(moving, scan, times, np.arange(len(moving.shape)))]
     if not parts:
-        return NearestHits.without_hits(np.zeros(0)).hits()
+        return NearestHits.empty(np.zeros(0)).compact()
     return BodyHits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -187,7 +187,7 @@ def _hits_on_device(
                     limits,
                 )
                 caster.cast_bodies(timed, nearest)
-        hits = nearest.hits()
+        hits = nearest.compact()
         yield hits._replace(ray=hits.ray + start)
 
 

@@ -20,10 +20,10 @@ from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, ClosestHits
 from .instances import LocalScene
-from .mesh import ACROSS, TINY, clip
+from .mesh import ACROSS, TINY, clip_to_box
 from .opacity import join_masks
 from .rays import Rays
-from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
+from .tree import LEAF_BITS, PAD, WideTree, build_instance_tree, build_tree, join_trees
 
 _WIDTH = 8
 _LEAF_SIZE = 4
@@ -217,7 +217,7 @@ class NumpyBackend(Backend):
         super().__init__(scene, threads, device)
         meshes = scene.meshes
         trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
-        tree, self._roots = join(trees)
+        tree, self._roots = join_trees(trees)
         orders = [tree.order for tree in trees]
         self._masks = join_masks([mesh.opacity for mesh in meshes], orders)
         self._nodes = _Nodes(tree)
@@ -231,7 +231,7 @@ class NumpyBackend(Backend):
         """Replace the scene by a scene of the same instances with new transforms."""
         super().update_scene(scene)
         if scene.nested:
-            self._top = _Nodes(build_top(scene.boxes, _WIDTH))
+            self._top = _Nodes(build_instance_tree(scene.boxes, _WIDTH))
             # Corners of the box of each instance's mesh: (3, n)
             frames = [mesh.frame for mesh in scene.meshes]
             self._lower = np.array([frame.lower for frame in frames])[scene.mesh].T
@@ -243,7 +243,7 @@ class NumpyBackend(Backend):
         origins = np.broadcast_to(frame.to_local(rays.origins), rays.directions.shape)
         t_min = rays.t_min * frame.scale
         t_max = rays.t_max * frame.scale
-        entry, leave = clip(frame.lower, frame.upper, origins, rays.directions)
+        entry, leave = clip_to_box(frame.lower, frame.upper, origins, rays.directions)
         row = np.flatnonzero((entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min - PAD))
         count = len(row)
         best = _Best(
@@ -286,10 +286,12 @@ class NumpyBackend(Backend):
 
     def _inner_rays(self, query: _Query, ray: Indices, instance: Indices) -> _Packet:
         """Return rays (m,) in the coordinates of instances (m,), if they meet the mesh's box."""
-        origins, directions, length = self._scene.enter(
+        origins, directions, length = self._scene.to_mesh_coordinates(
             instance, query.origins[ray], query.directions[ray]
         )
-        entry, leave = clip(self._lower[:, instance], self._upper[:, instance], origins, directions)
+        entry, leave = clip_to_box(
+            self._lower[:, instance], self._upper[:, instance], origins, directions
+        )
         t_max = query.best.t[ray] * length
         rows = np.flatnonzero(
             (entry <= leave) & (entry <= t_max + PAD) & (leave >= query.t_min * length - PAD)
@@ -306,13 +308,13 @@ class NumpyBackend(Backend):
         if rays.visit is not None:
             ray = rays.visit.ray[row]
             t = t / rays.visit.length[row]
-        passes = exact.inside(hits.a, hits.b, hits.c, hits.det)
+        passes = exact.is_inside(hits.a, hits.b, hits.c, hits.det)
         hit = np.flatnonzero(passes & (t >= query.t_min) & (t <= query.best.t.take(ray)))
         if self._masks is not None:
             instance = 0 if rays.visit is None else rays.visit.key[row[hit]] >> _SHIFT
             mesh = np.broadcast_to(self._scene.mesh[instance], len(hit))
             weights = (weight[hit] for weight in hits[:4])
-            hit = hit[self._masks.opaque(mesh, position[hit], *weights)]
+            hit = hit[self._masks.is_opaque(mesh, position[hit], *weights)]
         if not len(hit):
             return
         row = row[hit]
@@ -386,7 +388,7 @@ def _packet(
         inverse=inverse,
         near_side=(components < 0).astype(np.intp),
         limit=_limit(np.broadcast_to(t_max, len(entry)), entry),
-        sheared=exact.shear(origins, directions),
+        sheared=exact.shear_rays(origins, directions),
         visit=visit,
     )
 

@@ -1,7 +1,7 @@
 """Masks that make parts of triangles transparent: leaves, fences, nets.
 
 A triangle that a ray passes inside counts only where the mask is true. All backends compute the
-position in the mask in float64 with the operations of `MaskTables.opaque`, in that order.
+position in the mask in float64 with the operations of `MaskTables.is_opaque`, in that order.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class MaskTables:
     mask: Bytes
     records: Ints
 
-    def opaque(
+    def is_opaque(
         self,
         mesh: Indices,
         position: Indices,

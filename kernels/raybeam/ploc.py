@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import Floats32, Indices, Ints32
-from .sah_builder import divide
+from .sah_builder import build_by_sah
 
 _RADIUS = 8  # neighbors looked at on either side; twice as many gain 1 to 2 % of the tree's cost
 # Clusters that are left to the sweep: an eighth of all boxes, within these limits. Four times the
@@ -128,14 +128,14 @@ class _Nodes:
         clusters.node[first] = new
         clusters.remove(second)
 
-    def fit(self, start: int, stop: int) -> None:
+    def fit_boxes(self, start: int, stop: int) -> None:
         """Compute the boxes of nodes `start` to `stop` from their children."""
         children = self.first_child[start:stop], self.second_child[start:stop]
         self.lower[:, start:stop] = np.minimum(*(self.lower[:, child] for child in children))
         self.upper[:, start:stop] = np.maximum(*(self.upper[:, child] for child in children))
 
 
-def build(lower: Floats32, upper: Floats32) -> BinaryTree:
+def build_binary_tree(lower: Floats32, upper: Floats32) -> BinaryTree:
     """Build a binary tree over n boxes, where n is at least 1.
 
     Parameters
@@ -144,33 +144,33 @@ def build(lower: Floats32, upper: Floats32) -> BinaryTree:
         float32 (3, n): corners of the boxes, within [-2, 2].
     """
     n = lower.shape[1]
-    order = np.argsort(_morton(lower, upper), kind="stable").astype(np.int32)
+    order = np.argsort(_morton_codes(lower, upper), kind="stable").astype(np.int32)
     nodes = _Nodes(lower, upper)
     clusters = _Clusters(lower[:, order], upper[:, order], order)
     rounds: list[tuple[int, int]] = []
     next_node = n
     max_clusters = min(_MAX_CLUSTERS, max(_MIN_CLUSTERS, n // 8))
     while len(clusters.node) > max_clusters:
-        first, second = _partners(clusters.lower, clusters.upper)
+        first, second = _mutual_partners(clusters.lower, clusters.upper)
         nodes.merge(clusters, next_node, first, second)
         rounds.append((next_node, next_node + len(first)))
         next_node += len(first)
-    children, crown_rounds = _crown(clusters, nodes.count[clusters.node], next_node)
+    children, crown_rounds = _build_upper_levels(clusters, nodes.count[clusters.node], next_node)
     nodes.first_child[next_node:], nodes.second_child[next_node:] = children.T
     for start, stop in crown_rounds:
-        nodes.fit(start, stop)
+        nodes.fit_boxes(start, stop)
     all_rounds = (*rounds, *crown_rounds)
     return BinaryTree(nodes.lower, nodes.upper, nodes.first_child, nodes.second_child, all_rounds)
 
 
-def _crown(
+def _build_upper_levels(
     clusters: _Clusters, count: Ints32, next_node: int
 ) -> tuple[Ints32, list[tuple[int, int]]]:
     """Return children (m - 1, 2) of the nodes above the last m clusters, root last, and rounds.
 
     `count` (m,) is the number of boxes of each cluster, `next_node` the number of the next node.
     """
-    levels = divide(clusters.lower, clusters.upper, count.astype(np.float64))
+    levels = build_by_sah(clusters.lower, clusters.upper, count.astype(np.float64))
     children = [np.zeros((0, 2), np.int32)]
     rounds: list[tuple[int, int]] = []
     below = next_node  # start of the level below
@@ -183,7 +183,7 @@ def _crown(
     return np.concatenate(children), rounds
 
 
-def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
+def _mutual_partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
     """Return pairs of positions of mutual best partners, the lower position first."""
     n = lower.shape[1]
     position = np.arange(n)
@@ -248,16 +248,20 @@ def _half_area(size: Floats32) -> Floats32:
     return x * y + y * z + z * x
 
 
-def _morton(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
+def _morton_codes(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
     """Return the position of each box's center along a Z-order curve."""
     center = lower.astype(np.float64) + upper
     start = center.min(axis=1, keepdims=True)
     extent = float((center - start).max()) or 1.0
     cell = ((center - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
-    return _spread(cell[0]) << np.uint64(2) | _spread(cell[1]) << np.uint64(1) | _spread(cell[2])
+    return (
+        _spread_bits(cell[0]) << np.uint64(2)
+        | _spread_bits(cell[1]) << np.uint64(1)
+        | _spread_bits(cell[2])
+    )
 
 
-def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _spread_bits(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Return numbers with two zero bits after each of the 21 lowest bits."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Floats, Indices, Ints
-from .rays import finite_rows, real_rows, refuse_rows
+from .rays import are_finite, as_real_rows, check_rows
 
 _SLACK = 2e-9  # tolerance for products of a rotation's rows
 
@@ -61,7 +61,7 @@ class Poses:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def look_up(self, ray: Ints, out: Floats) -> RayPoses:
+    def per_ray(self, ray: Ints, out: Floats) -> RayPoses:
         """Look up the poses of rays (m,), into the memory `out`, float64 (18, m)."""
         pose = ray // self.rays_per_pose
         delay = np.zeros(1)
@@ -110,7 +110,7 @@ class RayPoses:
     velocities: Floats | None
     rates: Floats | None
 
-    def rotated(self, vectors: Floats) -> Floats:
+    def rotate(self, vectors: Floats) -> Floats:
         """Rotate vectors (3, m) from the sensor's axes to the mesh's, in a fixed order of rounding.
 
         ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
@@ -132,7 +132,7 @@ class RayPoses:
         crosses += vectors
         return crosses
 
-    def translated(self, positions: Floats) -> Floats:
+    def translate(self, positions: Floats) -> Floats:
         """Move positions (3, m), or (3, 1), by the velocity during the delay of each ray."""
         if self.velocities is None:
             return positions
@@ -156,8 +156,8 @@ def check_poses(
     """
     if isinstance(positions, Poses):
         return positions
-    position_rows = real_rows("positions", positions)
-    refuse_rows("Position", position_rows, finite_rows, "finite")
+    position_rows = as_real_rows("positions", positions)
+    check_rows("Position", position_rows, are_finite, "finite")
     matrices = None if rotations is None else _check_rotations(rotations)
     count = max(len(position_rows), 1 if matrices is None else len(matrices))
     for table in (position_rows, matrices):
@@ -176,14 +176,14 @@ def check_poses(
             "Pass more poses, a larger rays_per_pose, or a smaller window."
         )
     return Poses(
-        _repeated(by_component(position_rows), count),
-        None if matrices is None else _repeated(matrices, count),
+        _broadcast_rows(component_major(position_rows), count),
+        None if matrices is None else _broadcast_rows(matrices, count),
         rays_of_pose,
         None if motion is None else _check_motion(motion, count, rays_of_pose),
     )
 
 
-def _repeated(table: Floats, count: int) -> Floats:
+def _broadcast_rows(table: Floats, count: int) -> Floats:
     """Return a table (1, ...) or (count, ...) as (count, ...)."""
     return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
@@ -195,7 +195,7 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
         ("velocities", (pose_count, 3)),
         ("rates", (pose_count, 3)),
     ):
-        array = by_component(np.asarray(getattr(motion, name), dtype=np.float64))
+        array = component_major(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
                 f"PoseMotion.{name} must be an array of finite numbers with shape {shape} for "
@@ -210,7 +210,7 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
 
     Raises ValueError for a matrix that deforms or mirrors.
     """
-    matrices = by_component(real_rows("rotations", rotations, (3, 3)))
+    matrices = component_major(as_real_rows("rotations", rotations, (3, 3)))
     rows = matrices.transpose(1, 2, 0)
     x, y, z = rows.transpose(1, 0, 2)
     # NaN compares as false.
@@ -242,7 +242,7 @@ def determinants(matrix_rows: Floats) -> Floats:
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 
-def by_component(table: AnyArray) -> Floats:
+def component_major(table: AnyArray) -> Floats:
     """Return a table (k, ...) as float64, each component contiguous over the k entries."""
     # Not by `numpy.moveaxis`, which takes as long as casting 100 rays.
     components_first = table.transpose(*range(1, table.ndim), 0)

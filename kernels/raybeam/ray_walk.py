@@ -18,22 +18,22 @@ from .cast_record import (
     int32s,
     int64s,
 )
-from .compiled import WHOLE, inlined, part, stage
+from .compiled import INT64, called_by_address, inlined, stage
 from .mesh import ACROSS
-from .mesh_loops import enter_instance
+from .mesh_loops import to_mesh_coordinates
 from .ray_loops import entry_distance
-from .tile_exact import decide_one
+from .tile_exact import intersect_ray
 from .tile_frame import ONE, ZERO, cross, dot
-from .tile_leaf import EDGE, FLOOR, LEAF_MASK, norm
-from .tile_memory import AXIS, ENTRY, IX, LENGTH, OX, T, U, at, row_at
+from .tile_leaf import EDGE, FLOOR, LEAF_MASK, l1_norm
+from .tile_memory import AXIS, ENTRY, IX, LENGTH, OX, T, U, field_index, row_index
 from .tile_tree import BLOCK, NODE
-from .tile_walk import put, sort_farthest_first
+from .tile_walk import sort_farthest_first, write_entry
 from .tree import LEAF_BITS
-from .triangle_loops import shear
-from .vectors import at_least, higher_of, load, lower_of, lowest_bit, multiply_add, splat, store
+from .triangle_loops import shear_ray
+from .vectors import greater_equal, load, lowest_bit, maximum, minimum, multiply_add, splat, store
 
-_NEAR = at("near")
-_STACK = at("stack")
+_NEAR = field_index("near")
+_STACK = field_index("stack")
 _TINY = np.float32(2.0**-60)
 SLACK = 2.0**-20
 _MAX_ENTRY = 1e9  # see tree.py
@@ -73,7 +73,7 @@ class _Start(NamedTuple):
 
 
 @inlined
-def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Return the `_Start` of a ray, the first of whose six numbers has index k.
 
     The box of a scene or mesh is within [-1, 1] and its padding.
@@ -140,7 +140,7 @@ def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untype
 
 
 @inlined
-def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _push_children(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Add the children of a node that a ray meets to a list, nearest last, and return its length.
 
     `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
@@ -155,9 +155,9 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
     near_x, far_x = _slab(boxes, base, start.near_x, 0, start.ix, start.x)
     near_y, far_y = _slab(boxes, base, start.near_y, 1, start.iy, start.y)
     near_z, far_z = _slab(boxes, base, start.near_z, 2, start.iz, start.z)
-    near = higher_of(higher_of(near_x, near_y), higher_of(near_z, splat(ZERO)))
-    far = lower_of(lower_of(far_x, far_y), lower_of(far_z, splat(limit)))
-    hit = at_least(far, near)
+    near = maximum(maximum(near_x, near_y), maximum(near_z, splat(ZERO)))
+    far = minimum(minimum(far_x, far_y), minimum(far_z, splat(limit)))
+    hit = greater_equal(far, near)
     store(singles, _NEAR, near)
     first = count
     while hit != 0:
@@ -184,7 +184,7 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
 
 
 @inlined
-def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Test the triangles of a leaf and a ray, and return whether it has a closer hit."""
     record = int64s(mesh)
     blocks = float32s(record[BLOCKS])
@@ -200,35 +200,35 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ig
     n1 = dot(f[0], f[1], f[2], moment[0], moment[1], moment[2])
     n2 = splat(ZERO) - dot(e[0], e[1], e[2], moment[0], moment[1], moment[2])
     n0 = (dot(normal[0], normal[1], normal[2], d[0], d[1], d[2]) - n1) - n2
-    size = norm(e) + norm(f)
-    distance = splat(ONE) + norm((ax, ay, az))
+    size = l1_norm(e) + l1_norm(f)
+    distance = splat(ONE) + l1_norm((ax, ay, az))
     margin = multiply_add(splat(EDGE) * distance, size, splat(FLOOR))
-    positive = at_least(lower_of(lower_of(n0, n1), n2) + margin, splat(ZERO))
-    negative = at_least(margin, higher_of(higher_of(n0, n1), n2))
+    positive = greater_equal(minimum(minimum(n0, n1), n2) + margin, splat(ZERO))
+    negative = greater_equal(margin, maximum(maximum(n0, n1), n2))
     left = (positive | negative | start.undecided) & ((2 << (code & LEAF_MASK)) - 1)
     first = np.int64(int32s(record[BLOCKS])[block + 72])
     closer = np.int64(0)
     while left != 0:
         lane = lowest_bit(left)
         left &= left - 1
-        closer |= np.int64(decide_one(tile, rays, ray, mesh, instance, first + lane))
+        closer |= np.int64(intersect_ray(tile, rays, ray, mesh, instance, first + lane))
     return closer
 
 
-@part(types.void(*7 * WHOLE))
-def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
+@called_by_address(types.void(*7 * INT64))
+def walk_ray(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
     """Cast a ray in a mesh, with `waiting` entries of the tree above in the list of nodes."""
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
     codes = int32s(address)
     nodes = int64s(mesh)[NODES]
-    start = _start_of_ray(floats, row_at(first_row, rays) + ray, rays)
+    start = _make_start(floats, row_index(first_row, rays) + ray, rays)
     entry = start.entry
-    t_at = row_at(T, rays) + ray
-    length = floats[row_at(LENGTH, rays) + ray]
+    t_at = row_index(T, rays) + ray
+    length = floats[row_index(LENGTH, rays) + ray]
     limit = _limit_of(floats[t_at] * length, entry)
-    put(stack, codes, waiting, ZERO, 0, 0)
+    write_entry(stack, codes, waiting, ZERO, 0, 0)
     count = waiting + 1
     while count > waiting:
         count -= 1
@@ -236,21 +236,21 @@ def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: i
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(
+            count = _push_children(
                 tile, address, nodes, node=code, start=start, limit=limit, count=count
             )
-        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, code=~code, start=start):
+        elif _test_leaf(tile, rays, ray, mesh, instance, code=~code, start=start):
             limit = _limit_of(floats[t_at] * length, entry)
 
 
 @stage
-def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write a ray in the coordinates of the mesh of an instance, whose record is at an address."""
     floats = float64s(tile)
     numbers = int64s(tile)
-    k = row_at(OX, rays) + ray
-    i = row_at(IX, rays) + ray
-    ox, oy, oz, dx, dy, dz, length = enter_instance(
+    k = row_index(OX, rays) + ray
+    i = row_index(IX, rays) + ray
+    ox, oy, oz, dx, dy, dz, length = to_mesh_coordinates(
         float64s(instance),
         ox=floats[k],
         oy=floats[k + rays],
@@ -265,10 +265,10 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
     floats[i + 3 * rays] = dx
     floats[i + 4 * rays] = dy
     floats[i + 5 * rays] = dz
-    floats[row_at(LENGTH, rays) + ray] = length
-    axis, u, v, w, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
-    numbers[row_at(AXIS, rays) + ray] = axis
-    i = row_at(U, rays) + ray
+    floats[row_index(LENGTH, rays) + ray] = length
+    axis, u, v, w, sx, sy, sz = shear_ray(ox, oy, oz, dx, dy, dz)
+    numbers[row_index(AXIS, rays) + ray] = axis
+    i = row_index(U, rays) + ray
     floats[i] = u
     floats[i + rays] = v
     floats[i + 2 * rays] = w
@@ -277,17 +277,17 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
     floats[i + 5 * rays] = sz
 
 
-@part(types.void(*5 * WHOLE))
-def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
+@called_by_address(types.void(*5 * INT64))
+def walk_ray_over_instances(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
     """Cast a ray at all instances, from the address `nodes` of the tree over the instances."""
     floats = float64s(tile)
     numbers = int64s(tile)
     address = numbers[_STACK]
     stack = float32s(address)
     codes = int32s(address)
-    start = _start_of_ray(floats, row_at(OX, rays) + ray, rays)
-    t_at = row_at(T, rays) + ray
-    put(stack, codes, 0, ZERO, 0, 0)
+    start = _make_start(floats, row_index(OX, rays) + ray, rays)
+    t_at = row_index(T, rays) + ray
+    write_entry(stack, codes, 0, ZERO, 0, 0)
     count = np.int64(1)
     while count > 0:
         count -= 1
@@ -296,13 +296,13 @@ def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(
+            count = _push_children(
                 tile, address, nodes, node=code, start=start, limit=limit, count=count
             )
             continue
         number = ~code >> LEAF_BITS
         record = instances + INSTANCE_BYTES * number
-        _enter(tile, rays, ray, record)
+        _transform_ray(tile, rays, ray, record)
         mesh = int64s(record)[MESH_FIELD]
         key = KEYS_PER_INSTANCE * number
-        walk_by_one(tile, rays, ray, IX, mesh, key, count)
+        walk_ray(tile, rays, ray, IX, mesh, key, count)

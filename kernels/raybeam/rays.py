@@ -40,7 +40,7 @@ class Rays:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def part(self, start: int, stop: int) -> Rays:
+    def normalized(self, start: int, stop: int) -> Rays:
         """Convert rays `start` to `stop` for an engine: float64, directions as unit vectors.
 
         Rays are converted part by part, so that a cast needs memory for a single part only.
@@ -73,13 +73,13 @@ def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
 
     Raises ValueError for another shape.
     """
-    rows = real_rows("origins", origins)
+    rows = as_real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
         raise ValueError(
             f"origins must have length 1 or the same length as directions, which is {ray_count}, "
             f"but has length {len(rows)}."
         )
-    refuse_rows("Origin", rows, finite_rows, "finite")
+    check_rows("Origin", rows, are_finite, "finite")
     return rows
 
 
@@ -106,12 +106,12 @@ def unit_directions(directions: ArrayLike) -> Floats:
     The memory is in columns, so that the transposed array is contiguous.
     Each row's result depends only on that row, so that batches may be cut anywhere.
     """
-    table = real_rows("directions", directions)
+    table = as_real_rows("directions", directions)
     columns = np.empty((3, len(table)))
     columns[...] = table.T
     if _are_units(columns):
         return columns.T
-    _refuse_directions(table)
+    _check_nonzero(table)
     result = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
         result[start : start + _BLOCK] = _normalized(_float64(table[start : start + _BLOCK]))
@@ -137,7 +137,7 @@ def _normalized(table: Floats) -> Floats:
     return result
 
 
-def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
+def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
     """Return real numbers (n, *shape), copied only if no array.
 
     A single row may omit n.
@@ -154,13 +154,13 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> An
     return rows
 
 
-def finite_rows(block: Floats) -> Bools:
+def are_finite(block: Floats) -> Bools:
     """Return a mask (n,) of the rows (n, 3) that have only finite numbers."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
 
-def refuse_rows(
+def check_rows(
     subject: str,
     table: AnyArray,
     is_valid: Callable[[Floats], Bools],
@@ -191,16 +191,16 @@ def _are_units(columns: Floats) -> bool:
 
 
 def _check_directions(directions: ArrayLike) -> AnyArray:
-    table = real_rows("directions", directions)
-    _refuse_directions(table)
+    table = as_real_rows("directions", directions)
+    _check_nonzero(table)
     return table
 
 
-def _refuse_directions(table: AnyArray) -> None:
-    refuse_rows(
+def _check_nonzero(table: AnyArray) -> None:
+    check_rows(
         "Direction",
         table,
-        lambda block: finite_rows(block) & block.any(axis=1),
+        lambda block: are_finite(block) & block.any(axis=1),
         "finite and nonzero",
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from .arrays import Floats, Floats32, Indices
 
-_APART = 8.0  # more than the distance of boxes within [-2, 2]
+_NODE_SPACING = 8.0  # more than the distance of boxes within [-2, 2]
 # Levels that are divided by the heuristic; deeper ones are halved. Boxes that shrink along a line
 # would be split off singly, and as many nodes would wait in a traversal.
 _LEVELS = 32
@@ -37,7 +37,7 @@ class _Level:
     stop: Indices
 
 
-def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
+def build_by_sah(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
     """Divide boxes in two, again and again, down to single boxes.
 
     Parameters
@@ -60,7 +60,7 @@ def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
     while n > 1 and len(level.start):
         node = np.repeat(np.arange(len(level.start)), level.stop - level.start)
         if len(levels) < _LEVELS:
-            axis, split = _cheapest(lower, upper, weight, level, node)
+            axis, split = _cheapest_splits(lower, upper, weight, level, node)
         else:
             axis = np.zeros_like(level.start)
             split = (level.start + level.stop) // 2 - 1
@@ -69,14 +69,14 @@ def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
     return levels
 
 
-def _cheapest(
+def _cheapest_splits(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> tuple[Indices, Indices]:
     """Return the cheapest division of each node: axis, and last position of the first part."""
     best = np.full(len(level.start), np.inf)
     axis, split = np.zeros((2, len(level.start)), np.intp)
     for k, order in enumerate(level.orders):
-        cost = _costs(lower[:, order], upper[:, order], weight[order], level, node)
+        cost = _split_costs(lower[:, order], upper[:, order], weight[order], level, node)
         min_cost = np.minimum.reduceat(cost, level.start)
         cheapest = np.flatnonzero(cost == min_cost[node])
         position = cheapest[np.searchsorted(cheapest, level.start)]
@@ -90,12 +90,12 @@ def _cheapest(
     return axis, split
 
 
-def _costs(
+def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
     """Return the cost of a division behind each position, boxes and weights sorted by an axis."""
-    area_before = _areas(lower, upper, node)
-    area_after = _areas(lower[:, ::-1], upper[:, ::-1], (node[-1] - node)[::-1])[::-1]
+    area_before = _prefix_half_areas(lower, upper, node)
+    area_after = _prefix_half_areas(lower[:, ::-1], upper[:, ::-1], (node[-1] - node)[::-1])[::-1]
     sums = np.cumsum(weight)
     sums_from_zero = np.concatenate([[0.0], sums])
     cost = np.full(len(node), np.inf)
@@ -105,10 +105,10 @@ def _costs(
     return cost
 
 
-def _areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
+def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
     """Return half the surface of the box around each position's box and its node's boxes before."""
     # Shifted apart node by node, so that a single pass over all nodes restarts at each node.
-    shift = _APART * node
+    shift = _NODE_SPACING * node
     x, y, z = (
         np.maximum.accumulate(b + shift) - shift - (np.minimum.accumulate(a - shift) + shift)
         for a, b in zip(lower, upper, strict=True)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, Indices, Integers, Ints, Ints32
 from .hits import HitColumns, ScanReturns, join_hits
 from .pattern import Pattern
-from .pattern_rays import checked_rays
+from .pattern_rays import compute_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
@@ -68,7 +68,7 @@ class Scan:
     def rays(self, start: int, stop: int) -> Rays:
         """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `out`, if any."""
         ray = np.arange(start, stop, dtype=np.int64)
-        origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
+        origins, directions = compute_rays(self.pattern, self.first, ray, self.poses)
         if self.out is not None:
             self.out[-3:, start:stop] = directions.T
             if len(self.out) > 3:
@@ -152,7 +152,7 @@ class HitGroups:
         self.keep_every = keep_every
         self.hit_counts = np.zeros(len(starts), np.int64)  # hits of each group so far
 
-    def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
+    def find_groups(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
 
         Returns
@@ -166,7 +166,7 @@ class HitGroups:
         last = int(np.searchsorted(self._starts, stop, side="left"))
         return slice(first, last), self._starts[first + 1 : last] - start
 
-    def count(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
+    def count_hits(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
         """Count the hits of groups in a chunk, and find the hits to keep.
 
         Parameters
@@ -202,7 +202,7 @@ class HitCollector(HitGroups):
     >>> pattern = Pattern([[1, 0, 0]] * 10)
     >>> collector = HitCollector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
     >>> ray = np.array([1, 2, 3, 6, 7])
-    >>> ray[collector.keep(ray, 0, 10)].tolist()
+    >>> ray[collector.select_kept(ray, 0, 10)].tolist()
     [1, 3, 6]
     """
 
@@ -211,7 +211,7 @@ class HitCollector(HitGroups):
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
         self._parts: list[HitColumns] = []
 
-    def keep(self, ray: Integers, start: int, stop: int) -> slice | Indices:
+    def select_kept(self, ray: Integers, start: int, stop: int) -> slice | Indices:
         """Count the hits of rays `start` to `stop`, and select the hits to keep.
 
         Parameters
@@ -223,10 +223,10 @@ class HitCollector(HitGroups):
         -------
         The selection of kept hits: rows of `ray`, or all.
         """
-        groups, later_starts = self.spans(start, stop)
+        groups, later_starts = self.find_groups(start, stop)
         cuts = np.searchsorted(ray, later_starts.astype(ray.dtype))
         cuts = np.concatenate([[0], cuts, [len(ray)]])
-        first_kept, kept_counts = self.count(groups, np.diff(cuts))
+        first_kept, kept_counts = self.count_hits(groups, np.diff(cuts))
         if self.keep_every == 1:
             return slice(None)
         if len(first_kept) == 1:
@@ -236,12 +236,12 @@ class HitCollector(HitGroups):
         row_indices += self.keep_every * np.arange(len(row_indices))
         return row_indices
 
-    def tally(self, tally_indices: Integers) -> None:
+    def count_triangles(self, tally_indices: Integers) -> None:
         """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
         if self._tally is not None:
             np.add.at(self._tally, tally_indices.astype(np.intp), 1)
 
-    def add(
+    def add_hits(
         self,
         start: int,
         ray: Integers,

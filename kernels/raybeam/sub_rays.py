@@ -32,7 +32,7 @@ class SubRays:
     def __len__(self) -> int:
         return len(self.angles)
 
-    def shares(
+    def components(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
         """Return the forward, lateral and vertical components of the sub-ray directions.
@@ -44,8 +44,8 @@ class SubRays:
         if offsets is not None:
             across = across + offsets[0]
             up = up + offsets[1]
-        straight = 1 / np.sqrt((1 + across * across) + up * up)
-        return straight, across * straight, up * straight
+        forward = 1 / np.sqrt((1 + across * across) + up * up)
+        return forward, across * forward, up * forward
 
     def loop_table(self, offsets: Floats | None) -> Floats:
         """Return the table of sub-rays for compiled loops.
@@ -58,7 +58,7 @@ class SubRays:
         instead.
         """
         rows = np.zeros((5, len(self)))
-        rows[:3] = self.shares()
+        rows[:3] = self.components()
         if offsets is not None:  # shares differ by beam
             rows[1:3] = self.angles.T
         if self.starts is not None:
@@ -67,8 +67,8 @@ class SubRays:
         return rows[:, padded]
 
 
-def spread(
-    sub_rays: SubRays, ahead: Floats, subray: Indices, offsets: Floats | None
+def sub_ray_directions(
+    sub_rays: SubRays, beam_directions: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
     """Return directions (3, m) of sub-rays, and their origins relative to the beams' origins.
 
@@ -76,7 +76,7 @@ def spread(
     ----------
     sub_rays
         Sub-rays of every beam.
-    ahead
+    beam_directions
         (3, m): direction of the beam of each sub-ray.
     subray
         (m,): number of each sub-ray within its beam.
@@ -90,17 +90,21 @@ def spread(
     starts
         (3, m), meters; None if sub-rays start at the beam's origin.
     """
-    straight, across, up = sub_rays.shares(subray, offsets)
+    forward, across, up = sub_rays.components(subray, offsets)
     axis = sub_rays.axis
-    first, second = any_axes(ahead) if axis is None else axes_about(ahead, axis)
-    directions = (straight * ahead + across * first) + up * second
+    first, second = (
+        perpendicular_axes(beam_directions)
+        if axis is None
+        else oriented_axes(beam_directions, axis)
+    )
+    directions = (forward * beam_directions + across * first) + up * second
     if sub_rays.starts is None:
         return directions, None
-    aside, above = sub_rays.starts[subray].T
-    return directions, aside * first + above * second
+    lateral, vertical = sub_rays.starts[subray].T
+    return directions, lateral * first + vertical * second
 
 
-def any_axes(directions: Floats) -> tuple[Floats, Floats]:
+def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
     """Return two axes across unit directions (3, n), by Duff et al. 2017: defined everywhere."""
     x, y, z = directions
     sign = np.where(z < 0, -1.0, 1.0)
@@ -110,10 +114,10 @@ def any_axes(directions: Floats) -> tuple[Floats, Floats]:
     return first, np.stack([b, sign + y * y * a, -y])
 
 
-def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
+def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
     """Return axes across unit directions (3, n): counter-clockwise about an axis, and upward.
 
-    For directions parallel to the axis (3,), the two are the axes of `any_axes`.
+    For directions parallel to the axis (3,), the two are the axes of `perpendicular_axes`.
     """
     x, y, z = directions
     a, b, c = axis
@@ -124,5 +128,5 @@ def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
     upward = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
     parallel = length < 1e-6
     if parallel.any():
-        unit_across[:, parallel], upward[:, parallel] = any_axes(directions[:, parallel])
+        unit_across[:, parallel], upward[:, parallel] = perpendicular_axes(directions[:, parallel])
     return unit_across, upward

@@ -20,7 +20,7 @@ from .instances import LocalScene
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
-from .tile_plan import TilePlan, consecutive, plan_tiles
+from .tile_plan import TilePlan, plan_consecutive, plan_tiles
 
 if TYPE_CHECKING:
     from .cast_record import CastRecord
@@ -56,11 +56,11 @@ class TileBackend(Backend):
         self._threads = ThreadPoolExecutor(self._count, "tiles")  # threads start on first use
         self._process = os.getpid()
         self._loops = tile_casts
-        self._weigh = mesh_loops.weigh
+        self._weigh = mesh_loops.barycentric_weights
         self._memory = cast_record
         self._tiles = tile_memory.thread_tiles
-        self._top_nodes = tile_tree.top_nodes
-        self._trees = [tile_tree.tile_tree(mesh.corners) for mesh in scene.meshes]
+        self._top_nodes = tile_tree.build_instance_nodes
+        self._trees = [tile_tree.build_tile_tree(mesh.corners) for mesh in scene.meshes]
         self._waiting = 2 + max(tree.stack for tree in self._trees)
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = self._mesh_records(scene)
@@ -117,8 +117,10 @@ class TileBackend(Backend):
     def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         cast = self._ray_cast(rays)
-        cast.record["index"] = 0  # hits get the row of the corners, which `weigh` needs
-        ray, distance, row, instance = self._cast(cast, 0, len(rays), consecutive(1))
+        cast.record["index"] = (
+            0  # hits get the row of the corners, which `barycentric_weights` needs
+        )
+        ray, distance, row, instance = self._cast(cast, 0, len(rays), plan_consecutive(1))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
@@ -243,7 +245,7 @@ class TileBackend(Backend):
             record["distance"] = distance[row:].ctypes.data
             record["triangle"] = triangle[row:].ctypes.data
             record["instance"] = instance[row:].ctypes.data
-            count = self._loops.trace(record, begin, min(begin + share, stop))
+            count = self._loops.cast_rays(record, begin, min(begin + share, stop))
             part = slice(row, row + count)
             return ray[part], distance[part], triangle[part], instance[part]
 

@@ -28,12 +28,12 @@ from .moving_loops import (
     pose_rotation,
     to_body_axes,
 )
-from .ray_loops import make_rays, share_origin
+from .ray_loops import make_rays, write_shared_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
-from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, at, row_at
+from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, field_index, row_index
 
-_T_MIN = at("t_min")
+_T_MIN = field_index("t_min")
 _TILE_RAYS = 8 * SUBTILES  # rays per tile of rays at bodies
 
 
@@ -46,7 +46,7 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)
-    row = row_at(NUMBER, rays)
+    row = row_index(NUMBER, rays)
     exists = np.int64(0)
     for lane in range(rays):
         number = first + lane_numbers[lane]
@@ -56,14 +56,14 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
 
 
 @stage
-def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
+def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
     """Write reaches and no hits to the rays of a tile, with reach -1 for rays outside the call."""
     floats = float64s(tile)
     numbers = int64s(tile)
-    t_at = row_at(T, rays)
-    key_at = row_at(KEY, rays)
-    length_at = row_at(LENGTH, rays)
-    number_at = row_at(NUMBER, rays)
+    t_at = row_index(T, rays)
+    key_at = row_index(KEY, rays)
+    length_at = row_index(LENGTH, rays)
+    number_at = row_index(NUMBER, rays)
     for k in range(rays):
         number = numbers[number_at + k]
         floats[t_at + k] = t_max if (number >= 0) & (number < count) else -1.0
@@ -72,15 +72,15 @@ def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
+def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
     """Write the hits of a tile to the memory of the call's `count` rays, others to its last row."""
     floats = float64s(tile)
     numbers = int64s(tile)
     distances = float64s(hits)
     keys = int64s(hits + 8 * (count + 1))
-    t_at = row_at(T, rays)
-    key_at = row_at(KEY, rays)
-    number_at = row_at(NUMBER, rays)
+    t_at = row_index(T, rays)
+    key_at = row_index(KEY, rays)
+    number_at = row_index(NUMBER, rays)
     for lane in range(rays):
         number = numbers[number_at + lane]
         ray = number if (number >= 0) & (number < count) else count
@@ -89,7 +89,7 @@ def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
-def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Cast rays `start` to `stop` of a `CAST`, write hits in ray order, return their number."""
     cast = casts[0]
     address = casts.ctypes.data
@@ -110,7 +110,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
     triangle_out = int32s(cast.triangle)
     instance_out = int32s(cast.instance)
     if cast.shares_origin != 0:
-        share_origin(cast, tile, rays)
+        write_shared_origin(cast, tile, rays)
     lead = (cast.first + start) % firing  # the call may start within a firing
     firing_count = -(-(count + lead) // firing)
     max_shift = np.int64(0)
@@ -121,9 +121,9 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
             number = (column * cast.firings - shifts[group]) * firing - lead
             if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
                 make_rays(address, start, rays, count)
-                _reset(tile, rays, cast.t_max, count)
+                _clear_hits(tile, rays, cast.t_max, count)
                 cast_tile(tile, rays, cast.mesh, instances, cast.top, rays)
-                _keep_hits(tile, rays, cast.hits, count)
+                _store_hits(tile, rays, cast.hits, count)
     hit_count = 0
     for k in range(count):
         key = keys[k]
@@ -163,7 +163,7 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
         u = u / norm
         v = v / norm
         w = w / norm
-    k = row_at(OX, _TILE_RAYS) + lane
+    k = row_index(OX, _TILE_RAYS) + lane
     floats[k] = (origin[0] - center[0]) * scale
     floats[k + _TILE_RAYS] = (origin[1] - center[1]) * scale
     floats[k + 2 * _TILE_RAYS] = (origin[2] - center[2]) * scale
@@ -174,7 +174,7 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 
 @inlined
-def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
+def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
     """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays.
 
     Their reach is -1. All rays have no hits.
@@ -182,12 +182,12 @@ def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
     floats = float64s(tile)
     numbers = int64s(tile)
     for lane in range(_TILE_RAYS):
-        numbers[row_at(KEY, _TILE_RAYS) + lane] = -1
-        floats[row_at(LENGTH, _TILE_RAYS) + lane] = 1.0
+        numbers[row_index(KEY, _TILE_RAYS) + lane] = -1
+        floats[row_index(LENGTH, _TILE_RAYS) + lane] = 1.0
     for lane in range(filled, _TILE_RAYS):
-        floats[row_at(T, _TILE_RAYS) + lane] = -1.0
+        floats[row_index(T, _TILE_RAYS) + lane] = -1.0
     for field in range(6):
-        k = row_at(OX + field, _TILE_RAYS)
+        k = row_index(OX + field, _TILE_RAYS)
         for lane in range(filled, _TILE_RAYS):
             floats[k + lane] = floats[k]
 
@@ -200,10 +200,10 @@ def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  
     index = int32s(cast.index)
     meter = 1.0 / cast.scale
     distance, bodies, instance, triangle = nearest
-    t_at = row_at(T, _TILE_RAYS)
-    key_at = row_at(KEY, _TILE_RAYS)
-    pair_at = row_at(NUMBER, _TILE_RAYS)
-    norm_at = row_at(NORM, _TILE_RAYS)
+    t_at = row_index(T, _TILE_RAYS)
+    key_at = row_index(KEY, _TILE_RAYS)
+    pair_at = row_index(NUMBER, _TILE_RAYS)
+    norm_at = row_index(NORM, _TILE_RAYS)
     for lane in range(filled):
         key = numbers[key_at + lane]
         pair = numbers[pair_at + lane]
@@ -240,9 +240,9 @@ def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: 
     bodies = pairs.body
     floats[_T_MIN] = cast.t_min
     corners = box_corners(float64s(pairs.box.ctypes.data))
-    pair_at = row_at(NUMBER, _TILE_RAYS)
-    norm_at = row_at(NORM, _TILE_RAYS)
-    t_at = row_at(T, _TILE_RAYS)
+    pair_at = row_index(NUMBER, _TILE_RAYS)
+    norm_at = row_index(NORM, _TILE_RAYS)
+    t_at = row_index(T, _TILE_RAYS)
     pair = 0
     while pair < len(row):
         filled = 0
@@ -265,10 +265,10 @@ def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: 
                 filled += 1
             pair += 1
         if filled != 0:
-            _fill_up(tile, filled)
+            _fill_lanes(tile, filled)
             cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled)
             _write_hits(cast, pairs, nearest, filled)
 
 
 # Whether this process compiled the loops; otherwise numba loaded the code of an earlier process.
-COMPILED = bool(trace.stats.cache_misses)
+COMPILED = bool(cast_rays.stats.cache_misses)

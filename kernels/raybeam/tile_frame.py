@@ -12,32 +12,32 @@ from numba import types
 
 from . import tile_memory as memory
 from .cast_record import float32s, float64s, int64s
-from .compiled import WHOLE, inlined, part, stage
-from .tile_memory import LENGTH, SUBTILES, T, at, row_at
+from .compiled import INT64, called_by_address, inlined, stage
+from .tile_memory import LENGTH, SUBTILES, T, field_index, row_index
 from .vectors import (
     absolute,
-    higher_of,
-    highest,
     load,
-    lower_of,
-    lowest,
+    max_lane,
+    maximum,
+    min_lane,
+    minimum,
     multiply_add,
-    narrow,
     splat,
     store,
+    to_float32,
 )
 
-_AXES = at("axes")
-_PADDING = at("padding")
-_OFFSET = at("offset")
-_SPREAD = at("spread")
-_BOUNDS = at("bounds")
-_TILE_BOUNDS = at("tile_bounds")
-_REACH = at("reach")
-_PLANES = at("planes")
-_TILE_PLANES = at("tile_planes")
-_SIDES = at("sides")
-_SUMS = at("sums")
+_AXES = field_index("axes")
+_PADDING = field_index("padding")
+_OFFSET = field_index("offset")
+_SPREAD = field_index("spread")
+_BOUNDS = field_index("bounds")
+_TILE_BOUNDS = field_index("tile_bounds")
+_REACH = field_index("reach")
+_PLANES = field_index("planes")
+_TILE_PLANES = field_index("tile_planes")
+_SIDES = field_index("sides")
+_SUMS = field_index("sums")
 ZERO = np.float32(0)
 ONE = np.float32(1)
 FAR = np.float32(1e30)
@@ -74,7 +74,7 @@ def tile_axes(singles):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def turned(axes, x, y, z):  # type: ignore[no-untyped-def]
+def to_tile_axes(axes, x, y, z):  # type: ignore[no-untyped-def]
     """Return the components of vectors along the axes of the tile."""
     u, v, m = axes
     return (
@@ -85,9 +85,9 @@ def turned(axes, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _narrowed(floats, k):  # type: ignore[no-untyped-def]
+def _load_eight(floats, k):  # type: ignore[no-untyped-def]
     """Return eight float64 as float32."""
-    return narrow(load(floats, k), load(floats, k + 4))
+    return to_float32(load(floats, k), load(floats, k + 4))
 
 
 @stage
@@ -98,7 +98,7 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
     """
     singles = float32s(tile)
     floats = float64s(tile)
-    direction = row_at(first_row + 3, rays)
+    direction = row_index(first_row + 3, rays)
     for axis in range(3):
         total = splat(0.0)
         for k in range(0, rays, 4):
@@ -112,7 +112,7 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
     z = np.float64(singles[_AXES + 8])
     start = _set_frame(singles, x, y, z)
     for axis in range(3):
-        origin = row_at(first_row + axis, rays)
+        origin = row_index(first_row + axis, rays)
         o = 0.5 * floats[origin] + 0.5 * floats[origin + rays - 1]
         singles[_AXES + 9 + axis] = np.float32(o)
         start = max(start, abs(o))
@@ -146,7 +146,7 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write su, sv and the depths of a tile's rays, with bounds, and return the least cosine to m.
 
     `offset` becomes the maximum, over all rays, of the distance across m between the ray and the
@@ -155,12 +155,12 @@ def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PL
     singles = float32s(tile)
     floats = float64s(tile)
     axes = tile_axes(singles)
-    origin = row_at(first_row, rays)
-    direction = row_at(first_row + 3, rays)
-    su_at = 2 * row_at(memory.SU, rays)
-    sv_at = 2 * row_at(memory.SV, rays)
-    dm_at = 2 * row_at(memory.DM, rays)
-    wm_at = 2 * row_at(memory.WM, rays)
+    origin = row_index(first_row, rays)
+    direction = row_index(first_row + 3, rays)
+    su_at = 2 * row_index(memory.SU, rays)
+    sv_at = 2 * row_index(memory.SV, rays)
+    dm_at = 2 * row_index(memory.DM, rays)
+    wm_at = 2 * row_index(memory.WM, rays)
     px = splat(np.float64(singles[_AXES + 9]))
     py = splat(np.float64(singles[_AXES + 10]))
     pz = splat(np.float64(singles[_AXES + 11]))
@@ -175,43 +175,43 @@ def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PL
         high_v = splat(-FAR)
         for k in range(subtile * each, (subtile + 1) * each, 8):
             i = direction + k
-            du, dv, dm = turned(
+            du, dv, dm = to_tile_axes(
                 axes,
-                _narrowed(floats, i),
-                _narrowed(floats, i + rays),
-                _narrowed(floats, i + 2 * rays),
+                _load_eight(floats, i),
+                _load_eight(floats, i + rays),
+                _load_eight(floats, i + 2 * rays),
             )
-            cosine = lower_of(cosine, dm)
+            cosine = minimum(cosine, dm)
             inverse = one / dm
             su = du * inverse
             sv = dv * inverse
             store(singles, su_at + k, su)
             store(singles, sv_at + k, sv)
             store(singles, dm_at + k, dm)
-            low_u = lower_of(low_u, su)
-            high_u = higher_of(high_u, su)
-            low_v = lower_of(low_v, sv)
-            high_v = higher_of(high_v, sv)
+            low_u = minimum(low_u, su)
+            high_u = maximum(high_u, su)
+            low_v = minimum(low_v, sv)
+            high_v = maximum(high_v, sv)
             i = origin + k
-            wu, wv, wm = turned(
+            wu, wv, wm = to_tile_axes(
                 axes,
-                narrow(load(floats, i) - px, load(floats, i + 4) - px),
-                narrow(load(floats, i + rays) - py, load(floats, i + rays + 4) - py),
-                narrow(load(floats, i + 2 * rays) - pz, load(floats, i + 2 * rays + 4) - pz),
+                to_float32(load(floats, i) - px, load(floats, i + 4) - px),
+                to_float32(load(floats, i + rays) - py, load(floats, i + rays + 4) - py),
+                to_float32(load(floats, i + 2 * rays) - pz, load(floats, i + 2 * rays + 4) - pz),
             )
             store(singles, wm_at + k, wm)
             across = absolute(wu - wm * su) + absolute(wv - wm * sv)
-            offset = higher_of(offset, across + absolute(wm))
-        singles[_BOUNDS + subtile] = lowest(low_u)
-        singles[_BOUNDS + SUBTILES + subtile] = highest(high_u)
-        singles[_BOUNDS + 2 * SUBTILES + subtile] = lowest(low_v)
-        singles[_BOUNDS + 3 * SUBTILES + subtile] = highest(high_v)
-    singles[_TILE_BOUNDS] = lowest(load(singles, _BOUNDS))
-    singles[_TILE_BOUNDS + 1] = highest(load(singles, _BOUNDS + SUBTILES))
-    singles[_TILE_BOUNDS + 2] = lowest(load(singles, _BOUNDS + 2 * SUBTILES))
-    singles[_TILE_BOUNDS + 3] = highest(load(singles, _BOUNDS + 3 * SUBTILES))
-    singles[_OFFSET] = highest(offset)
-    return lowest(cosine)
+            offset = maximum(offset, across + absolute(wm))
+        singles[_BOUNDS + subtile] = min_lane(low_u)
+        singles[_BOUNDS + SUBTILES + subtile] = max_lane(high_u)
+        singles[_BOUNDS + 2 * SUBTILES + subtile] = min_lane(low_v)
+        singles[_BOUNDS + 3 * SUBTILES + subtile] = max_lane(high_v)
+    singles[_TILE_BOUNDS] = min_lane(load(singles, _BOUNDS))
+    singles[_TILE_BOUNDS + 1] = max_lane(load(singles, _BOUNDS + SUBTILES))
+    singles[_TILE_BOUNDS + 2] = min_lane(load(singles, _BOUNDS + 2 * SUBTILES))
+    singles[_TILE_BOUNDS + 3] = max_lane(load(singles, _BOUNDS + 3 * SUBTILES))
+    singles[_OFFSET] = max_lane(offset)
+    return min_lane(cosine)
 
 
 @stage
@@ -247,12 +247,12 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
             ny = (y - bound * m[1]) * sign
             nz = (z - bound * m[2]) * sign
             k = _PLANES + 7 * SUBTILES * plane
-            store(singles, k, higher_of(nx, zero))
-            store(singles, k + 8, higher_of(ny, zero))
-            store(singles, k + 16, higher_of(nz, zero))
-            store(singles, k + 24, lower_of(nx, zero))
-            store(singles, k + 32, lower_of(ny, zero))
-            store(singles, k + 40, lower_of(nz, zero))
+            store(singles, k, maximum(nx, zero))
+            store(singles, k + 8, maximum(ny, zero))
+            store(singles, k + 16, maximum(nz, zero))
+            store(singles, k + 24, minimum(nx, zero))
+            store(singles, k + 32, minimum(ny, zero))
+            store(singles, k + 40, minimum(nz, zero))
             store(singles, k + 48, slack - dot(nx, ny, nz, ox, oy, oz))
             bound = splat(singles[_TILE_BOUNDS + plane])
             nx = (x - bound * m[0]) * sign
@@ -260,33 +260,33 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
             nz = (z - bound * m[2]) * sign
             constant = slack
         constant = constant - dot(nx, ny, nz, ox, oy, oz)
-        x1 = lowest(nx)
-        y1 = lowest(ny)
-        z1 = lowest(nz)
+        x1 = min_lane(nx)
+        y1 = min_lane(ny)
+        z1 = min_lane(nz)
         k = _TILE_PLANES + 4 * plane
         singles[k] = x1
         singles[k + 1] = y1
         singles[k + 2] = z1
-        singles[k + 3] = lowest(constant)
+        singles[k + 3] = min_lane(constant)
         far = plane < 4  # the farthest corner of a box counts for a side, the nearest for the depth
         numbers[_SIDES + 3 * plane] = 24 if (x1 >= 0) == far else 0
         numbers[_SIDES + 3 * plane + 1] = 32 if (y1 >= 0) == far else 8
         numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
 
 
-@part(types.float32(*3 * WHOLE))
-def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+@called_by_address(types.float32(*3 * INT64))
+def update_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the greatest depth, rounded up, of the rays of subtiles (a mask), and of each subtile.
 
     Returns the greatest depth of all subtiles.
     """
     singles = float32s(tile)
     floats = float64s(tile)
-    t_at = row_at(T, rays)
-    length_at = row_at(LENGTH, rays)
-    dm_at = 2 * row_at(memory.DM, rays)
-    wm_at = 2 * row_at(memory.WM, rays)
-    depth_at = 2 * row_at(memory.DEPTH, rays)
+    t_at = row_index(T, rays)
+    length_at = row_index(LENGTH, rays)
+    dm_at = 2 * row_index(memory.DM, rays)
+    wm_at = 2 * row_index(memory.WM, rays)
+    depth_at = 2 * row_index(memory.DEPTH, rays)
     far = splat(1e30)
     factor = splat(_REACH_FACTOR)
     margin = splat(_REACH_MARGIN + np.float32(2) * singles[_PADDING])
@@ -296,18 +296,18 @@ def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa:
             continue
         greatest = splat(-FAR)
         for k in range(subtile * each, (subtile + 1) * each, 8):
-            first = lower_of(load(floats, t_at + k) * load(floats, length_at + k), far)
-            second = lower_of(load(floats, t_at + k + 4) * load(floats, length_at + k + 4), far)
-            along = narrow(first, second) * load(singles, dm_at + k)
+            first = minimum(load(floats, t_at + k) * load(floats, length_at + k), far)
+            second = minimum(load(floats, t_at + k + 4) * load(floats, length_at + k + 4), far)
+            along = to_float32(first, second) * load(singles, dm_at + k)
             depth = multiply_add(along, factor, load(singles, wm_at + k) + margin)
             store(singles, depth_at + k, depth)
-            greatest = higher_of(greatest, depth)
-        singles[_REACH + subtile] = highest(greatest)
-    return highest(load(singles, _REACH))
+            greatest = maximum(greatest, depth)
+        singles[_REACH + subtile] = max_lane(greatest)
+    return max_lane(load(singles, _REACH))
 
 
-@part(types.int64(*4 * WHOLE))
-def aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
+@called_by_address(types.int64(*4 * INT64))
+def prepare_tile(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
     """Prepare a tile for a traversal in its rays' coordinates, and return whether it is narrow.
 
     `first_row` is the first of six rows with origins and directions, `mask` of subtiles to cast.
@@ -315,10 +315,10 @@ def aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
     singles = float32s(tile)
     if _set_axes(tile, rays, first_row) > _MAX_START:
         return False
-    if not _flatten(tile, rays, first_row) > _NARROW:
+    if not _project_rays(tile, rays, first_row) > _NARROW:
         return False
     _set_planes(tile)
     for subtile in range(SUBTILES):
         singles[_REACH + subtile] = -FAR
-    limit_depths(tile, rays, mask)
+    update_depths(tile, rays, mask)
     return True

@@ -46,20 +46,20 @@ from .cast_record import (
     int32s,
     int64s,
 )
-from .compiled import WHOLE, part, stage
-from .ray_walk import SLACK, walk_by_one, walk_instances_by_one
+from .compiled import INT64, called_by_address, stage
+from .ray_walk import SLACK, walk_ray, walk_ray_over_instances
 from .tile_exact import shear_rays
-from .tile_frame import aim
-from .tile_memory import ENTRY, IX, LENGTH, OX, SUBTILES, T, at, row_at
-from .tile_walk import list_instances, walk
-from .vectors import bit_count, higher_of, highest, load, splat, square_root, store
+from .tile_frame import prepare_tile
+from .tile_memory import ENTRY, IX, LENGTH, OX, SUBTILES, T, field_index, row_index
+from .tile_walk import list_instances, walk_tile
+from .vectors import bit_count, load, max_lane, maximum, splat, square_root, store
 
-_PADDING = at("padding")
-_OFFSET = at("offset")
-_SKIPS = at("skips")
-_PATIENCE = at("patience")
-_MET = at("met")
-_NESTED = at("nested")
+_PADDING = field_index("padding")
+_OFFSET = field_index("offset")
+_SKIPS = field_index("skips")
+_PATIENCE = field_index("patience")
+_MET = field_index("met")
+_NESTED = field_index("nested")
 _MAX_SKIPS = 31  # tiles that are cast one by one before another trial
 _FEW = 6  # rays that are cast one by one
 
@@ -76,8 +76,8 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[
     if numbers[_SKIPS] > 0:
         numbers[_SKIPS] -= 1
     else:
-        if aim(tile, rays, first_row, mask) != 0:
-            mask = walk(tile, rays, mesh, instance, mask)
+        if prepare_tile(tile, rays, first_row, mask) != 0:
+            mask = walk_tile(tile, rays, mesh, instance, mask)
         if bit_count(mask) > SUBTILES // 2:
             numbers[_PATIENCE] = min(2 * numbers[_PATIENCE] + 1, _MAX_SKIPS)
             numbers[_SKIPS] = numbers[_PATIENCE]
@@ -87,20 +87,20 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[
             return
     floats = float64s(tile)
     each = rays // SUBTILES
-    t_at = row_at(T, rays)
+    t_at = row_index(T, rays)
     for ray in range(rays):
         if (mask >> (ray // each)) & 1 and floats[t_at + ray] >= 0:
-            walk_by_one(tile, rays, ray, first_row, mesh, instance, 0)
+            walk_ray(tile, rays, ray, first_row, mesh, instance, 0)
 
 
-@part(types.void(*3 * WHOLE))
-def _enter_all(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write all rays in the coordinates of the mesh of an instance, as `enter_instance`."""
+@called_by_address(types.void(*3 * INT64))
+def _transform_rays(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write all rays in the coordinates of the mesh of an instance, as `to_mesh_coordinates`."""
     floats = float64s(tile)
     m = float64s(instance)
-    k = row_at(OX, rays)
-    i = row_at(IX, rays)
-    length_at = row_at(LENGTH, rays)
+    k = row_index(OX, rays)
+    i = row_index(IX, rays)
+    length_at = row_index(LENGTH, rays)
     for ray in range(0, rays, 4):
         dx = load(floats, k + 3 * rays + ray)
         dy = load(floats, k + 4 * rays + ray)
@@ -125,24 +125,24 @@ def _enter_all(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: P
 
 
 @stage
-def _before(tile, rays, near, mask):  # type: ignore[no-untyped-def]
+def _reaching_subtiles(tile, rays, near, mask):  # type: ignore[no-untyped-def]
     """Return the subtiles of a mask with a ray that reaches a depth along the tile's axis m.
 
     The depth is of the scene: a distance there is at least as long as its depth.
     """
     floats = float64s(tile)
-    t_at = row_at(T, rays)
+    t_at = row_index(T, rays)
     each = rays // SUBTILES
     left = np.int64(0)
     for subtile in range(SUBTILES):
         farthest = splat(-1e30)
         for k in range(subtile * each, (subtile + 1) * each, 4):
-            farthest = higher_of(farthest, load(floats, t_at + k))
-        left |= np.int64(highest(farthest) * (1 + SLACK) + SLACK >= near) << subtile
+            farthest = maximum(farthest, load(floats, t_at + k))
+        left |= np.int64(max_lane(farthest) * (1 + SLACK) + SLACK >= near) << subtile
     return mask & left
 
 
-@part(types.void(*6 * WHOLE))
+@called_by_address(types.void(*6 * INT64))
 def cast_tile(tile, rays, mesh, instances, top, last):  # type: ignore[no-untyped-def]
     """Write the closest hits of a tile to its rows `T` and `KEY`, which have reaches and -1.
 
@@ -159,14 +159,14 @@ def cast_tile(tile, rays, mesh, instances, top, last):  # type: ignore[no-untype
         shear_rays(tile, rays, OX)
         if few:
             for ray in range(last):
-                walk_by_one(tile, rays, ray, OX, mesh, 0, 0)
+                walk_ray(tile, rays, ray, OX, mesh, 0, 0)
         else:
             _cast_in_mesh(tile, rays, OX, mesh, 0, mask)
         return
-    if few or aim(tile, rays, OX, mask) == 0:
+    if few or prepare_tile(tile, rays, OX, mask) == 0:
         for ray in range(last):
-            if float64s(tile)[row_at(T, rays) + ray] >= 0:
-                walk_instances_by_one(tile, rays, ray, top, instances)
+            if float64s(tile)[row_index(T, rays) + ray] >= 0:
+                walk_ray_over_instances(tile, rays, ray, top, instances)
         return
     slack = np.float64(singles[_OFFSET] + singles[_OFFSET] + singles[_PADDING])
     count = list_instances(tile, top, mask)
@@ -174,14 +174,14 @@ def cast_tile(tile, rays, mesh, instances, top, last):  # type: ignore[no-untype
     codes = int32s(numbers[_MET])
     while count > 0:
         count -= 1
-        subtiles = _before(
+        subtiles = _reaching_subtiles(
             tile, rays, np.float64(met[ENTRY * count]) - slack, np.int64(codes[ENTRY * count + 2])
         )
         if subtiles == 0:
             continue
         number = np.int64(codes[ENTRY * count + 1])
         record = instances + INSTANCE_BYTES * number
-        _enter_all(tile, rays, record)
+        _transform_rays(tile, rays, record)
         shear_rays(tile, rays, IX)
         mesh = int64s(record)[MESH_FIELD]
         _cast_in_mesh(tile, rays, IX, mesh, KEYS_PER_INSTANCE * number, subtiles)

@@ -20,8 +20,8 @@ TILE = np.dtype(
         # Unit vectors u, v, m of the tile's axes, m ahead, and the point that they start from.
         ("axes", "f4", 12),
         ("padding", "f4", 1),  # padding of depths
-        ("offset", "f4", 1),  # maximum offset of a ray from the tile's point, as `aim` describes
-        ("spread", "f4", 2),  # factor of errors (`aim`); and a gap
+        ("offset", "f4", 1),  # maximum offset of a ray from the tile's point, as `prepare_tile` describes
+        ("spread", "f4", 2),  # factor of errors (`prepare_tile`); and a gap
         ("bounds", "f4", 4 * SUBTILES),  # subtiles: lowest and highest su, lowest, highest sv
         ("tile_bounds", "f4", 8),  # bounds of the tile, and a gap
         ("reach", "f4", SUBTILES),  # greatest depth of a subtile's rays
@@ -63,7 +63,7 @@ ROWS = 32
 FIRST_ROW = -(-TILE.itemsize // 64) * 8  # index of the first row, in numbers of 8 bytes
 
 
-def at(name: str) -> int:
+def field_index(name: str) -> int:
     """Return the index of a field in the memory, seen as an array of the field's type."""
     field = TILE[name]
     kind = field.subdtype[0] if field.subdtype else field
@@ -71,7 +71,7 @@ def at(name: str) -> int:
 
 
 @inlined
-def row_at(row, rays):  # type: ignore[no-untyped-def]
+def row_index(row, rays):  # type: ignore[no-untyped-def]
     """Return the index of a row of a tile with a number of rays, in numbers of 8 bytes."""
     return FIRST_ROW + row * rays
 
@@ -97,9 +97,9 @@ class _ThreadTiles(threading.local):
         tables = FIRST_ROW + ROWS * rays + 16
         memory = np.zeros(tables + 2 * (waiting + instances) + 8, np.int64)
         memory = memory[-memory.ctypes.data % 64 // 8 :]
-        memory[at("stack")] = memory.ctypes.data + 8 * tables
-        memory[at("met")] = memory.ctypes.data + 8 * (tables + 2 * waiting)
-        bits = memory[at("bits") :][:256].view(np.uint8).reshape(256, 8)
+        memory[field_index("stack")] = memory.ctypes.data + 8 * tables
+        memory[field_index("met")] = memory.ctypes.data + 8 * (tables + 2 * waiting)
+        bits = memory[field_index("bits") :][:256].view(np.uint8).reshape(256, 8)
         for mask in range(256):
             numbers = [bit for bit in range(8) if mask >> bit & 1]
             bits[mask, : len(numbers)] = numbers

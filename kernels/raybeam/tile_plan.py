@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Ints
-from .pattern_rays import checked_rays
+from .pattern_rays import compute_rays
 from .scan import Scan
 
 SUBTILES = 8  # subtiles per tile
@@ -48,7 +48,7 @@ class TilePlan(NamedTuple):
         return self.lanes.shape[1]
 
 
-def consecutive(subrays: int) -> TilePlan:
+def plan_consecutive(subrays: int) -> TilePlan:
     """Return tiles of consecutive beams with a number of sub-rays each."""
     beams = np.arange(SUBTILES * _VECTOR)
     return TilePlan(subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64))
@@ -74,17 +74,17 @@ def plan_tiles(scan: Scan) -> TilePlan:
     start = -scan.first % firing  # first ray of the first whole firing
     whole_firings = (len(scan) - start) // firing
     if step == 1 or whole_firings < 2 or firing * SUBTILES * _VECTOR > _MAX_LANES:
-        return consecutive(subrays)
+        return plan_consecutive(subrays)
     start += (whole_firings - 2) // 2 * firing
     beams = start + subrays * np.arange(step)
-    _, directions = checked_rays(scan.pattern, scan.first, np.r_[beams, beams + firing], scan.poses)
-    rings, shifts, spacings = _sorted_rings(directions[:step], directions[step:])
+    _, directions = compute_rays(scan.pattern, scan.first, np.r_[beams, beams + firing], scan.poses)
+    rings, shifts, spacings = _sort_rings(directions[:step], directions[step:])
     if whole_firings < _FEW_FIRINGS * np.ptp(shifts):
         shifts[:] = 0
-    return _laid_out(rings, shifts, spacings, subrays)
+    return _plan_from_rings(rings, shifts, spacings, subrays)
 
 
-def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
+def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
     """Return how the rings of two successive firings (n, 3) neighbor each other.
 
     Returns
@@ -109,16 +109,18 @@ def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[floa
     return rings, shifts, (float(np.sqrt(np.median(squared))), max(ring_spacing, 1e-12))
 
 
-def _laid_out(rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int) -> TilePlan:
+def _plan_from_rings(
+    rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
+) -> TilePlan:
     """Return tiles whose rays lie in squares, as far as their numbers allow."""
     step = len(rings)
     firing = step * subrays
     each = 1 if subrays > 1 else 2  # vectors of beams in a subtile
     beams = SUBTILES * _VECTOR * each
     most_rings = 1 << (step.bit_length() - 1)
-    tile = _square(beams, spacings, most_rings, beams)
-    subtile = _square(_VECTOR * each, spacings, *tile)
-    vector = _square(_VECTOR, spacings, *subtile)
+    tile = _squarest_grid(beams, spacings, most_rings, beams)
+    subtile = _squarest_grid(_VECTOR * each, spacings, *tile)
+    vector = _squarest_grid(_VECTOR, spacings, *subtile)
     # Of the tile, subtile and vector: numbers of rings and firings.
     grids = [
         (tile[0] // subtile[0], tile[1] // subtile[1]),
@@ -146,7 +148,7 @@ def _laid_out(rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays:
     return TilePlan(firing, tile[1], _sub_rays(beam, subrays), shift.max(axis=1))
 
 
-def _square(
+def _squarest_grid(
     beams: int, spacings: tuple[float, float], most_rings: int, most_firings: int
 ) -> tuple[int, int]:
     """Return numbers of rings and firings whose product is `beams`, nearest to a square."""

@@ -9,7 +9,7 @@ import numpy as np
 from .arrays import Floats, Floats32, Ints32
 from .compiled import compiled
 from .cuda_tables import max_stack_depth
-from .tree import LEAF_BITS, WideTree, build_top, build_tree
+from .tree import LEAF_BITS, WideTree, build_instance_tree, build_tree
 
 WIDTH = 8
 NODE = 64  # numbers of a node: lower x, y, z, upper x, y, z and the child, of eight children each
@@ -50,7 +50,7 @@ class TileTree:
     stack: int
 
 
-def tile_tree(corners: Floats) -> TileTree:
+def build_tile_tree(corners: Floats) -> TileTree:
     """Build the tree of triangles (k, 3, 3), local."""
     tree = build_tree(corners, WIDTH, _LEAF_SIZE, _TRIANGLE_COST)
     is_leaf = tree.child < 0
@@ -67,12 +67,12 @@ def tile_tree(corners: Floats) -> TileTree:
     return TileTree(_nodes(tree, child), blocks, ordered, tree.order, _stack(tree))
 
 
-def top_nodes(boxes: Floats) -> tuple[Floats32, int]:
+def build_instance_nodes(boxes: Floats) -> tuple[Floats32, int]:
     """Return the nodes of a tree over boxes (n, 2, 3), and the maximum of nodes that wait.
 
     Its leaves have the number of a box.
     """
-    tree = build_top(boxes, WIDTH)
+    tree = build_instance_tree(boxes, WIDTH)
     return _nodes(tree, tree.child), _stack(tree)
 
 

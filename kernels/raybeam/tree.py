@@ -67,7 +67,7 @@ def build_tree(
     each = corners.transpose(1, 0, 2)  # reduced corner by corner: ten times as fast
     lower = np.ascontiguousarray((reduce(np.minimum, each) - PAD).T, dtype=np.float32)
     upper = np.ascontiguousarray((reduce(np.maximum, each) + PAD).T, dtype=np.float32)
-    binary = ploc.build(lower, upper)
+    binary = ploc.build_binary_tree(lower, upper)
     count, leaf = _leaves(binary, leaf_size, triangle_cost)
     first = _positions(binary, count)
     n = len(corners)
@@ -77,7 +77,7 @@ def build_tree(
     return _widen(binary, leaf, code, order, width)
 
 
-def build_top(boxes: Floats, width: int) -> WideTree:
+def build_instance_tree(boxes: Floats, width: int) -> WideTree:
     """Build a tree over instances' boxes (n, 2, 3), with a single box in each leaf.
 
     Leaves have the number of an instance in place of a position in `order`.
@@ -88,7 +88,7 @@ def build_top(boxes: Floats, width: int) -> WideTree:
     return WideTree(tree.lower, tree.upper, child, np.arange(len(boxes), dtype=np.int32))
 
 
-def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
+def join_trees(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     """Join trees in sequence, and return the joint tree, and the root of each.
 
     Triangles are numbered over all trees, in order.

@@ -55,7 +55,7 @@ class PlaneHits(NamedTuple):
     ----------
     a, b, c
         float64 (m,): weights of the three corners times `det`. The ray passes inside if none is
-        negative or none is positive (`inside`).
+        negative or none is positive (`is_inside`).
     det
         float64 (m,): ``(a + b) + c``; zero if the ray runs in the triangle's plane.
     t
@@ -69,7 +69,7 @@ class PlaneHits(NamedTuple):
     t: Floats
 
 
-def shear(origins: Floats, directions: Floats) -> ShearedRays:
+def shear_rays(origins: Floats, directions: Floats) -> ShearedRays:
     """Prepare rays with local origins (n, 3) and unit directions (n, 3)."""
     kz = np.argmax(np.abs(directions), axis=1)
     kx = (kz + 1) % 3
@@ -139,7 +139,7 @@ def _sheared_corners(
     return x, y, z
 
 
-def inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
+def is_inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
     """Return whether the line of a ray passes through a triangle, edges and corners included."""
     same_sign = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     return same_sign & (det != 0)

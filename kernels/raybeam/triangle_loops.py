@@ -28,7 +28,7 @@ class PlaneHit(NamedTuple):
 
 
 @inlined
-def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def shear_ray(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the longest axis of a ray, its origin with that axis last, and its shear."""
     ax = abs(dx)
     ay = abs(dy)
@@ -53,7 +53,7 @@ def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def areas(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def intersect_plane(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Return the `PlaneHit` of a triangle, by corners with the axis last, and a sheared ray."""
     u, v, w, sx, sy, sz = ray
     (px, py, pz), (qx, qy, qz), (rx, ry, rz) = corners

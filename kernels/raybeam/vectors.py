@@ -167,7 +167,7 @@ def copy_sign(context: Any, a: Any, b: Any) -> Any:
     return a(a, a), generate
 
 
-def _choice(comparison: str) -> Any:
+def _select(comparison: str) -> Any:
     @intrinsic
     def choose(context: Any, a: Any, b: Any) -> Any:
         def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -178,12 +178,12 @@ def _choice(comparison: str) -> Any:
     return choose
 
 
-lower_of = _choice("<")  # the second where a lane of either is NaN
-higher_of = _choice(">")
+minimum = _select("<")  # the second where a lane of either is NaN
+maximum = _select(">")
 
 
 @intrinsic
-def at_least(context: Any, a: Any, b: Any) -> Any:
+def greater_equal(context: Any, a: Any, b: Any) -> Any:
     """Return the mask of the lanes where ``a >= b``."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -193,7 +193,7 @@ def at_least(context: Any, a: Any, b: Any) -> Any:
     return types.int64(a, a), generate
 
 
-def _reduction(comparison: str) -> Any:
+def _reduce_lanes(comparison: str) -> Any:
     @intrinsic
     def reduce(context: Any, a: Any) -> Any:
         def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -217,12 +217,12 @@ def _reduction(comparison: str) -> Any:
     return reduce
 
 
-highest = _reduction(">")
-lowest = _reduction("<")
+max_lane = _reduce_lanes(">")
+min_lane = _reduce_lanes("<")
 
 
 @intrinsic
-def narrow(context: Any, a: Any, b: Any) -> Any:
+def to_float32(context: Any, a: Any, b: Any) -> Any:
     """Return two vectors of 4 float64 as a vector of 8 float32."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -266,7 +266,7 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
 
 
 @intrinsic
-def write_where(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
+def store_masked(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
     """Write the lanes of a mask of a vector from an index on, without a branch."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -284,7 +284,7 @@ def write_where(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -
 
 
 @intrinsic
-def write_word(context: Any, pointer: Any, index: Any, value: Any) -> Any:
+def store_int64(context: Any, pointer: Any, index: Any, value: Any) -> Any:
     """Write 8 bytes, the lowest first, from an index of bytes on."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:

@@ -19,7 +19,7 @@ from raybeam import (
 )
 from raybeam import moving as module
 from raybeam.moving import nearest_body_hits
-from raybeam.pattern_rays import checked_rays
+from raybeam.pattern_rays import compute_rays
 from raybeam.scan import check_scan
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -125,7 +125,7 @@ def scans(kind, rays=RAYS):
 
 def by_all(moving, scan, times):
     """Nearest hits, of each ray cast by itself at every body that is there."""
-    origins, directions = checked_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
+    origins, directions = compute_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
     best = {}
     for body, (first, last) in enumerate(moving.presence):
         rows = np.flatnonzero((first <= times) & (times <= last))
@@ -290,12 +290,12 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
             at = frame(body, times[ray])
             share = at - int(at)
             corners = ((1 - share) * frames[int(at)] + share * frames[int(at) + 1])[doubled]
-            sheared = triangle.shear(start[[number]], ahead[[number]])
+            sheared = triangle.shear_rays(start[[number]], ahead[[number]])
             count = len(doubled)
             a, b, c, det, t = triangle.intersect(
                 sheared, np.zeros(count, int), corners, np.arange(count)
             )
-            hit = triangle.inside(a, b, c, det) & (t >= 0.3) & (t <= 30)
+            hit = triangle.is_inside(a, b, c, det) & (t >= 0.3) & (t <= 30)
             nearest = np.where(hit, t, np.inf)
             if nearest.min() < expected[0][ray]:
                 expected[0][ray] = nearest.min()

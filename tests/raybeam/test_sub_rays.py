@@ -5,7 +5,7 @@ import pytest
 
 from raybeam import MovingBodies, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
 from raybeam.moving import nearest_body_hits
-from raybeam.pattern_rays import plain_rays
+from raybeam.pattern_rays import compute_rays_numpy
 from raybeam.poses import check_poses
 from raybeam.scan import check_scan
 
@@ -92,7 +92,7 @@ def check_rays_of_loops(place, kind, count):
     ray = rng.permutation(2_000)[:1_100]
     made = pattern_rays(given, ray, **where, start=4)
     asked = where["positions"], where["rotations"], where["rays_per_pose"], 2_000
-    plain = plain_rays(given, 4, ray, check_poses(*asked, where.get("motion")))
+    plain = compute_rays_numpy(given, 4, ray, check_poses(*asked, where.get("motion")))
     for one, other in zip(made, plain, strict=True):
         assert np.array_equal(one, other)
 
