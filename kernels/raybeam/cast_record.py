@@ -12,6 +12,7 @@ from numba.extending import intrinsic
 from .arrays import AnyArray, Floats
 from .pattern import Pattern
 from .poses import Poses
+from .tile_sizes import lanes_per_beam
 
 # A cast: addresses of arrays that the loops read or write, and numbers. Address 0: no array. A ray
 # belongs to a row of the pattern, which is a beam, or a sub-ray of a beam. Local: centered and
@@ -114,11 +115,6 @@ CASTS = types.Array(numba.from_dtype(CAST), 1, "C")
 casts_at = pointer(CASTS.dtype)
 
 
-def whole_vectors(subrays: int) -> int:
-    """Return how many lanes the sub-rays of a beam take: whole vectors of 8, but 1 for a beam."""
-    return 1 if subrays == 1 else -(-subrays // 8) * 8
-
-
 class CastRecord:
     """A `CAST` record, and references to the arrays whose addresses are in the record."""
 
@@ -174,7 +170,7 @@ class CastRecord:
             return 0.0
         record["subrays"] = len(sub_rays)
         record["sub_ray_table"] = self.address_of(sub_rays.loop_table(pattern.offsets))
-        record["lanes_per_beam"] = whole_vectors(len(sub_rays))
+        record["lanes_per_beam"] = lanes_per_beam(len(sub_rays))
         record["has_starts"] = sub_rays.starts is not None
         record["offsets"] = self.address_of(pattern.offsets)
         if sub_rays.axis is not None:

@@ -20,10 +20,11 @@ from .compiled import INT64, called_by_address, compiled, inlined, stage
 from .pattern import Pattern
 from .poses import Poses
 from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_index, thread_tiles
+from .tile_sizes import VECTOR_RAYS
 from .vectors import load, splat, square_root, store
 
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
-_SINGLE_ROW = 8  # numbers of a row of the table of shares of a single sub-ray
+_SINGLE_ROW = VECTOR_RAYS  # columns of `SubRays.loop_table` if beams have a single sub-ray
 _BEAMS = 64  # beams per tile when rays are only computed
 
 

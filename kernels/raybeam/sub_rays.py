@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import Floats, Indices
+from .tile_sizes import VECTOR_RAYS
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class SubRays:
             rows[1:3] = self.angles.T
         if self.starts is not None:
             rows[3:] = self.starts.T
-        padded = np.minimum(np.arange(-(-len(self) // 8) * 8), len(self) - 1)
+        padded = np.minimum(np.arange(-(-len(self) // VECTOR_RAYS) * VECTOR_RAYS), len(self) - 1)
         return rows[:, padded]
 
 

@@ -31,7 +31,8 @@ from .moving_loops import (
 from .ray_loops import make_rays, write_shared_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
-from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, field_index, row_index
+from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, T, field_index, row_index
+from .tile_sizes import SUBTILES
 
 _T_MIN = field_index("t_min")
 _TILE_RAYS = 8 * SUBTILES  # rays per tile of rays at bodies

@@ -13,7 +13,8 @@ from numba import types
 from . import tile_memory as memory
 from .cast_record import float32s, float64s, int64s
 from .compiled import INT64, called_by_address, inlined, stage
-from .tile_memory import LENGTH, SUBTILES, T, field_index, row_index
+from .tile_memory import LENGTH, T, field_index, row_index
+from .tile_sizes import SUBTILES
 from .vectors import (
     absolute,
     load,

@@ -25,7 +25,8 @@ from .cast_record import (
 from .compiled import INT64, called_by_address, inlined
 from .tile_exact import intersect_four_rays, intersect_ray
 from .tile_frame import ONE, ZERO, cross, dot, tile_axes, to_tile_axes
-from .tile_memory import SUBTILES, field_index, row_index
+from .tile_memory import field_index, row_index
+from .tile_sizes import SUBTILES
 from .tile_tree import BLOCK
 from .tree import LEAF_BITS
 from .vectors import (

@@ -50,7 +50,8 @@ from .compiled import INT64, called_by_address, stage
 from .ray_walk import SLACK, walk_ray, walk_ray_over_instances
 from .tile_exact import shear_rays
 from .tile_frame import prepare_tile
-from .tile_memory import ENTRY, IX, LENGTH, OX, SUBTILES, T, field_index, row_index
+from .tile_memory import ENTRY, IX, LENGTH, OX, T, field_index, row_index
+from .tile_sizes import SUBTILES
 from .tile_walk import list_instances, walk_tile
 from .vectors import bit_count, load, max_lane, maximum, splat, square_root, store
 

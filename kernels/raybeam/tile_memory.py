@@ -12,7 +12,7 @@ import threading
 import numpy as np
 
 from .compiled import inlined
-from .tile_plan import SUBTILES as SUBTILES
+from .tile_sizes import SUBTILES
 
 # Fields of a tile. float32 unless stated; vectors of eight numbers, if not one for each subtile.
 TILE = np.dtype(

@@ -14,9 +14,8 @@ import numpy as np
 from .arrays import Floats, Ints
 from .pattern_rays import compute_rays
 from .scan import Scan
+from .tile_sizes import SUBTILES, VECTOR_RAYS, lanes_per_beam
 
-SUBTILES = 8  # subtiles per tile
-_VECTOR = 8  # rays of a vector
 _MAX_LANES = 1 << 20  # limit for all tiles of a column: a longer firing counts as consecutive rays
 _FEW_FIRINGS = 4  # times the shift of a ring: shorter scans would have too many incomplete tiles
 
@@ -50,7 +49,7 @@ class TilePlan(NamedTuple):
 
 def plan_consecutive(subrays: int) -> TilePlan:
     """Return tiles of consecutive beams with a number of sub-rays each."""
-    beams = np.arange(SUBTILES * _VECTOR)
+    beams = np.arange(SUBTILES * VECTOR_RAYS)
     return TilePlan(subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64))
 
 
@@ -61,8 +60,7 @@ def _sub_rays(beams: Ints, subrays: int) -> Ints:
     """
     if subrays == 1:
         return beams
-    lanes = -(-subrays // _VECTOR) * _VECTOR
-    sub_ray = np.minimum(np.arange(lanes), subrays - 1)  # copies of the last one
+    sub_ray = np.minimum(np.arange(lanes_per_beam(subrays)), subrays - 1)  # copies of the last one
     return (beams[..., None] * subrays + sub_ray).reshape(*beams.shape[:-1], -1)
 
 
@@ -73,7 +71,7 @@ def plan_tiles(scan: Scan) -> TilePlan:
     firing = step * subrays
     start = -scan.first % firing  # first ray of the first whole firing
     whole_firings = (len(scan) - start) // firing
-    if step == 1 or whole_firings < 2 or firing * SUBTILES * _VECTOR > _MAX_LANES:
+    if step == 1 or whole_firings < 2 or firing * SUBTILES * VECTOR_RAYS > _MAX_LANES:
         return plan_consecutive(subrays)
     start += (whole_firings - 2) // 2 * firing
     beams = start + subrays * np.arange(step)
@@ -116,11 +114,11 @@ def _plan_from_rings(
     step = len(rings)
     firing = step * subrays
     each = 1 if subrays > 1 else 2  # vectors of beams in a subtile
-    beams = SUBTILES * _VECTOR * each
+    beams = SUBTILES * VECTOR_RAYS * each
     most_rings = 1 << (step.bit_length() - 1)
     tile = _squarest_grid(beams, spacings, most_rings, beams)
-    subtile = _squarest_grid(_VECTOR * each, spacings, *tile)
-    vector = _squarest_grid(_VECTOR, spacings, *subtile)
+    subtile = _squarest_grid(VECTOR_RAYS * each, spacings, *tile)
+    vector = _squarest_grid(VECTOR_RAYS, spacings, *subtile)
     # Of the tile, subtile and vector: numbers of rings and firings.
     grids = [
         (tile[0] // subtile[0], tile[1] // subtile[1]),

@@ -12,7 +12,8 @@ from .cast_record import BLOCKS, NODES, float32s, int32s, int64s, uint8s
 from .compiled import INT64, called_by_address, inlined, stage
 from .tile_frame import FAR, ZERO, update_depths
 from .tile_leaf import test_leaf
-from .tile_memory import ENTRY, SUBTILES, field_index
+from .tile_memory import ENTRY, field_index
+from .tile_sizes import SUBTILES
 from .tile_tree import BLOCK, NODE
 from .tree import LEAF_BITS
 from .vectors import (
