@@ -1,4 +1,4 @@
-"""The interface of a ray casting engine."""
+"""The interface that a ray-casting backend implements."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from .rays import Rays
 from .scan import HitCollector, Scan
 
 
-class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """Raised when the requested backend cannot be used; the message states the reason."""
+class BackendUnavailable(RuntimeError):  # noqa: N818 - describes a state, not an error
+    """Raised if the requested backend cannot be used. The message states the reason."""
 
 
 @dataclass(frozen=True)
 class ClosestHits:
-    """Closest hits of a chunk of rays, without misses, in ray order.
+    """Closest hits of a chunk of rays, in ray order and without rays that miss.
 
     Attributes
     ----------
     ray
-        (k,): number of the ray within the chunk.
+        (k,): index of the ray within the chunk.
     t
         float64 (k,): distance in local units.
     triangle
-        int32 (k,): row of the `faces` of the mesh.
+        int32 (k,): index of the triangle in the `faces` of its mesh.
     u, v
-        float64 (k,): weights of the second and third corner.
+        float64 (k,): barycentric weights of the second and third vertex.
     instance
-        int32 (k,): number of the instance.
+        int32 (k,): index of the instance.
     """
 
     ray: Integers
@@ -49,21 +49,23 @@ class ClosestHits:
 
 
 class Backend(ABC):
-    """A ray casting engine, bound to the meshes of a scene.
+    """A ray-casting engine for one scene.
 
-    A backend is created with the scene, the maximum number of CPU threads (None for the default of
-    the backend) and the number of the CUDA device (None for the current device); a backend without
-    threads or device ignores the number. The constructor builds the trees of the meshes, and calls
-    `update_scene` for all that depends on transforms. A backend must implement `closest_hits`; it may
-    override `scan` to be faster.
+    The constructor takes the scene, the maximum number of CPU threads (None for the default of the
+    backend) and the index of the CUDA device (None for the current device). A backend that uses no
+    threads or no device ignores these arguments. The constructor builds the acceleration structures
+    of the meshes and calls `update_scene`, which does everything that depends on transforms.
+
+    A backend must implement `closest_hits` and `unavailable_reason`. It may override `scan` and
+    other methods with faster versions.
     """
 
     name: ClassVar[str]
-    # Maximum rays of a call of `closest_hits`: limits the memory. The result of a ray does not depend
-    # on its chunk.
+    # Maximum number of rays per call of `closest_hits`, which limits the memory. How rays are
+    # divided into chunks does not affect the results.
     chunk: ClassVar[int]
 
-    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device (`scan_on_device`)
+    on_device: ClassVar[bool] = False  # whether `scan_on_device` is supported
 
     @classmethod
     @abstractmethod
@@ -72,28 +74,26 @@ class Backend(ABC):
 
     @classmethod
     def versions(cls) -> str:
-        """Return the versions besides NumPy's that the bits of results depend on, "" for none."""
+        """Return the versions, besides NumPy's, that affect the bits of the results, or ""."""
         return ""
 
-    @classmethod  # noqa: B027 - other backends have nothing to limit
+    @classmethod  # noqa: B027 - most backends have nothing to limit
     def limit_memory(cls, device: int | None, share: float) -> None:
-        """Have this process take at most a share of a device's memory.
+        """Limit the device memory of this process to a fraction of the total.
 
-        Without a device, nothing is limited.
-
-        A share of 1 or more sets no limit.
+        If `share` is 1 or more, there is no limit. Backends without a device ignore this call.
         """
 
     def __init__(self, scene: LocalScene, threads: int | None, device: int | None) -> None:
         self._scene = scene
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene by a scene of the same instances with new transforms."""
+        """Replace the scene with a scene that has the same instances but new transforms."""
         self._scene = scene
 
     @property
     def device_lost(self) -> bool:
-        """Whether the device answers no call of this process any more, after an error of it."""
+        """Whether the device no longer responds to calls from this process after an error."""
         return False
 
     @abstractmethod
@@ -101,7 +101,10 @@ class Backend(ABC):
         """Return the closest hits of at most `chunk` rays."""
 
     def hit_columns(self, rays: Rays) -> HitColumns:
-        """Return the closest hits of rays, without weights and misses, in ray order."""
+        """Return the closest hits of any number of rays, in ray order.
+
+        Rays that miss and barycentric weights are not included.
+        """
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
             hits = self.closest_hits(rays.normalized(start, start + self.chunk))
@@ -111,25 +114,28 @@ class Backend(ABC):
         return join_hits(parts)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
+        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
         cast_pairs(self.hit_columns, pairs, nearest)
 
     def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearestHits:
-        """Put rays `start` to `stop` of a scan on the device, as `RayCaster.upload_rays`."""
+        """Copy rays `start` to `stop` of a scan to the device. See `RayCaster.upload_rays`."""
         raise BackendUnavailable(
             f"Backend {self.name!r} does not support devices. Use cast_crossing."
         )
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
-        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
+        """Cast rays at bodies on the device, and record closer hits in `nearest`.
+
+        The bodies have the shape of this scene.
+        """
         raise BackendUnavailable(
             f"Backend {self.name!r} does not support devices. Use cast_crossing."
         )
 
     def cast(self, rays: Rays) -> Hits:
-        """Return the closest hit of every ray, misses included."""
+        """Return the closest hit of each ray, including rays that miss."""
         n = len(rays)
         hits = Hits(
             np.full(n, np.inf),
@@ -149,7 +155,7 @@ class Backend(ABC):
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the kept hits of the rays of a scan, and counts of all hits."""
+        """Return the stored hits of a scan and the counts of all hits."""
         collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
@@ -161,7 +167,10 @@ class Backend(ABC):
         return collector.result()
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield start and stop of each part of a scan, and its hits, numbered from start."""
+        """Yield consecutive parts of a scan, each as first ray, end, and hits.
+
+        The ray indices of the hits start at 0 in each part.
+        """
         for start, stop in scan.chunks(self.chunk):
             hits = self.closest_hits(scan.rays(start, stop))
             distance = hits.t / self._scene.frame.scale
@@ -175,9 +184,9 @@ class Backend(ABC):
         counters: tuple[Ints, int] | None = None,
         external_hits: ExternalHits | None = None,
     ) -> tuple[Ints, TallyCounts | None]:
-        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.scan_on_device` does.
+        """Cast a scan and pass its hits to `use` on the device. See `RayCaster.scan_on_device`.
 
-        BackendUnavailable if this backend has no device.
+        Raises BackendUnavailable if this backend does not use a device.
         """
         raise BackendUnavailable(
             f"The hits of backend {self.name!r} are not on a device. Use scan, or backend='cuda'."

@@ -1,4 +1,9 @@
-"""Rays that pass through the boxes of moving bodies, and the nearest hits so far."""
+"""Pairs of rays and moving bodies, and the closest hits on bodies.
+
+Moving bodies are not part of a caster's scene. Instead, the rays that may hit a body are
+transformed to the frame of the body at the firing time of each ray, and cast at the body's shape
+there. A shape is a `RayCaster` or a `DeformingMesh`.
+"""
 
 from __future__ import annotations
 
@@ -13,26 +18,31 @@ from .rays import Rays
 
 
 class RayBodyPairs(NamedTuple):
-    """Pairs of a ray and a body of a common shape, where the ray passes through the body's box.
+    """Pairs of a ray and a body whose bounding box the ray intersects.
+
+    All bodies have the same shape.
 
     Attributes
     ----------
     rays
-        float64 (6, n): origins, meters, and directions of all rays of the cast.
+        float64 (6, n): origins in meters and directions of all rays of the cast.
     row
-        int64 (m,): row in `rays` of each pair's ray; the pairs of a body follow each other.
+        int64 (m,): column in `rays` of each pair's ray. The pairs of a body are consecutive.
     body
-        int64 (m,): number of each pair's body.
+        int64 (m,): index of each pair's body.
     pose
-        int64 (m,): column in `poses` of the body's pose at the time of the ray.
+        int64 (m,): column in `poses` that contains the pose of the body at the firing time of the
+        ray.
     poses
-        float64 (12, p): positions, meters, and rotations from the body's axes by rows.
+        float64 (12, p): positions in meters, and rotation matrices from the body frame, row by row.
     box
-        float64 (6,): lower and upper corner of the shape, in its axes, meters.
+        float64 (6,): lower and upper corner of the shape's bounding box in the body frame, in
+        meters.
     limits
-        Closest and farthest distance of a hit, meters.
+        Minimum and maximum distance of a hit in meters.
     frame
-        float64 (m,): frame of a deforming shape at the time of the ray; (0,) for a rigid shape.
+        float64 (m,): frame number of a deforming shape at the firing time of the ray. Empty for a
+        rigid shape.
     """
 
     rays: Floats
@@ -45,7 +55,7 @@ class RayBodyPairs(NamedTuple):
     frame: Floats
 
     def contiguous(self) -> RayBodyPairs:
-        """Return a copy whose rows, bodies and poses are contiguous, for compiled loops."""
+        """Return a copy whose integer arrays are contiguous, as the compiled loops require."""
         return self._replace(
             row=np.ascontiguousarray(self.row),
             body=np.ascontiguousarray(self.body),
@@ -54,22 +64,22 @@ class RayBodyPairs(NamedTuple):
 
 
 class TimedBodies(NamedTuple):
-    """Bodies of a common shape, with their poses at consecutive times of rays.
+    """Bodies with the same shape, and their poses at consecutive ray times.
 
     Attributes
     ----------
     body
-        int64 (b,): numbers of the bodies.
+        int64 (b,): indices of the bodies.
     poses
-        float64 (t, b, 12): position, meters, and rotation from the body's axes by rows; NaN while
-        a body is absent.
+        float64 (t, b, 12): position in meters, and rotation matrix from the body frame, row by row.
+        NaN while a body is absent.
     boxes
-        float64 (t / SPAN, b, 6): lower and upper corner of the box around a body's boxes during
-        `SPAN` times, meters.
+        float64 (t / SPAN, b, 6): lower and upper corner, in meters, of a box that encloses the body
+        at `SPAN` consecutive times.
     first_time
-        Number of the first of the t times among the times of the rays.
+        Index of the first of the t times among all ray times.
     limits
-        Closest and farthest distance of a hit, meters.
+        Minimum and maximum distance of a hit in meters.
     """
 
     body: Ints
@@ -79,20 +89,20 @@ class TimedBodies(NamedTuple):
     limits: tuple[float, float]
 
 
-SPAN = 32  # times of a box of `TimedBodies`; as in intersect.cu
+SPAN = 32  # number of times that a box in `TimedBodies` covers; intersect.cu has the same value
 
 
 class BodyHits(NamedTuple):
-    """Nearest hits on moving bodies, of the rays that hit a body.
+    """Closest hits on moving bodies, without rays that hit no body.
 
     Attributes
     ----------
     ray
-        int64 (k,): number of the ray, ascending.
+        int64 (k,): index of the ray, in ascending order.
     distance
-        float64 (k,): meters.
+        float64 (k,): distance in meters.
     body
-        int64 (k,): number of the body; of equal distances, the lowest.
+        int64 (k,): index of the body. Ties are resolved in favor of the lowest index.
     instance, triangle
         int32 (k,): instance and triangle of the body's shape.
     """
@@ -105,16 +115,17 @@ class BodyHits(NamedTuple):
 
 
 class NearestHits(NamedTuple):
-    """Nearest hits of rays (n,) on moving bodies.
+    """Closest hit of each ray on a moving body, with one row per ray.
 
-    Of bodies at equal distances, the lowest number counts.
+    Ties are resolved in favor of the lowest body index. The arrays are updated in place.
 
     Attributes
     ----------
     distance
-        float64 (n,): meters; the distance before which hits count for a ray without a hit.
+        float64 (n,): distance in meters. If a ray has no hit, only hits at a shorter distance are
+        recorded.
     body
-        int64 (n,): number of the body, -1 for no hit.
+        int64 (n,): index of the body, or -1 for no hit.
     instance, triangle
         int32 (n,): instance and triangle of the body's shape.
     """
@@ -126,18 +137,21 @@ class NearestHits(NamedTuple):
 
     @classmethod
     def empty(cls, limits: Floats) -> NearestHits:
-        """Create rays without a hit, for hits before distances `limits` (n,), meters."""
+        """Create a table without hits, which records hits at a distance of less than `limits`.
+
+        `limits` contains one distance per ray in meters and becomes the column `distance`.
+        """
         n = len(limits)
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
     def view(self, start: int, stop: int) -> NearestHits:
-        """Return the hits of rays `start` to `stop`, as views of the same memory."""
+        """Return the rows of rays `start` to `stop` as views of the same memory."""
         span = slice(start, stop)
         distance, body, instance, triangle = self
         return NearestHits(distance[span], body[span], instance[span], triangle[span])
 
     def update(self, hits: BodyHits) -> None:
-        """Write those hits on bodies that are nearer than the nearest hits so far."""
+        """Record the hits that are closer than the hits recorded so far."""
         nearer = np.flatnonzero(hits.distance < self.distance[hits.ray])
         ray = hits.ray[nearer]
         self.distance[ray] = hits.distance[nearer]
@@ -146,7 +160,7 @@ class NearestHits(NamedTuple):
         self.triangle[ray] = hits.triangle[nearer]
 
     def compact(self) -> BodyHits:
-        """Return the hits, without the rays that hit no body."""
+        """Return the recorded hits, without rays that hit no body."""
         ray = np.flatnonzero(self.body >= 0)
         distance, body, instance, triangle = self
         return BodyHits(ray, distance[ray], body[ray], instance[ray], triangle[ray])
@@ -155,10 +169,14 @@ class NearestHits(NamedTuple):
 def cast_pairs(
     cast: Callable[[Rays], HitColumns], pairs: RayBodyPairs, nearest: NearestHits
 ) -> None:
-    """Cast the rays of a crossing in the bodies' axes, and write nearer hits to `nearest`."""
-    rays = _in_body_axes(pairs)
+    """Cast rays at bodies and record closer hits in `nearest`.
+
+    `cast` returns the closest hits of rays in the frame of the bodies.
+    """
+    rays = _to_body_frames(pairs)
     ray, distance, triangle, instance = cast(rays)
-    # Directions of a sensor that turns during a pose are not quite of unit length.
+    # If the sensor rotates while the rays of a pose are fired, directions are not exactly unit
+    # vectors.
     x, y, z = rays.directions.T[:, ray]
     distance = distance / np.sqrt((x * x + y * y) + z * z)
     row = pairs.row[ray]
@@ -171,8 +189,8 @@ def cast_pairs(
     nearest.triangle[row] = triangle[nearer]
 
 
-def _in_body_axes(pairs: RayBodyPairs) -> Rays:
-    """Return the ray of each pair, relative to the body's position and in the body's axes."""
+def _to_body_frames(pairs: RayBodyPairs) -> Rays:
+    """Return the ray of each pair in the frame of its body."""
     poses = pairs.poses[:, pairs.pose]
     origins = pairs.rays[:3, pairs.row] - poses[:3]
     directions = pairs.rays[3:, pairs.row]
@@ -185,7 +203,11 @@ def _in_body_axes(pairs: RayBodyPairs) -> Rays:
 
 
 def _nearer_hits(nearest: NearestHits, row: Ints, distance: Floats, body: Ints) -> Indices:
-    """Return the hits (m,) that are nearer than known hits, the nearest of each ray last."""
+    """Return the indices of the hits that are closer than the recorded hits.
+
+    The hits are sorted so that the closest hit of each ray comes last. If they are assigned in this
+    order, the closest hit remains.
+    """
     limit = nearest.distance[row]
     lower_body = (distance == limit) & (body < nearest.body[row])
     nearer = np.flatnonzero((distance < limit) | lower_body)

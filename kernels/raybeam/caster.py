@@ -1,4 +1,4 @@
-"""The public ray caster."""
+"""The ray caster, which is the main class of this package."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class RayCaster:
         """
         self.engine.cast_bodies(bodies, nearest)
 
-    def set_transforms(self, number: int | ArrayLike, transform: ArrayLike) -> None:
+    def set_transforms(self, instance: int | ArrayLike, transform: ArrayLike) -> None:
         """Set new transforms of instances for all subsequent casts.
 
         Only the acceleration structure over the instances is rebuilt, which happens once before the
@@ -189,7 +189,7 @@ class RayCaster:
 
         Parameters
         ----------
-        number
+        instance
             Index of the instance, or indices (k,) without duplicates.
         transform
             (3, 4) or (4, 4), as for `Instance`; for k instances (k, 3, 4) or (k, 4, 4).
@@ -209,8 +209,8 @@ class RayCaster:
         >>> caster = RayCaster.from_instances(instances, backend="numpy")
         >>> caster.set_transforms([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
         """
-        single = np.ndim(number) == 0
-        numbers = np.asarray([index(number)] if single else number)  # type: ignore[arg-type]
+        single = np.ndim(instance) == 0
+        numbers = np.asarray([index(instance)] if single else instance)  # type: ignore[arg-type]
         outside = numbers[(numbers < 0) | (numbers >= self.instance_count)]
         if len(outside):
             raise IndexError(
@@ -383,11 +383,11 @@ class RayCaster:
 
         Returns
         -------
-        hits
+        hit_counts
             int64 (g,): number of hits in each group, including hits that are not stored.
         counted
-            Indices of the counters that are not 0, and their numbers of hits, int64 (k,) each; None
-            without a tally.
+            Indices of the nonzero counters and their numbers of hits, int64 (k,) each. None without
+            a tally.
 
         Raises
         ------

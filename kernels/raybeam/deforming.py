@@ -1,8 +1,10 @@
-"""Meshes whose vertices move: each ray meets the mesh in its shape at the time of the ray.
+"""Meshes whose vertices move between frames.
 
-A tree over the triangles, built once, serves for all times: between two frames each vertex moves
-straight, so a box around a triangle at both frames holds the triangle in between, too. All backends
-cast these meshes in a loop on the CPU (deforming_loops.py), with the test of triangle.py.
+A ray hits such a mesh in its shape at the firing time of the ray. One tree over the triangles,
+which is built once, serves all times: each vertex moves along a straight line between two frames,
+so a box that encloses a triangle at both frames also encloses it in between. All backends cast rays
+at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses the intersection
+test in triangle.py.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from .tree import build_tree
 if TYPE_CHECKING:
     from .deforming_loops import DeformingTree
 
-_PAD = 1e-6  # share of the mesh's size, around boxes: far more than rounding to float32
+_PAD = 1e-6  # padding of boxes relative to the mesh's size, much more than float32 rounding errors
 _LEAF_SIZE = 4
 
 
@@ -59,7 +61,7 @@ class DeformingMesh:
 
     @cached_property
     def _tree(self) -> DeformingTree:
-        """The mesh and its tree for the compiled loop."""
+        """The mesh and its tree in the form that the compiled loop reads."""
         from . import deforming_loops as loops
 
         vertices = np.ascontiguousarray(self.vertices)

@@ -1,4 +1,4 @@
-"""Loops of deforming.py, which cast rays on meshes whose vertices move."""
+"""Compiled loops that cast rays at meshes whose vertices move (deforming.py)."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ from .moving_loops import NEAREST_HITS, PAIRS, named_tuple_type, pose_rotation, 
 from .tree import LEAF_BITS
 from .triangle_loops import intersect_plane, same_sign, shear_ray
 
-WIDTH = 8  # children of a node
-_STACK = 512  # nodes still to visit: far more than on any descent in a tree of 2**28 triangles
+WIDTH = 8  # children per node
+_STACK = 512  # capacity of the stack, much more than any traversal of 2**28 triangles needs
 _BOX = 4 * 6 * WIDTH  # bytes of the boxes of a node
 _TINY = 1e-300
 
 
 class DeformingTree(NamedTuple):
-    """A mesh that deforms, and a tree over its triangles with boxes for each interval of frames.
-
-    A frame is the vertices at a known time; between two frames each vertex moves straight.
+    """A deforming mesh, and a tree over its triangles with boxes for each interval between frames.
 
     Attributes
     ----------
     vertices
-        float64 (f, v, 3): vertices at each frame, meters.
+        float64 (f, v, 3): vertices at each frame, in meters. They move linearly between frames.
     faces
-        int64 (t, 3): rows of the vertices of each triangle.
+        int64 (t, 3): indices of the vertices of each triangle.
     order, child
-        int32 (t,) and (m, `WIDTH`): triangles in the order of the leaves, and children of each
-        node, as in `tree.WideTree`: a positive number of a node, 0 for none, or
-        ``~(first << LEAF_BITS | count - 1)`` for a leaf of ``order[first : first + count]``.
+        int32 (t,) and (m, `WIDTH`): triangles in leaf order, and children of each node, as in
+        `tree.WideTree`. A child is the index of a node if it is positive, 0 if the slot is empty,
+        or ``~(first << LEAF_BITS | count - 1)`` for a leaf with the triangles ``order[first : first
+        + count]``.
     boxes
-        float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node, from each frame to the
-        next: lower x, y, z, upper x, y, z, meters.
+        float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node between consecutive
+        frames: lower x, y, z, upper x, y, z, in meters.
     """
 
     vertices: Floats
@@ -59,12 +58,13 @@ _TREE = named_tuple_type(
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
 def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Compute the boxes of all nodes of a `DeformingTree` between each frame and the next.
+    """Compute the boxes of all nodes of a `DeformingTree` between consecutive frames.
 
-    The boxes are written to `boxes`. They extend beyond the triangles by `pad`, in meters.
+    The boxes are written to `boxes`. They extend beyond the triangles by `pad` meters.
     """
     for i in range(len(boxes)):
-        for node in range(len(child) - 1, -1, -1):  # children come after their parents
+        # Children have higher indices than their parents.
+        for node in range(len(child) - 1, -1, -1):
             for c in range(WIDTH):
                 code = np.int64(child[node, c])
                 first = ~code >> LEAF_BITS
@@ -89,12 +89,12 @@ def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-unt
 
 
 @stage
-def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def _entry_distances(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the distances at which a ray enters the boxes of a node's children, or inf for a miss.
 
-    `box` is the address of the boxes, float32 (6, `WIDTH`); `entry_distances` is the address of the
-    output, float64 (`WIDTH`,). `inverse` is 1 over the ray's direction; the ray ends at the
-    distance `reach`.
+    `box` is the address of the boxes, float32 (6, `WIDTH`), and `entry_distances` is the address of
+    the output, float64 (`WIDTH`,). `inverse` contains the reciprocals of the direction's
+    components. The ray ends at the distance `reach`.
     """
     x, y, z = origin
     u, v, w = inverse
@@ -114,15 +114,15 @@ def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-unt
 
 @inlined
 def _inverse(d):  # type: ignore[no-untyped-def]
-    """Return 1 over a component of a direction, or a large number for 0."""
+    """Return the reciprocal of a direction component, or of a tiny number if it is 0."""
     return 1 / (d if abs(d) >= _TINY else _TINY)
 
 
 @inlined
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
-    """Return a vertex at a share of the time from a frame to the next, 0 to 1.
+    """Return a vertex between two frames, as three coordinates in meters with `axis` last.
 
-    Returns three coordinates, meters, with `axis` last.
+    `share` is the fraction of the time from `frame` to the next frame, between 0 and 1.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
@@ -136,10 +136,10 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
 
 @compiled(types.void(PAIRS, _TREE, NEAREST_HITS))
 def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast the pairs of a `RayBodyPairs` on a deforming mesh, and write nearer hits to a `NearestHits`.
+    """Cast pairs of rays and bodies at a deforming mesh, and record closer hits in `nearest`.
 
-    Each ray meets the mesh in its shape at `RayBodyPairs.frame`. Nodes are visited nearest first;
-    `waits` are the distances of the nodes on the stack.
+    Each ray hits the mesh in its shape at the frame number `RayBodyPairs.frame`. Nodes are visited
+    from near to far. `waits` contains the entry distances of the nodes on the stack.
     """
     rays = pairs.rays
     poses = pairs.poses
@@ -178,16 +178,16 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
             node = stack[top]
             if waits[top] > best:
                 continue
-            _enter(frame_boxes + _BOX * node, origin, inverse, best, enters.ctypes.data)
-            below = top
+            _entry_distances(frame_boxes + _BOX * node, origin, inverse, best, enters.ctypes.data)
+            bottom = top
             for slot in range(WIDTH):
                 code = np.int64(child[node, slot])
                 enter = enters[slot]
                 if code == 0 or enter > best:
                     continue
-                if code > 0:  # the nearest comes last
+                if code > 0:  # Insert the node so that the nearest one is on top.
                     position = top
-                    while position > below and waits[position - 1] < enter:
+                    while position > bottom and waits[position - 1] < enter:
                         stack[position] = stack[position - 1]
                         waits[position] = waits[position - 1]
                         position -= 1

@@ -1,4 +1,4 @@
-"""Rays at meshes, their instances and masks, as parts of compiled loops.
+"""Compiled functions for rays, meshes, instances and masks.
 
 `mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_record.py).
 """
@@ -20,10 +20,10 @@ i32_1 = types.int32[::1]
 
 @stage
 def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray from the scene's to the mesh's local coordinates, as `LocalScene.to_mesh_coordinates`.
+    """Transform a ray from scene to mesh coordinates, as `LocalScene.to_mesh_coordinates` does.
 
-    `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
-    the length of the direction before it was made a unit vector.
+    `m` points to the (3, 4) matrix of the instance. Return the origin, the unit direction, and the
+    length that the direction had before it was normalized.
     """
     x = (m[0] * dx + m[1] * dy) + m[2] * dz
     y = (m[4] * dx + m[5] * dy) + m[6] * dz
@@ -37,9 +37,9 @@ def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-d
 
 @inlined
 def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
-    """Return the three corners of a triangle, each as three coordinates with `axis` last.
+    """Return the three vertices of a triangle, each as three coordinates with `axis` last.
 
-    `triangle` is the row in `table`.
+    `triangle` is the row of the triangle in `table`.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
@@ -53,9 +53,9 @@ def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
 
 @stage
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether the mask of a mesh stops a ray in a triangle, as `MaskTables.is_opaque`.
+    """Return whether a mesh is opaque at a hit, as `MaskTables.is_opaque` does.
 
-    `mesh` points to a `MESH`, `triangle` is the row in its corners.
+    `mesh` points to a `MESH` record, and `triangle` is the row in its corners.
     """
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
@@ -76,11 +76,11 @@ def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     casts, origins, directions, triangle_row, instance, u, v
 ):
-    """Write the weights `u` and `v` (m,) of the second and third corner for hits of a `CAST`.
+    """Write the barycentric weights `u` and `v` (m,) of the second and third vertex of hits.
 
-    Rays (m, 3) are local to the scene; origins are (1, 3) if all rays share their origin.
-    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `cast_rays` wrote
-    with `index` 0.
+    The rays (m, 3) are in local scene coordinates. `origins` is (1, 3) if all rays share an origin.
+    `triangle_row` is the row of each hit in the corners of all meshes, as `cast_rays` writes it if
+    the field `index` of the cast is 0.
     """
     mesh = casts[0].mesh
     instances = casts[0].instances
@@ -106,7 +106,7 @@ def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a co
         axis, p, q, r, sx, sy, sz = shear_ray(ox, oy, oz, dx, dy, dz)
         corners = triangle_corners(float64s(int64s(mesh_address)[0]), row, axis)
         a, b, c, det, _ = intersect_plane(corners, (p, q, r, sx, sy, sz))
-        sign = -1.0 if det < 0 else 1.0  # areas of a hit have the sign of `det`, or are 0
+        sign = -1.0 if det < 0 else 1.0  # The areas of a hit have the sign of `det` or are 0.
         a = max(sign * a, 0.0)
         b = max(sign * b, 0.0)
         c = max(sign * c, 0.0)

@@ -1,4 +1,4 @@
-"""Origins and directions of the rays of a pattern, as a cast computes them."""
+"""Origins and directions of the rays of a pattern."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .pattern import Pattern
 from .poses import PoseMotion, Poses, check_poses
 from .sub_rays import sub_ray_directions
 
-_BLOCK_RAYS = 1 << 14  # rays that are computed at a time: their arrays stay in a core's cache
+_BLOCK_RAYS = 1 << 14  # number of rays per block, chosen so that their arrays fit into the cache
 
 
 def pattern_rays(
@@ -77,10 +77,10 @@ def pattern_rays(
 
 
 def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return origins and directions of rays without checks, by compiled loops if possible.
+    """Return the origins and directions of rays, with compiled loops if numba is installed.
 
-    `first` is the row of ray 0; `ray` (m,) are numbers of rays. The shapes are as in
-    `pattern_rays`.
+    `first` is the pattern row of ray 0, and `ray` (m,) contains ray indices. The arguments are not
+    validated. The result is as in `pattern_rays`.
     """
     if not (_numba_is_installed() and len(ray)):
         return compute_rays_numpy(pattern, first, ray, poses)
@@ -93,10 +93,11 @@ def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple
 def compute_rays_numpy(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats, Floats]:
-    """Return origins and directions of rays as `compute_rays` does, by NumPy.
+    """Return the origins and directions of rays like `compute_rays`, with NumPy.
 
-    Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
-    lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
+    Vectors are rotated to the mesh frame and then translated: ``((x a + y b) + z c) + p``. If the
+    lidar moves while the rays of a pose are fired, rotations are followed by ``v + t (w x v)`` and
+    translations by ``p + t u``.
     """
     shares_origin = pattern.shares_origin(poses)
     origins, directions = np.empty((2, 3, len(ray)))
@@ -117,12 +118,12 @@ def compute_rays_numpy(
 
 
 def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
-    """Return directions (3, m), and offsets of origins (3, m), in the sensor's axes.
+    """Return the directions and the origins, (3, m) each, of rays in the sensor frame.
 
-    `row` (m,) are rows of rays, which may be beyond the end of the pattern. Offsets are relative
-    to the sensor's position, meters; None for zero.
+    `row` (m,) contains pattern rows, which may be beyond the end of the pattern. The origins are
+    relative to the sensor position, in meters. They are None if all are zero.
     """
-    row = row - row // len(pattern) * len(pattern)  # takes half as long as the remainder
+    row = row - row // len(pattern) * len(pattern)  # takes half as long as the % operator
     beam = row // pattern.subrays_per_beam
     direction = _columns(pattern.directions.T, beam)
     offset = None

@@ -1,4 +1,4 @@
-"""Poses of a sensor: positions and rotations, each for a number of rays."""
+"""Poses of a sensor, each of which applies to a number of consecutive rays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .arrays import AnyArray, Floats, Indices, Ints
 from .rays import are_finite, as_real_rows, check_rows
 
-_SLACK = 2e-9  # tolerance for products of a rotation's rows
+_SLACK = 2e-9  # tolerance for the dot products of the rows of a rotation matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +38,21 @@ class PoseMotion:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses that have been checked.
+    """Validated poses.
 
     Attributes
     ----------
     positions
-        float64 (k, 3), meters.
+        float64 (k, 3), in meters.
     rotations
-        float64 (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are the same. Each
-        matrix entry is contiguous over the poses, as are the components of positions and motion.
+        float64 (k, 3, 3): rotations from the sensor frame to the mesh frame. None if their axes are
+        parallel. Each matrix element is contiguous over the poses, as are the components of
+        positions and motion.
     rays_per_pose
-        Rays of a pose, at least 1: ray i belongs to pose ``i // rays_per_pose``.
+        Number of rays per pose, at least 1. Ray i belongs to pose ``i // rays_per_pose``.
     motion
-        Motion within each pose; None if the lidar stands still during the rays of a pose.
+        Motion of the lidar while the rays of a pose are fired. None if the lidar does not move
+        during this time.
     """
 
     positions: Floats
@@ -62,7 +64,7 @@ class Poses:
         return len(self.positions)
 
     def per_ray(self, ray: Ints, out: Floats) -> RayPoses:
-        """Look up the poses of rays (m,), into the memory `out`, float64 (18, m)."""
+        """Return the pose of each ray (m,), using `out` as memory, float64 (18, m)."""
         pose = ray // self.rays_per_pose
         delay = np.zeros(1)
         rates = None
@@ -90,18 +92,21 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class RayPoses:
-    """Poses of m rays: arrays (components, m), or (components, 1) if all rays share a pose.
+    """Poses of m rays.
+
+    The arrays have shape (components, m), or (components, 1) if all rays share a pose.
 
     Attributes
     ----------
     positions
-        float64 (3, m), meters.
+        float64 (3, m), in meters.
     rotations
-        float64 (9, m): matrices by rows, from the sensor's axes to the mesh's; None if equal.
+        float64 (9, m): matrices from the sensor frame to the mesh frame, row by row. None if their
+        axes are parallel.
     delay
-        float64 (m,) or (1,): delay of each ray after the time of its pose, seconds.
+        float64 (m,) or (1,): delay of each ray relative to the time of its pose, in seconds.
     velocities, rates
-        float64 (3, m): as in `PoseMotion`; None if the lidar does not move, or does not rotate.
+        float64 (3, m): as in `PoseMotion`. None if the lidar does not move or does not rotate.
     """
 
     positions: Floats
@@ -111,9 +116,10 @@ class RayPoses:
     rates: Floats | None
 
     def rotate(self, vectors: Floats) -> Floats:
-        """Rotate vectors (3, m) from the sensor's axes to the mesh's, in a fixed order of rounding.
+        """Rotate vectors (3, m) from the sensor frame to the mesh frame.
 
-        ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
+        The order of operations is fixed. The last bit of ``matrices @ vectors`` would depend on the
+        BLAS library.
         """
         if self.rotations is not None:
             x, y, z = vectors
@@ -133,7 +139,7 @@ class RayPoses:
         return crosses
 
     def translate(self, positions: Floats) -> Floats:
-        """Move positions (3, m), or (3, 1), by the velocity during the delay of each ray."""
+        """Move positions, (3, m) or (3, 1), by the velocity during the delay of each ray."""
         if self.velocities is None:
             return positions
         pairs = zip(positions, self.velocities, strict=True)
@@ -147,12 +153,12 @@ def check_poses(
     ray_count: int,
     motion: PoseMotion | None = None,
 ) -> Poses:
-    """Check the poses of a number of rays.
+    """Validate the poses of a number of rays.
 
-    Raises ValueError for an invalid pose, or too few poses.
+    `RayCaster.scan` describes the arguments. If `positions` is a `Poses` object, which has already
+    been validated, it is returned unchanged.
 
-    `RayCaster.scan` describes the arguments. `Poses` in place of positions have been checked
-    before, and are returned as such.
+    Raises ValueError if a pose is invalid or there are too few poses.
     """
     if isinstance(positions, Poses):
         return positions
@@ -184,7 +190,7 @@ def check_poses(
 
 
 def _broadcast_rows(table: Floats, count: int) -> Floats:
-    """Return a table (1, ...) or (count, ...) as (count, ...)."""
+    """Repeat a table (1, ...) along the first axis if it does not have `count` rows."""
     return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
 
@@ -208,14 +214,16 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 def _check_rotations(rotations: ArrayLike) -> Floats:
     """Return rotations (k, 3, 3) as float64.
 
-    Raises ValueError for a matrix that deforms or mirrors.
+    Raises ValueError if a matrix is not orthonormal or contains a reflection.
     """
     matrices = component_major(as_real_rows("rotations", rotations, (3, 3)))
     rows = matrices.transpose(1, 2, 0)
     x, y, z = rows.transpose(1, 0, 2)
-    # NaN compares as false.
+    # Comparisons with NaN are false, so matrices with NaN count as invalid.
     with np.errstate(over="ignore", invalid="ignore"):
-        products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # products of two rows each
+        products = (x[:, None] * x + y[:, None] * y) + z[
+            :, None
+        ] * z  # dot products of two rows each
         deviations = np.abs(products - np.eye(3)[:, :, None])
         orthonormal = (deviations <= _SLACK).all(axis=(0, 1))
         mirrored = orthonormal & ~(determinants(rows) > 0)
@@ -226,25 +234,24 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     if mirrored[first]:
         raise ValueError(
             f"The determinant of rotation {first} must be 1, but {matrices[first].tolist()} "
-            "contains a "
-            f"reflection. {len(invalid)} of {len(matrices)} matrices are invalid."
+            f"contains a reflection. {len(invalid)} of {len(matrices)} matrices are invalid."
         )
     raise ValueError(
         f"Rotation {first} must be an orthonormal matrix from the sensor frame to the mesh frame, "
-        "but "
-        f"is {matrices[first].tolist()}. {len(invalid)} of {len(matrices)} matrices are invalid."
+        f"but is {matrices[first].tolist()}. {len(invalid)} of {len(matrices)} matrices are "
+        "invalid."
     )
 
 
 def determinants(matrix_rows: Floats) -> Floats:
-    """Return the determinants (k,) of matrices by rows (3, 3, k)."""
+    """Return the determinants (k,) of matrices with shape (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix_rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 
 def component_major(table: AnyArray) -> Floats:
-    """Return a table (k, ...) as float64, each component contiguous over the k entries."""
-    # Not by `numpy.moveaxis`, which takes as long as casting 100 rays.
+    """Return a table (k, ...) as float64 with each component contiguous over the k rows."""
+    # `numpy.moveaxis` would take as long as casting 100 rays.
     components_first = table.transpose(*range(1, table.ndim), 0)
     contiguous = np.ascontiguousarray(components_first, dtype=np.float64)
     return contiguous.transpose(-1, *range(table.ndim - 1))

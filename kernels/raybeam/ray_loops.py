@@ -1,9 +1,10 @@
-"""Rays of a pattern, a tile at a time in compiled loops, with the operations of `compute_rays_numpy`.
+"""Compiled loops that compute the rays of a pattern, with the operations of `compute_rays_numpy`.
 
-A ray is a beam of the pattern, or a sub-ray of a beam, cast from a pose. `cast` is a `CAST` record
-(cast_record.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py).
-`floats` and `numbers` point to this memory as float64 and int64. Tables that a `CAST` names come as
-addresses, with one column for each beam or pose. A vector has four rays.
+A ray is a beam of the pattern, or a sub-ray of a beam, that is cast from a pose. The rays of one
+tile are computed at a time. `cast` is a `CAST` record (cast_record.py), and `tile` is the address
+of the memory of a tile with `rays` rays (tile_memory.py), which `floats` and `numbers` access as
+float64 and int64. Arrays of a `CAST` are passed by address and have one column per beam or pose. A
+vector contains four rays.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_index, thread_ti
 from .tile_sizes import VECTOR_RAYS
 from .vectors import load, splat, square_root, store
 
-_TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
+_TINY = 2.0**-60  # replaces zero components of directions, to avoid 0 * inf
 _SINGLE_ROW = VECTOR_RAYS  # columns of `SubRays.loop_table` if beams have a single sub-ray
-_BEAMS = 64  # beams per tile when rays are only computed
+_BEAMS = 64  # beams per tile if rays are computed but not cast
 
 
 class FirstRay(NamedTuple):
-    """The ray with number 0 of a call.
+    """The first ray of a call.
 
     Attributes
     ----------
     row
-        Row in the pattern, counted in sub-rays.
+        Row in the pattern, where each sub-ray is a row.
     pose, within
-        Number of the pose, and number of the ray within the pose.
+        Index of its pose, and index of the ray within the pose.
     ray
-        Number of the ray in the scan.
+        Index of the ray in the scan.
     """
 
     row: int
@@ -49,13 +50,13 @@ class FirstRay(NamedTuple):
 
 @inlined
 def _floor_divide(number, divisor):  # type: ignore[no-untyped-def]
-    """Return ``number // divisor``, for whole numbers below 2^52: exact, faster than `//`."""
+    """Return ``number // divisor`` for integers below 2**52, faster than `//`."""
     return np.int64(np.floor(np.float64(number) / np.float64(divisor)))
 
 
 @inlined
 def perpendicular_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """Return the two axes across a unit direction of `sub_rays.perpendicular_axes`, as six numbers."""
+    """Return the six components of the two axes of `sub_rays.perpendicular_axes`."""
     sign = -1.0 if z < 0 else 1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -64,9 +65,9 @@ def perpendicular_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """Return the two axes across a unit direction of `sub_rays.oriented_axes`, as six numbers.
+    """Return the six components of the two axes of `sub_rays.oriented_axes`.
 
-    `axis` is `SubRays.axis`: three numbers.
+    `axis` contains the three components of `SubRays.axis`.
     """
     a, b, c = axis
     p = b * z - c * y
@@ -87,9 +88,10 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 @stage
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
-    """Write the rows in the pattern of a tile's rays, counted in sub-rays.
+    """Write the pattern rows of a tile's rays, where each sub-ray is a row.
 
-    `first_row` is the row of the call's first ray; the pattern, of `row_count` rows, repeats.
+    `first_row` is the row of the first ray of the call. The pattern has `row_count` rows and
+    repeats.
     """
     numbers = int64s(tile)
     number_at = row_index(NUMBER, rays)
@@ -101,9 +103,10 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
 
 @stage
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
-    """Write the poses of a tile's rays, and the numbers of the rays within their poses.
+    """Write the poses of a tile's rays, and the indices of the rays within their poses.
 
-    `first` is the `FirstRay`. Rays outside the call take the nearest pose.
+    `first` is the `FirstRay` of the call. Rays before or after the rays of the call use the closest
+    pose.
     """
     numbers = int64s(tile)
     number_at = row_index(NUMBER, rays)
@@ -118,7 +121,7 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
 
 @stage
 def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyped-def]
-    """Write the directions of a tile's rays, by their rows in the pattern."""
+    """Write the directions of a tile's rays, given their pattern rows."""
     numbers = int64s(tile)
     floats = float64s(tile)
     table = float64s(directions)
@@ -133,17 +136,17 @@ def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyp
 
 @inlined
 def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
-    """Return ``a x + b y`` of vectors."""
+    """Return ``a x + b y`` for vectors."""
     return a * x + b * y
 
 
 @stage
 def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the directions of a tile's sub-rays, and their starts relative to the beams' origins.
+    """Write the directions of a tile's sub-rays, and their starts relative to the beam origins.
 
-    The rows of the sub-rays become rows of their beams. `lanes_per_beam` consecutive lanes are of a
-    beam. With `offsets` of the beams, radians, rows 1 and 2 of the table of shares are tangents of
-    angles. The offsets are added to these angles.
+    The pattern rows of the sub-rays are replaced by the rows of their beams. Each beam occupies
+    `lanes_per_beam` consecutive lanes. If beams have `offsets`, rows 1 and 2 of the sub-ray table
+    contain angles, to which the offsets are added, instead of components.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -195,7 +198,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
 
 @stage
 def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write directions and starts as `_make_sub_rays`, of the only sub-ray of each beam."""
+    """Write the directions and starts like `_make_sub_rays`, if each beam has a single sub-ray."""
     numbers = int64s(tile)
     floats = float64s(tile)
     table = float64s(cast.sub_ray_table)
@@ -237,7 +240,10 @@ def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # 
 
 @inlined
 def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
-    """Rotate four vectors, whose components are in three rows from `target` on, by nine vectors."""
+    """Rotate four vectors by a matrix of nine vectors.
+
+    The components of the vectors are in three rows of the tile, starting at index `target`.
+    """
     a, b, c, d, e, f, g, h, i = matrix
     p = load(floats, target)
     q = load(floats, target + rays)
@@ -249,7 +255,7 @@ def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
 
 @inlined
 def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
-    """Return the nine numbers of a pose's matrix, each as a vector."""
+    """Return the nine elements of a pose's matrix, each as a vector of equal numbers."""
     k = pose
     n = poses
     return (
@@ -267,7 +273,7 @@ def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
 
 @inlined
 def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
-    """Rotate the vector with first component i by matrix k of n matrices."""
+    """Rotate the vector whose first component has index `i` by the `k`-th of `n` matrices."""
     p = floats[i]
     q = floats[i + rays]
     r = floats[i + 2 * rays]
@@ -279,9 +285,10 @@ def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def
 
 @stage
 def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
-    """Rotate vectors of a tile, in three rows from `first_row` on, to the scene's axes.
+    """Rotate vectors of a tile to the axes of the scene.
 
-    `rotations` is the address of the matrices of the poses, float64 (9, poses).
+    The vectors are in three rows of the tile, starting at row `first_row`. `rotations` is the
+    address of the matrices of the poses, float64 (9, poses).
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -305,7 +312,7 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
 
 @stage
 def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Rotate vectors of a tile by the angular rates of their poses, as `PoseMotion` describes."""
+    """Rotate vectors of a tile by the angular velocities of their poses. See `PoseMotion`."""
     numbers = int64s(tile)
     floats = float64s(tile)
     delays = float64s(cast.delays)
@@ -331,7 +338,10 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 
 @stage
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins, by each ray's column in row `field`."""
+    """Add vectors of a table (3, count) to the origins of a tile's rays.
+
+    Row `field` of the tile contains the column of the table for each ray.
+    """
     numbers = int64s(tile)
     floats = float64s(tile)
     vectors = float64s(table)
@@ -346,7 +356,7 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
 
 @stage
 def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
-    """Add the position of the only pose, whose address is given, to the origins."""
+    """Add the position of the only pose, given its address, to the origins of a tile's rays."""
     floats = float64s(tile)
     vector = float64s(position)
     target = row_index(OX, rays)
@@ -377,7 +387,7 @@ def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
 
 @stage
 def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
-    """Write zero to the origins of a tile's rays."""
+    """Set the origins of a tile's rays to zero."""
     floats = float64s(tile)
     zero = splat(0.0)
     for k in range(row_index(OX, rays), row_index(OX + 3, rays), 4):
@@ -386,9 +396,9 @@ def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
 
 @stage
 def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
-    """Write the origins of a tile's rays in the scene, meters.
+    """Write the origins of a tile's rays in the scene, in meters.
 
-    If sub-rays have starts, the rows of the origins hold these.
+    If sub-rays have starts, these must already be in the rows of the origins.
     """
     has_starts = cast.sub_ray_table != 0 and cast.has_starts != 0
     if not has_starts:
@@ -410,7 +420,7 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
 
 @stage
 def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Convert the origins of a tile's rays, meters, to local coordinates."""
+    """Convert the origins of a tile's rays from meters to local coordinates."""
     floats = float64s(tile)
     target = row_index(OX, rays)
     factor = splat(scale)
@@ -423,9 +433,10 @@ def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 @stage
 def _write_output(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
-    """Write vectors of a tile to an output (3, total) of all rays.
+    """Write vectors of a tile to an output array (3, total) for all rays of a cast.
 
-    `address` is of the output of the call's first ray, `count` the number of rays of the call.
+    `address` is the output for the first ray of the call, and `count` is the number of rays in the
+    call.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -442,7 +453,7 @@ def _write_output(tile, rays, first_row, address, total, count):  # type: ignore
 
 @inlined
 def first_ray(cast, ray):  # type: ignore[no-untyped-def]
-    """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
+    """Return the `FirstRay` of a call, given its index in the scan."""
     total = cast.beam_count * cast.subrays
     rays_per_pose = cast.rays_per_pose
     pose = ray // rays_per_pose
@@ -452,12 +463,13 @@ def first_ray(cast, ray):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.void(*4 * INT64))
 def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
-    """Compute the rays of a tile in local coordinates, by their numbers in the call.
+    """Compute the rays of a tile in local coordinates, given their indices in the call.
 
-    `address` is of the `CAST`, `start` the number of the call's first ray in the scan, and `count`
-    the number of the call's rays. Rays outside the call are neighbors of its rays, if these have
-    one pose. An origin that all rays share is in the tile already: `write_shared_origin`. Rays are also
-    written to the outputs of rays of the cast, if any.
+    `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
+    scan, and `count` is the number of rays in the call. If there is a single pose, the tile may
+    also contain neighboring rays that do not belong to the call. If all rays share an origin,
+    `write_shared_origin` must have written it to the tile. The rays are also written to the ray
+    outputs of the cast, if there are any.
     """
     cast = carray(casts_at(address), 1)[0]
     tile = cast.tile
@@ -489,10 +501,10 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
 
 @stage
 def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
-    """Write the origin that all rays of a cast share, in local coordinates, to a tile's rays.
+    """Write the origin that all rays of a cast share to the rays of a tile, in local coordinates.
 
-    All tiles of a cast use the same memory, where `make_rays` leaves this origin unchanged. So
-    the origin is written once, before the first tile.
+    All tiles of a cast use the same memory, and `make_rays` does not change this origin, so it is
+    written only once before the first tile.
     """
     _write_origins(tile, rays, cast)
     _to_local(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
@@ -500,7 +512,7 @@ def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the larger of `entry` and the distance at which a ray enters a slab of the box."""
+    """Return the larger of `entry` and the distance at which a ray enters the slab of one axis."""
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY
@@ -509,10 +521,10 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the box from -half to half; 0 if it starts inside.
+    """Return the distance at which a ray enters the cube from -half to half, 0 if it starts inside.
 
-    All lengths are in local units; `o` and `d` are the ray's origin and direction. For a ray that
-    misses the box, the result has no meaning.
+    All lengths are in local units. `o` and `d` are the origin and the direction of the ray. The
+    result is meaningless if the ray misses the cube.
     """
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > half:
@@ -524,7 +536,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write the directions (3, m), and the origins unless (3, 0), of rays with numbers (m,)."""
+    """Write the directions (3, m) of rays (m,), and their origins unless `origins` is (3, 0)."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -538,7 +550,7 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
     direction = row_index(DX, lanes)
     beams = lanes // each
     for start in range(0, count, beams):
-        # Each ray fills the lanes of a beam. One of these lanes is the ray.
+        # Each requested ray takes the lanes of a whole beam, of which one lane contains the ray.
         for k in range(beams):
             number = rays[min(start + k, count - 1)]
             first_of_beam = number - (cast.first + number) % cast.subrays
@@ -558,15 +570,14 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
 def compute_rays_compiled(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats | None, Floats]:
-    """Return origins and directions, float64 (3, m), of rays with numbers (m,).
+    """Return the origins and directions of rays (m,), float64 (3, m) each.
 
-    The arguments are as in `pattern_rays.compute_rays`. Origins are None if all rays start at the
-    position of a single pose.
+    The arguments are as in `pattern_rays.compute_rays`. The origins are None if all rays share one.
     """
     cast = memory.CastRecord(np.zeros(1, memory.CAST))
     record = cast.record
     cast.set_pattern(pattern, poses, first)
-    record["scale"] = 1.0  # local coordinates are meters, about the origin of the scene
+    record["scale"] = 1.0  # local coordinates are scene coordinates in meters
     lanes = _BEAMS * int(record["lanes_per_beam"][0])
     record["tile_rays"] = lanes
     record["tile"] = thread_tiles.address(lanes, 0, 0)

@@ -1,4 +1,4 @@
-"""A single ray's way down the trees that tiles descend."""
+"""Traversal of the trees of tiles by a single ray."""
 
 from __future__ import annotations
 
@@ -36,24 +36,25 @@ _NEAR = field_index("near")
 _STACK = field_index("stack")
 _TINY = np.float32(2.0**-60)
 SLACK = 2.0**-20
-_MAX_ENTRY = 1e9  # see tree.py
+_MAX_ENTRY = 1e9  # local distance that the padding in tree.py allows for
 
 
 class _Start(NamedTuple):
-    """A ray in float32, from where it enters the box of a scene or mesh.
+    """A ray in float32, starting where it enters the box of a scene or mesh.
 
     Attributes
     ----------
     entry
-        Distance of the start from the ray's origin, float64; 0 if the origin is inside the box.
+        Distance of the start from the origin of the ray, float64; 0 if the origin is inside the
+        box.
     x, y, z, dx, dy, dz
         Start and direction.
     ix, iy, iz
-        Reciprocals of the direction.
+        Reciprocals of the direction components.
     near_x, near_y, near_z
-        Where in a node the coordinates of its children's nearer sides are.
+        Positions, within a node, of the coordinates of the children's closer sides.
     undecided
-        Whether the start is too inexact to discard triangles: -1 if so, else 0.
+        -1 if the start is too inaccurate to discard triangles, otherwise 0.
     """
 
     entry: float
@@ -74,9 +75,9 @@ class _Start(NamedTuple):
 
 @inlined
 def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `_Start` of a ray, the first of whose six numbers has index k.
+    """Return the `_Start` of a ray, whose six numbers start at index `k` with a stride of `rays`.
 
-    The box of a scene or mesh is within [-1, 1] and its padding.
+    The box of a scene or mesh is within [-1, 1], plus padding.
     """
     ox = floats[k]
     oy = floats[k + rays]
@@ -94,7 +95,7 @@ def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR09
     near_x = 0 if ix >= 0 else 24
     near_y = 8 if iy >= 0 else 32
     near_z = 16 if iz >= 0 else 40
-    # So far away, the start is off by more than the margins of the test in float32.
+    # Beyond this distance, the error of the start exceeds the margins of the test in float32.
     undecided = -1 if entry > _MAX_ENTRY else 0
     return _Start(
         entry=entry,
@@ -123,13 +124,16 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
-    """Return a distance after the entry as float32, never less than the exact distance."""
+    """Return a distance from the entry as float32, never less than the exact distance."""
     return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -ACROSS), ACROSS))
 
 
 @inlined
 def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untyped-def]
-    """Return the distances at which a ray meets the nearer and the farther side of eight boxes."""
+    """Return the distances at which a ray intersects the two sides of eight boxes across an axis.
+
+    The first vector contains the closer sides.
+    """
     far_at = (24 + 16 * axis) - near_at
     factor = splat(inverse)
     shift = splat(start * inverse)
@@ -141,10 +145,10 @@ def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untype
 
 @inlined
 def _push_children(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Add the children of a node that a ray meets to a list, nearest last, and return its length.
+    """Push the children of a node that a ray intersects, and return the new size of the stack.
 
-    `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
-    at which the ray ends.
+    The closest child is pushed last. `address` is the stack, which has `count` entries, `nodes` is
+    the address of the nodes, and `limit` is the distance at which the ray ends.
     """
     singles = float32s(tile)
     stack = float32s(address)
@@ -167,7 +171,7 @@ def _push_children(tile, address, nodes, node, start, limit, count):  # type: ig
         codes[ENTRY * count + 1] = children[base + 48 + child]
         count += 1
     if count == first + 2:
-        # Mostly there are one or two, and which is nearer cannot be predicted.
+        # This common case is handled without a branch, which would often be mispredicted.
         k = ENTRY * first
         here = stack[k]
         there = stack[k + ENTRY]
@@ -185,7 +189,7 @@ def _push_children(tile, address, nodes, node, start, limit, count):  # type: ig
 
 @inlined
 def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test the triangles of a leaf and a ray, and return whether it has a closer hit."""
+    """Test a ray against the triangles of a leaf, and return whether a closer hit was found."""
     record = int64s(mesh)
     blocks = float32s(record[BLOCKS])
     block = (code >> LEAF_BITS) * BLOCK
@@ -217,7 +221,10 @@ def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no
 
 @called_by_address(types.void(*7 * INT64))
 def walk_ray(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
-    """Cast a ray in a mesh, with `waiting` entries of the tree above in the list of nodes."""
+    """Cast a ray at a mesh.
+
+    `waiting` is the number of entries of the instance tree that are on the stack.
+    """
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
@@ -245,7 +252,7 @@ def walk_ray(tile, rays, ray, first_row, mesh, instance, waiting):  # type: igno
 
 @stage
 def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write a ray in the coordinates of the mesh of an instance, whose record is at an address."""
+    """Write a ray in the mesh coordinates of an instance, whose record is given by its address."""
     floats = float64s(tile)
     numbers = int64s(tile)
     k = row_index(OX, rays) + ray
@@ -279,7 +286,7 @@ def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  
 
 @called_by_address(types.void(*5 * INT64))
 def walk_ray_over_instances(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
-    """Cast a ray at all instances, from the address `nodes` of the tree over the instances."""
+    """Cast a ray at all instances. `nodes` is the address of the nodes of the instance tree."""
     floats = float64s(tile)
     numbers = int64s(tile)
     address = numbers[_STACK]

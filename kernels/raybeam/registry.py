@@ -1,4 +1,4 @@
-"""The list of engines, and the choice of an engine."""
+"""The available backends, and how one of them is selected."""
 
 from __future__ import annotations
 
@@ -25,25 +25,28 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_versions(name: str) -> str:
-    """Return the versions that the bits of a backend's results depend on, besides NumPy's.
+    """Return the versions, besides NumPy's, that affect the bits of a backend's results.
 
-    Two processes with equal versions of these and of NumPy give the same hits, to the bit.
+    Two processes with the same versions, and with the same version of NumPy, return bit-identical
+    hits.
 
     Raises
     ------
-    ValueError, BackendUnavailable
-        If no backend has that name, or the backend cannot be used on this machine.
+    ValueError
+        If no backend has this name.
+    BackendUnavailable
+        If the backend cannot be used on this machine.
     """
     return choose_backend(name).versions()
 
 
 def choose_backend(name: str) -> type[Backend]:
-    """Return the backend with a name or, for "auto", the first backend that can be used.
+    """Return the backend with a name, or the first available one if the name is "auto".
 
     Raises
     ------
     ValueError
-        If no backend has that name.
+        If no backend has this name.
     BackendUnavailable
         If the backend cannot be used on this machine.
     """

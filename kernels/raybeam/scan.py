@@ -1,4 +1,4 @@
-"""Scans: rays of a pattern, their poses, and which hits are kept and counted."""
+"""Scans: the rays of a pattern with their poses, and the selection of the hits to store."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .pattern_rays import compute_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MAX_RAYS = 1 << 32  # limit for a scan: numbers of rays in `ScanReturns` have 32 bits
+_MAX_RAYS = 1 << 32  # ray indices in `ScanReturns` have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Checked arguments of `RayCaster.scan`.
+    """Validated arguments of `RayCaster.scan`.
 
     Attributes
     ----------
     pattern
-        Rays in the sensor's axes.
+        Rays in the sensor frame.
     first
         Row of ray 0 in the pattern, which repeats after its last row.
     count
@@ -34,16 +34,16 @@ class Scan:
     poses
         Poses of all rays.
     t_min, t_max
-        Closest and farthest distance of a reported hit, meters; both limits count.
+        Minimum and maximum distance of a hit in meters, both inclusive.
     keep_every
-        Number n: the first and then every n-th hit of each group is kept.
+        The first hit of each group and then every n-th hit are stored.
     groups
-        int64 (g,): number of the first ray of each group; ascending, from 0.
+        int64 (g,): index of the first ray of each group, in ascending order and starting at 0.
     tally
-        Whether to count hits by triangle.
+        Whether hits are counted per triangle.
     out
-        float64 (6, count): output for origins and directions of all rays; (3, count) for
-        directions alone, None for no output.
+        float64 (6, count): output array for the origins and directions of all rays, or (3, count)
+        for the directions only. None if they are not needed.
     """
 
     pattern: Pattern
@@ -61,12 +61,15 @@ class Scan:
         return self.count
 
     def chunks(self, size: int) -> Iterator[tuple[int, int]]:
-        """Yield half-open ranges of at most `size` rays, in ray order."""
+        """Yield the start and stop of ranges of at most `size` rays, in ray order."""
         for start in range(0, self.count, size):
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `out`, if any."""
+        """Compute rays `start` to `stop`, bit-identical to `pattern_rays`.
+
+        If the scan has an output array, the rays are written to it.
+        """
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = compute_rays(self.pattern, self.first, ray, self.poses)
         if self.out is not None:
@@ -91,9 +94,9 @@ def check_scan(
     motion: PoseMotion | None = None,
     out: Floats | None = None,
 ) -> Scan:
-    """Check the arguments of a scan.
+    """Validate the arguments of a scan.
 
-    `RayCaster.scan` describes arguments and errors.
+    `RayCaster.scan` describes the arguments and exceptions.
     """
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
@@ -126,8 +129,11 @@ def check_scan(
 
 
 def host_rays(scan: Scan, start: int, stop: int) -> Floats:
-    """Return origins, meters, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
-    if scan.out is not None:  # the caster has written the rays
+    """Return the origins in meters and directions of rays `start` to `stop` of a scan.
+
+    The result has shape (6, n).
+    """
+    if scan.out is not None:  # The caster has already written the rays.
         return np.ascontiguousarray(scan.out[:, start:stop])
     scan_rays = scan.rays(start, stop)
     rays = np.empty((6, stop - start))
@@ -137,20 +143,20 @@ def host_rays(scan: Scan, start: int, stop: int) -> Floats:
 
 
 class HitGroups:
-    """Counts of the hits in each group of rays of a scan that keeps every n-th hit of a group.
+    """Counts the hits in each group of rays, and selects every n-th hit of a group.
 
     Parameters
     ----------
     starts
-        int64 (g,): number of the first ray of each group; ascending, from 0.
+        int64 (g,): index of the first ray of each group, in ascending order and starting at 0.
     keep_every
-        n: the first and then every n-th hit of a group is kept.
+        The first hit of each group and then every n-th hit are stored.
     """
 
     def __init__(self, starts: Ints, keep_every: int) -> None:
         self._starts = starts
         self.keep_every = keep_every
-        self.hit_counts = np.zeros(len(starts), np.int64)  # hits of each group so far
+        self.hit_counts = np.zeros(len(starts), np.int64)  # number of hits in each group so far
 
     def find_groups(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
@@ -158,29 +164,32 @@ class HitGroups:
         Returns
         -------
         groups
-            Range of the groups.
+            Range of groups.
         later_starts
-            int64: first ray of each of these groups but the first, counted from `start`.
+            int64: first ray of the second and later of these groups, relative to `start`.
         """
         first = int(np.searchsorted(self._starts, start, side="right")) - 1
         last = int(np.searchsorted(self._starts, stop, side="left"))
         return slice(first, last), self._starts[first + 1 : last] - start
 
     def count_hits(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
-        """Count the hits of groups in a chunk, and find the hits to keep.
+        """Count the hits of groups in a chunk, and determine the hits to store.
 
         Parameters
         ----------
-        groups, counts
-            Range of the groups (g), and their numbers of hits in the chunk, int64 (g,).
+        groups
+            Range of g groups.
+        counts
+            int64 (g,): number of hits of each group in the chunk.
 
         Returns
         -------
-        first_kept, kept_counts
-            int64 (g,): index among each group's hits in the chunk of the first hit to keep, and
-            the number of hits to keep.
+        first_kept
+            int64 (g,): index of the first hit to store among the hits of each group in the chunk.
+        kept_counts
+            int64 (g,): number of hits to store.
         """
-        # Hits in the chunks before: not 0 for the first group.
+        # Only the first of these groups can have hits in earlier chunks.
         earlier_hits = self.hit_counts[groups].copy()
         self.hit_counts[groups] += counts
         first_kept = -earlier_hits % self.keep_every
@@ -188,14 +197,14 @@ class HitGroups:
 
 
 class HitCollector(HitGroups):
-    """Collects the hits of a scan, chunk after chunk in ray order.
+    """Collects the hits of a scan, chunk by chunk in ray order.
 
     Parameters
     ----------
     scan
-        The scan, with the selection of hits to keep and the tally to count.
+        The scan, which determines the hits to store and whether hits are counted per triangle.
     face_count
-        Rows of the tally.
+        Number of rows of the tally.
 
     Examples
     --------
@@ -212,16 +221,16 @@ class HitCollector(HitGroups):
         self._parts: list[HitColumns] = []
 
     def select_kept(self, ray: Integers, start: int, stop: int) -> slice | Indices:
-        """Count the hits of rays `start` to `stop`, and select the hits to keep.
+        """Count the hits of rays `start` to `stop`, and select the hits to store.
 
         Parameters
         ----------
         ray
-            (m,): numbers of the rays that hit, ascending, counted from `start`.
+            (m,): indices of the rays that hit, relative to `start`, in ascending order.
 
         Returns
         -------
-        The selection of kept hits: rows of `ray`, or all.
+        The rows of `ray` to store, as a slice or as indices.
         """
         groups, later_starts = self.find_groups(start, stop)
         cuts = np.searchsorted(ray, later_starts.astype(ray.dtype))
@@ -237,7 +246,10 @@ class HitCollector(HitGroups):
         return row_indices
 
     def count_triangles(self, tally_indices: Integers) -> None:
-        """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
+        """Add the hits of a chunk to the tally, given their tally rows (m,).
+
+        Without a tally, the call has no effect.
+        """
         if self._tally is not None:
             np.add.at(self._tally, tally_indices.astype(np.intp), 1)
 
@@ -249,7 +261,7 @@ class HitCollector(HitGroups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add the kept hits of a chunk, whose numbers of rays `ray` are counted from `start`."""
+        """Add the hits of a chunk that are stored. The indices `ray` are relative to `start`."""
         ray_number = ray.astype(np.uint32, copy=False)
         ray_number = ray_number + np.uint32(start) if start else ray_number
         self._parts.append((ray_number, distance, triangle, instance))

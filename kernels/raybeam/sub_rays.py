@@ -1,4 +1,4 @@
-"""Sub-rays of a beam, computed from the direction of the beam during a cast."""
+"""Sub-rays of a beam, which are computed from the direction of the beam during a cast."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SubRays:
         """
         rows = np.zeros((5, len(self)))
         rows[:3] = self.components()
-        if offsets is not None:  # shares differ by beam
+        if offsets is not None:  # The components differ between beams.
             rows[1:3] = self.angles.T
         if self.starts is not None:
             rows[3:] = self.starts.T
@@ -71,25 +71,26 @@ class SubRays:
 def sub_ray_directions(
     sub_rays: SubRays, beam_directions: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
-    """Return directions (3, m) of sub-rays, and their origins relative to the beams' origins.
+    """Return the directions (3, m) of sub-rays, and their origins relative to the beam origins.
 
     Parameters
     ----------
     sub_rays
-        Sub-rays of every beam.
+        Sub-rays of each beam.
     beam_directions
-        (3, m): direction of the beam of each sub-ray.
+        (3, m): direction of each sub-ray's beam.
     subray
-        (m,): number of each sub-ray within its beam.
+        (m,): index of each sub-ray within its beam.
     offsets
-        (2, m): angles across and up, radians, added to the angles of each sub-ray; or None.
+        (2, m): angles across and up, in radians, that are added to the angles of each sub-ray. None
+        for no offsets.
 
     Returns
     -------
     directions
         (3, m), unit vectors.
     starts
-        (3, m), meters; None if sub-rays start at the beam's origin.
+        (3, m), in meters. None if sub-rays start at the beam origin.
     """
     forward, across, up = sub_rays.components(subray, offsets)
     axis = sub_rays.axis
@@ -106,7 +107,10 @@ def sub_ray_directions(
 
 
 def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Return two axes across unit directions (3, n), by Duff et al. 2017: defined everywhere."""
+    """Return two axes (3, n) each that are perpendicular to unit directions (3, n).
+
+    The method of Duff et al. (2017) works for all directions.
+    """
     x, y, z = directions
     sign = np.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
@@ -116,9 +120,10 @@ def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
 
 
 def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Return axes across unit directions (3, n): counter-clockwise about an axis, and upward.
+    """Return two axes perpendicular to unit directions (3, n), oriented by an axis (3,).
 
-    For directions parallel to the axis (3,), the two are the axes of `perpendicular_axes`.
+    The first one points counterclockwise about the axis and the second one upward along it. For
+    directions parallel to the axis, they are the axes of `perpendicular_axes`.
     """
     x, y, z = directions
     a, b, c = axis

@@ -1,7 +1,7 @@
-"""The loops that cast scans, and rays at moving bodies, tile by tile, with hits in ray order.
+"""Compiled loops that cast scans, and rays at moving bodies, tile by tile.
 
-tile_plan.py says which rays form tiles. The hits of a call go to memory by their numbers; then they
-are written in the order of rays.
+tile_plan.py determines which rays form a tile. The hits of a call are first stored by ray index and
+then written to the output in ray order.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .moving_loops import (
     PADS_M,
     PAIRS,
     box_corners,
-    passes_box,
+    intersects_box,
     pose_rotation,
     to_body_axes,
 )
@@ -35,15 +35,15 @@ from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, T, field_index, row_inde
 from .tile_sizes import SUBTILES
 
 _T_MIN = field_index("t_min")
-_TILE_RAYS = 8 * SUBTILES  # rays per tile of rays at bodies
+_TILE_RAYS = 8 * SUBTILES  # rays per tile if rays are cast at bodies
 
 
 @stage
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
-    """Write the numbers of a tile's rays, and return whether it has one of the `count` rays.
+    """Write the ray indices of a tile, and return whether any of them belongs to the call.
 
-    `first` is added to the numbers at the address `lanes`. A number below 0 or from `count` on
-    belongs to a ray that is cast with the tile, for nothing.
+    The indices are `first` plus the numbers at the address `lanes`. An index below 0, or not below
+    `count`, belongs to a ray that is cast with the tile but ignored.
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)
@@ -58,7 +58,10 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
 
 @stage
 def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
-    """Write reaches and no hits to the rays of a tile, with reach -1 for rays outside the call."""
+    """Clear the hits of a tile, and set the maximum distance of each ray.
+
+    The maximum distance is -1 for rays that do not belong to the call.
+    """
     floats = float64s(tile)
     numbers = int64s(tile)
     t_at = row_index(T, rays)
@@ -74,7 +77,10 @@ def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
 
 @stage
 def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
-    """Write the hits of a tile to the memory of the call's `count` rays, others to its last row."""
+    """Store the hits of a tile in the scratch memory of a call with `count` rays.
+
+    Hits of rays that do not belong to the call go to an additional last row.
+    """
     floats = float64s(tile)
     numbers = int64s(tile)
     distances = float64s(hits)
@@ -91,7 +97,10 @@ def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Cast rays `start` to `stop` of a `CAST`, write hits in ray order, return their number."""
+    """Cast rays `start` to `stop` of a `CAST`, and return the number of hits.
+
+    The hits are written to the outputs of the `CAST` in ray order.
+    """
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -112,7 +121,7 @@ def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0
     instance_out = int32s(cast.instance)
     if cast.shares_origin != 0:
         write_shared_origin(cast, tile, rays)
-    lead = (cast.first + start) % firing  # the call may start within a firing
+    lead = (cast.first + start) % firing  # rays of the first firing that precede the call
     firing_count = -(-(count + lead) // firing)
     max_shift = np.int64(0)
     for group in range(cast.groups):
@@ -145,10 +154,10 @@ def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0
 
 @inlined
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
-    """Write a ray to a lane of a tile, in local coordinates, and return its direction's length.
+    """Write a ray to a lane of a tile in local coordinates, and return the length of its direction.
 
-    `origin`, meters, and `direction` are in the axes of the body. The length is 1 but for a sensor
-    that turns during a pose.
+    `origin`, in meters, and `direction` are in the frame of the body. The length differs from 1
+    only if the sensor rotates while the rays of a pose are fired.
     """
     scale = cast.scale
     center = cast.center
@@ -176,9 +185,10 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 @inlined
 def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
-    """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays.
+    """Fill the lanes of a tile after the first `filled` rays with copies of the first ray.
 
-    Their reach is -1. All rays have no hits.
+    The maximum distance of the copies is -1, so that they are not cast. The hits of all rays are
+    cleared.
     """
     floats = float64s(tile)
     numbers = int64s(tile)
@@ -195,7 +205,7 @@ def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
 
 @inlined
 def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the hits of a tile's first `filled` rays to a `NearestHits`, where they are nearer."""
+    """Record the hits of a tile's first `filled` rays in a `NearestHits`, where they are closer."""
     numbers = int64s(cast.tile)
     floats = float64s(cast.tile)
     index = int32s(cast.index)
@@ -227,9 +237,10 @@ def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  
 
 @compiled(types.void(memory.CASTS, PAIRS, NEAREST_HITS))
 def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Cast the pairs of a `RayBodyPairs` with a `CAST`, and write nearer hits to a `NearestHits`.
+    """Cast pairs of rays and bodies with a `CAST`, and record closer hits in a `NearestHits`.
 
-    A pair whose ray misses the body's box, or ends before the box, takes no lane of a tile.
+    If a ray misses the bounding box of the body, or ends in front of it, the pair does not occupy a
+    lane of a tile.
     """
     cast = casts[0]
     tile = cast.tile
@@ -257,7 +268,7 @@ def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: 
             z = rays[2, k] - poses[2, p]
             origin = to_body_axes(rotation, x, y, z)
             direction = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
-            if passes_box(corners, PADS_M, nearest.distance[k], origin, direction):
+            if intersects_box(corners, PADS_M, nearest.distance[k], origin, direction):
                 norm = _write_ray(cast, floats, filled, origin, direction)
                 floats[norm_at + filled] = norm
                 reach = nearest.distance[k] * norm * cast.scale * (1 + 2.0**-40)
@@ -271,5 +282,5 @@ def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: 
             _write_hits(cast, pairs, nearest, filled)
 
 
-# Whether this process compiled the loops; otherwise numba loaded the code of an earlier process.
+# Whether this process compiled the loops. Otherwise, numba loaded them from its cache.
 COMPILED = bool(cast_rays.stats.cache_misses)

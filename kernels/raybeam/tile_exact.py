@@ -1,4 +1,4 @@
-"""The test of triangle.py for rays of a tile, one or four at a time, in float64."""
+"""The intersection test of triangle.py in float64, for one or four rays of a tile."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ _NESTED = field_index("nested")
 
 @called_by_address(types.void(*3 * INT64))
 def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the shear of rays, and the common longest axis of each eight rays, -1 if they differ.
+    """Write the shear of all rays of a tile.
 
-    `first_row` is the first of six rows with origins and directions.
+    Also write the longest axis that each group of eight rays has in common, or -1 if their longest
+    axes differ. `first_row` is the first of six rows with origins and directions.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -94,7 +95,7 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
 
 @inlined
 def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
-    """Return the shear of a ray without the axis: 6 numbers."""
+    """Return the sheared coordinates of a ray as six numbers, without the axis."""
     k = row_index(U, rays) + ray
     return (
         floats[k],
@@ -108,10 +109,10 @@ def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
 
 @stage
 def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test a ray and a triangle in float64, keep a closer hit, and return whether it is kept.
+    """Test a ray against a triangle in float64, and return whether it is a closer hit.
 
-    `instance` is the instance's number times `KEYS_PER_INSTANCE`, `position` of the triangle in
-    leaf order.
+    A closer hit is recorded in the tile. `instance` is the index of the instance times
+    `KEYS_PER_INSTANCE`, and `position` is the position of the triangle in leaf order.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -156,10 +157,11 @@ def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no
 
 @inlined
 def intersect_four_rays(tile, rays, ray, axis, corners, position, key):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test four rays from a number on as `intersect_ray`, and return the mask of rays that hit.
+    """Test four consecutive rays against a triangle, and return the mask of rays with closer hits.
 
-    The rays have the longest axis `axis`, and the mesh has no mask. `corners` points to the corners
-    of the mesh in leaf order, `key` is of the triangle.
+    The rays must have the same longest axis `axis`, and the mesh must not have a mask. `corners`
+    points to the corners of the mesh in leaf order, and `key` is the key of the triangle. Hits are
+    recorded as in `intersect_ray`.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -192,7 +194,7 @@ def intersect_four_rays(tile, rays, ray, axis, corners, position, key):  # type:
     zero = splat(0.0)
     t_at = row_index(T, rays) + ray
     nearest = load(floats, t_at)
-    # Where det is 0, all areas are 0, so t is NaN and not at least t_min.
+    # If all areas have the same sign and det is 0, all areas are 0, so t is NaN and fails the test.
     hit = greater_equal(minimum(minimum(a, b), c), zero) | greater_equal(
         zero, maximum(maximum(a, b), c)
     )

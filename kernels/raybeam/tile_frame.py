@@ -1,8 +1,8 @@
-"""A tile's axes, and its rays, sides and depths in them.
+"""The coordinate system of a tile, and its rays, sides and depths in this system.
 
-A ray becomes a point (su, sv) of a plane across the tile's mean direction m: its direction is (su,
-sv, 1) in the axes (u, v, m), divided by the component along m. tile_loops.py describes the margins
-and the parameters.
+A ray becomes a point (su, sv) on a plane perpendicular to the tile's mean direction m. In the axes
+(u, v, m), the direction of the ray is (su, sv, 1), scaled so that its component along m is 1.
+tile_loops.py describes the margins and the parameters.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _UNIT = 2.0**-24
 _SIDE = np.float32(64 * _UNIT)
 _REACH_FACTOR = np.float32(1 + 2.0**-19)
 _REACH_MARGIN = np.float32(2.0**-19)
-_NARROW = np.float32(0.6)  # least cosine between m and a ray of a tile
-_MAX_START = 64.0  # local: rays that start farther away are cast one by one, from the scene's box
+_NARROW = np.float32(0.6)  # minimum cosine of the angle between m and the rays of a tile
+_MAX_START = 64.0  # Rays that start farther away, in local units, are cast one by one.
 
 
 @inlined
 def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Return the scalar products of vectors, by components."""
+    """Return the dot products of vectors, given by their components."""
     return multiply_add(ax, bx, multiply_add(ay, by, az * bz))
 
 
 @inlined
 def cross(a, b):  # type: ignore[no-untyped-def]
-    """Return the cross products of vectors, by components."""
+    """Return the cross products of vectors, given by their components."""
     ax, ay, az = a
     bx, by, bz = b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -66,7 +66,7 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 
 @inlined
 def tile_axes(singles):  # type: ignore[no-untyped-def]
-    """Return the tile's axes u, v, m as vectors of equal numbers: three components each."""
+    """Return the axes u, v, m of the tile, each as three vectors of equal numbers."""
     k = _AXES
     u = splat(singles[k]), splat(singles[k + 1]), splat(singles[k + 2])
     v = splat(singles[k + 3]), splat(singles[k + 4]), splat(singles[k + 5])
@@ -87,13 +87,13 @@ def to_tile_axes(axes, x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _load_eight(floats, k):  # type: ignore[no-untyped-def]
-    """Return eight float64 as float32."""
+    """Return eight float64 numbers, starting at index `k`, as float32."""
     return to_float32(load(floats, k), load(floats, k + 4))
 
 
 @stage
-def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
-    """Write the axes of a tile and their starting point, and return its largest coordinate.
+def _write_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
+    """Write the axes of a tile and its point, and return the largest coordinate of the point.
 
     `first_row` is the first of six rows with origins and directions.
     """
@@ -111,7 +111,8 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
     x = np.float64(singles[_AXES + 6])
     y = np.float64(singles[_AXES + 7])
     z = np.float64(singles[_AXES + 8])
-    start = _set_frame(singles, x, y, z)
+    _set_frame(singles, x, y, z)
+    start = 0.0
     for axis in range(3):
         origin = row_index(first_row + axis, rays)
         o = 0.5 * floats[origin] + 0.5 * floats[origin + rays - 1]
@@ -122,7 +123,7 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
-    """Write the three axes about a direction of any length but zero, and return 0."""
+    """Write three orthonormal axes, of which the last one has a given direction."""
     norm = 1 / np.sqrt((x * x + y * y) + z * z)
     x *= norm
     y *= norm
@@ -143,15 +144,16 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
     singles[_AXES + 6] = np.float32(x)
     singles[_AXES + 7] = np.float32(y)
     singles[_AXES + 8] = np.float32(z)
-    return 0.0
 
 
 @stage
 def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write su, sv and the depths of a tile's rays, with bounds, and return the least cosine to m.
+    """Write su, sv and the depths of a tile's rays, with their bounds.
 
-    `offset` becomes the maximum, over all rays, of the distance across m between the ray and the
-    ray with the same (su, sv) from the tile's point, and of the distance along m.
+    Return the smallest cosine of the angle between a ray and the axis m. The field `offset` is also
+    written. To compute it, each ray is compared with the ray that has the same (su, sv) but starts
+    at the tile's point. The offset is the maximum, over all rays, of the distance between these two
+    rays across m plus the distance between their origins along m.
     """
     singles = float32s(tile)
     floats = float64s(tile)
@@ -217,7 +219,7 @@ def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noq
 
 @stage
 def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the sides of the tile and of its subtiles, with margins, and the padding of depths."""
+    """Write the sides of the tile and of its subtiles, with margins, and the margin of depths."""
     singles = float32s(tile)
     numbers = int64s(tile)
     u, v, m = tile_axes(singles)
@@ -269,7 +271,7 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
         singles[k + 1] = y1
         singles[k + 2] = z1
         singles[k + 3] = min_lane(constant)
-        far = plane < 4  # the farthest corner of a box counts for a side, the nearest for the depth
+        far = plane < 4  # A side needs the farthest corner of a box, and the depth the nearest.
         numbers[_SIDES + 3 * plane] = 24 if (x1 >= 0) == far else 0
         numbers[_SIDES + 3 * plane + 1] = 32 if (y1 >= 0) == far else 8
         numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
@@ -277,9 +279,9 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
 
 @called_by_address(types.float32(*3 * INT64))
 def update_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the greatest depth, rounded up, of the rays of subtiles (a mask), and of each subtile.
+    """Update the maximum depths of subtiles, and return the maximum depth of the tile.
 
-    Returns the greatest depth of all subtiles.
+    `subtiles` is the mask of the subtiles to update. Depths are rounded up.
     """
     singles = float32s(tile)
     floats = float64s(tile)
@@ -309,12 +311,13 @@ def update_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa
 
 @called_by_address(types.int64(*4 * INT64))
 def prepare_tile(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
-    """Prepare a tile for a traversal in its rays' coordinates, and return whether it is narrow.
+    """Compute the coordinate system of a tile and its rays in it, and return whether it is usable.
 
-    `first_row` is the first of six rows with origins and directions, `mask` of subtiles to cast.
+    A tile is not usable if its rays diverge too much or start too far away. `first_row` is the
+    first of six rows with origins and directions, and `mask` contains the subtiles to cast.
     """
     singles = float32s(tile)
-    if _set_axes(tile, rays, first_row) > _MAX_START:
+    if _write_axes(tile, rays, first_row) > _MAX_START:
         return False
     if not _project_rays(tile, rays, first_row) > _NARROW:
         return False

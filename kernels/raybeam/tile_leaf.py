@@ -1,8 +1,10 @@
-"""Which triangles of a leaf a tile's rays may hit, in float32, and which they do hit.
+"""Intersection of a tile's rays with the triangles of a leaf.
 
-A triangle is three linear functions of (su, sv), prepared for eight triangles of a leaf at a time.
-The maximum of each over a range of (su, sv) discards the triangle for a tile or a subtile, and a
-test of eight rays is six multiply-adds and a comparison with the depth so far.
+In the coordinates of a tile, a triangle consists of three linear functions of (su, sv), which are
+computed for the eight triangles of a leaf at a time. If the maximum of one of these functions over
+a range of (su, sv) is negative, the triangle is discarded for a tile or a subtile. The float32 test
+for eight rays takes six multiply-adds and a comparison with the depth so far. The remaining
+candidates are tested in float64.
 """
 
 from __future__ import annotations
@@ -62,7 +64,10 @@ LEAF_MASK = (1 << LEAF_BITS) - 1
 
 @inlined
 def _leaf_edges(singles, blocks, block):  # type: ignore[no-untyped-def]
-    """Return the first corners of a leaf, from the tile's point, and edges: in the tile's axes."""
+    """Return the first vertices of a leaf's triangles, relative to the tile's point, and two edges.
+
+    All vectors are in the axes of the tile.
+    """
     axes = tile_axes(singles)
     x = load(blocks, block) - splat(singles[_AXES + 9])
     y = load(blocks, block + 8) - splat(singles[_AXES + 10])
@@ -79,12 +84,12 @@ def _leaf_edges(singles, blocks, block):  # type: ignore[no-untyped-def]
 
 @inlined
 def l1_norm(a):  # type: ignore[no-untyped-def]
-    """Return the sums of the sizes of the components of vectors."""
+    """Return the sum of the absolute values of the components of vectors."""
     return (absolute(a[0]) + absolute(a[1])) + absolute(a[2])
 
 
 @inlined
-def _maximum(normal, bounds):  # type: ignore[no-untyped-def]
+def _max_over_bounds(normal, bounds):  # type: ignore[no-untyped-def]
     """Return the maximum of a linear function over ranges of (su, sv)."""
     nu, nv, nm = normal
     low_u, high_u, low_v, high_v = bounds
@@ -98,10 +103,11 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*6 * INT64, types.float32))
 def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test the triangles of a leaf and the rays of a mask of subtiles, return subtiles with hits.
+    """Test the rays of a mask of subtiles against the triangles of a leaf.
 
-    `code` is of the leaf, `deepest` the greatest depth that a ray reaches, `instance` the number
-    of the instance times `KEYS_PER_INSTANCE`.
+    Return the mask of subtiles with closer hits. `code` is the code of the leaf, `deepest` is the
+    maximum depth that a ray reaches, and `instance` is the index of the instance times
+    `KEYS_PER_INSTANCE`.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
@@ -122,7 +128,7 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
     margin = multiply_add(offset, size, rounding)
     volume_margin = multiply_add(rounding, size, multiply_add(offset, l1_norm(n), floor))
     undecided = greater_equal(volume_margin, absolute(volume))
-    sign = copy_sign(splat(ONE), volume)  # so that rays ahead see positive areas
+    sign = copy_sign(splat(ONE), volume)  # so that areas are positive for rays in front
     n1 = n1[0] * sign, n1[1] * sign, n1[2] * sign
     n2 = n2[0] * sign, n2[1] * sign, n2[2] * sign
     n = n[0] * sign, n[1] * sign, n[2] * sign
@@ -136,7 +142,10 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         splat(singles[k + 2]),
         splat(singles[k + 3]),
     )
-    least = minimum(minimum(_maximum(n0, bounds), _maximum(n1, bounds)), _maximum(n2, bounds))
+    least = minimum(
+        minimum(_max_over_bounds(n0, bounds), _max_over_bounds(n1, bounds)),
+        _max_over_bounds(n2, bounds),
+    )
     hit = greater_equal(least + margin, zero) | undecided
     hit &= greater_equal(splat(deepest), depth) & ((2 << (code & LEAF_MASK)) - 1)
     if hit == 0:
@@ -153,8 +162,9 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
     store(singles, k + 24, rounding * splat(np.float32(4)))
     first = np.int64(int32s(record[BLOCKS])[block + 72])
     corners = float64s(record[LEAF_CORNERS])
-    # Three loops over lists, not one nest with branches: a branch that is mispredicted costs as
-    # much as the test of 24 rays. First, pairs of a triangle and a subtile.
+    # Three loops over lists are faster than nested loops with branches, because a mispredicted
+    # branch costs as much as the test of 24 rays. The first loop lists pairs of a triangle and a
+    # subtile.
     bounds = (
         load(singles, _BOUNDS),
         load(singles, _BOUNDS + SUBTILES),
@@ -169,10 +179,10 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         k = _EDGES + lane
         least = minimum(
             minimum(
-                _maximum(_splat_three(singles, k), bounds),
-                _maximum(_splat_three(singles, k + 24), bounds),
+                _max_over_bounds(_splat_three(singles, k), bounds),
+                _max_over_bounds(_splat_three(singles, k + 24), bounds),
             ),
-            _maximum(_splat_three(singles, k + 48), bounds),
+            _max_over_bounds(_splat_three(singles, k + 48), bounds),
         )
         chosen = greater_equal(least + splat(singles[k + 72]), zero) | -((undecided >> lane) & 1)
         chosen &= mask & greater_equal(reach, splat(singles[k + 88]))
@@ -182,7 +192,7 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         pair_count += bit_count(chosen)
         prefetch(corners, 9 * (first + lane))
         prefetch(corners, 9 * (first + lane) + 8)
-    # Then halves of vectors whose rays may hit the triangle.
+    # The second loop lists groups of four rays that may hit a triangle.
     su_at = 2 * row_index(memory.SU, rays)
     sv_at = 2 * row_index(memory.SV, rays)
     depth_at = 2 * row_index(memory.DEPTH, rays)
@@ -214,7 +224,7 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
             survivor_count += np.int64((passing & 15) != 0)
             numbers[survivors + survivor_count] = (i + 4) << 8 | triangle << 4 | passing >> 4
             survivor_count += np.int64(passing > 15)
-    # Last, the test in float64 of these.
+    # The third loop tests these rays in float64.
     eight_at = row_index(memory.AXIS_OF_EIGHT, rays)
     order = int32s(record[ORDER])
     opaque = record[MASK_HEIGHT] == 0

@@ -1,6 +1,8 @@
-"""A tile's way down a tree: eight children of a node, then eight subtiles, at a time.
+"""Traversal of a tree by a tile of rays.
 
-A box is outside the tile if it is outside one of its four sides, and outside a subtile likewise.
+For each node, the boxes of its eight children are tested against the tile, and those that remain
+are tested against the eight subtiles at once. A box is outside the tile or a subtile if it is
+outside one of its four sides.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ _MET = field_index("met")
 
 @inlined
 def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
-    """Write entry k of a list: depth, code and mask of subtiles."""
+    """Write entry `k` of a list: the depth, the code, and the mask of subtiles."""
     stack[ENTRY * k] = near
     codes[ENTRY * k + 1] = np.int32(code)
     codes[ENTRY * k + 2] = np.int32(mask)
@@ -48,7 +50,10 @@ def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-d
 
 @inlined
 def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
-    """Sort entries `start` to `stop` of a list at an address, the nearest last."""
+    """Sort entries `start` to `stop` of a list so that the closest entry is last.
+
+    `address` is the address of the list.
+    """
     stack = float32s(address)
     codes = int32s(address)
     for k in range(start + 1, stop):
@@ -66,9 +71,9 @@ def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
 
 @inlined
 def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Add the children of a node that the tile meets to the waiting ones, nearest last.
+    """Push the children of a node that the tile may intersect, the closest last.
 
-    There were `count` of them; returns how many there are. `nodes` and `blocks` are addresses.
+    The stack has `count` entries. Return its new size. `nodes` and `blocks` are addresses.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
@@ -123,7 +128,7 @@ def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ig
         subtiles = mask & greater_equal(inside, zero) & greater_equal(reach, splat(near))
         code = np.int64(children[k + 48])
         write_entry(stack, codes, count, near, code, subtiles)
-        count += np.int64(subtiles != 0)  # no branch: it would often be mispredicted
+        count += np.int64(subtiles != 0)  # without a branch, which would often be mispredicted
         leaf = blocks + 4 * BLOCK * (~code >> LEAF_BITS)
         line = uint8s(nodes + 4 * NODE * code if code >= 0 else leaf)
         for byte in range(0, 4 * BLOCK, 64):
@@ -134,7 +139,7 @@ def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ig
 
 @stage
 def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
-    """Return the mask of the subtiles that reach one of the first `count` waiting nodes."""
+    """Return the mask of the subtiles that reach one of the first `count` pending nodes."""
     reach = load(float32s(tile), _REACH)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
@@ -147,10 +152,10 @@ def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*5 * INT64))
 def walk_tile(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of a mask of subtiles in a mesh, and return the mask of unfinished subtiles.
+    """Cast the rays of a mask of subtiles at a mesh, and return the mask of unfinished subtiles.
 
-    The walk ends early if the tile meets more leaves than it has rays: then the subtiles that may
-    meet a node that still waits are unfinished.
+    The traversal stops if the tile visits more leaves than it has rays. In this case, the subtiles
+    that may intersect a pending node are unfinished.
     """
     singles = float32s(tile)
     address = int64s(tile)[_STACK]
@@ -185,9 +190,9 @@ def walk_tile(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*3 * INT64))
 def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
-    """Write the instances that a tile may meet, nearest last, and return their number.
+    """List the instances that a tile may hit, the closest last, and return their number.
 
-    `nodes` is the address of the tree over the instances, `mask` of the subtiles to cast.
+    `nodes` is the address of the instance tree, and `mask` contains the subtiles to cast.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
