@@ -158,7 +158,7 @@ class SceneCaster:
         return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
-        """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
+        """Return the counter table for `RayCaster.scan_on_device`, and the number of counters.
 
         The table is int64 (bodies, 2): a hit of triangle t of body i counts in the counter
         ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the
