@@ -74,8 +74,8 @@ class TimedBodies(NamedTuple):
         float64 (t, b, 12): position in meters, and rotation matrix from the body frame, row by row.
         NaN while a body is absent.
     boxes
-        float64 (t / SPAN, b, 6): lower and upper corner, in meters, of a box that encloses the body
-        at `SPAN` consecutive times.
+        float64 (t / TIMES_PER_BOX, b, 6): lower and upper corner, in meters, of a box that encloses
+        the body at `TIMES_PER_BOX` consecutive times.
     first_time
         Index of the first of the t times among all ray times.
     limits
@@ -89,7 +89,8 @@ class TimedBodies(NamedTuple):
     limits: tuple[float, float]
 
 
-SPAN = 32  # number of times that a box in `TimedBodies` covers; intersect.cu has the same value
+# Number of times that a box in `TimedBodies` covers; intersect.cu has the same value.
+TIMES_PER_BOX = 32
 
 
 class BodyHits(NamedTuple):

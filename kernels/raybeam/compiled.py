@@ -149,8 +149,8 @@ def _compile_lock(folder: str) -> Iterator[None]:
 def _log_if_slow(seconds: float) -> None:
     """Add the time that a loop took, and log once that loops are being compiled.
 
-    Loops are compiled one after the other when modules are imported. If compilation takes more than
-    a second, many loops are affected.
+    Loops are compiled one after the other when modules are imported. If they take more than a
+    second in total, many of them are being compiled, so a message is helpful.
     """
     if not _is_compiling[0]:
         return

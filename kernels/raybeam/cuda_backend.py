@@ -493,8 +493,8 @@ class CudaBackend(Backend):
         offsets = np.cumsum(kept_counts) - kept_counts
         starts = np.append(0, chunk.later_starts)
         table = np.minimum([starts, cuts[:-1] + first_kept, offsets], _MAX_INT)
-        kinds = (np.uint32, np.float64, np.int32, np.int32)
-        packed = tuple(cp.empty(int(kept_counts.sum()), kind) for kind in kinds)
+        dtypes = (np.uint32, np.float64, np.int32, np.int32)
+        packed = tuple(cp.empty(int(kept_counts.sum()), dtype) for dtype in dtypes)
         self._run(
             "pack",
             n,

@@ -139,7 +139,7 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
     """Cast pairs of rays and bodies at a deforming mesh, and record closer hits in `nearest`.
 
     Each ray hits the mesh in its shape at the frame number `RayBodyPairs.frame`. Nodes are visited
-    from near to far. `waits` contains the entry distances of the nodes on the stack.
+    from near to far. `stack_distances` contains the entry distances of the nodes on the stack.
     """
     rays = pairs.rays
     poses = pairs.poses
@@ -147,8 +147,8 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
     vertices, faces, order, child, boxes = tree
     distance, bodies, instance, triangle = nearest
     stack = np.empty(_STACK, np.int64)
-    waits = np.empty(_STACK)
-    enters = np.empty(WIDTH)
+    stack_distances = np.empty(_STACK)
+    child_distances = np.empty(WIDTH)
     t_min, t_max = pairs.limits
     last = np.int64(len(vertices) - 2)
     for n in range(len(body)):
@@ -172,27 +172,29 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
         hit_triangle = np.int64(-1)
         top = 1
         stack[0] = 0
-        waits[0] = 0.0
+        stack_distances[0] = 0.0
         while top:
             top -= 1
             node = stack[top]
-            if waits[top] > best:
+            if stack_distances[top] > best:
                 continue
-            _entry_distances(frame_boxes + _BOX * node, origin, inverse, best, enters.ctypes.data)
+            _entry_distances(
+                frame_boxes + _BOX * node, origin, inverse, best, child_distances.ctypes.data
+            )
             bottom = top
             for slot in range(WIDTH):
                 code = np.int64(child[node, slot])
-                enter = enters[slot]
-                if code == 0 or enter > best:
+                distance_to_child = child_distances[slot]
+                if code == 0 or distance_to_child > best:
                     continue
                 if code > 0:  # Insert the node so that the nearest one is on top.
                     position = top
-                    while position > bottom and waits[position - 1] < enter:
+                    while position > bottom and stack_distances[position - 1] < distance_to_child:
                         stack[position] = stack[position - 1]
-                        waits[position] = waits[position - 1]
+                        stack_distances[position] = stack_distances[position - 1]
                         position -= 1
                     stack[position] = code
-                    waits[position] = enter
+                    stack_distances[position] = distance_to_child
                     top += 1
                     continue
                 first = ~code >> LEAF_BITS

@@ -147,22 +147,22 @@ class _Pinned:
 _pinned = _Pinned()
 
 
-def pinned_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
+def pinned_array(cupy: Any, count: int, dtype: DTypeLike) -> AnyArray:
     """Return an array (count,) in page-locked memory, to which the device can write directly.
 
     The memory returns to CuPy's pool when the last view of the array is released. If `PINNED_BYTES`
     are in use, the array is in ordinary memory instead. Copies to ordinary memory are slower, but
     page-locked memory is not available to other processes on the machine.
     """
-    size = max(count * np.dtype(kind).itemsize, 1)
+    size = max(count * np.dtype(dtype).itemsize, 1)
     if not _pinned.reserve(size):
-        return np.empty(count, kind)
+        return np.empty(count, dtype)
     try:
         memory = cupy.cuda.alloc_pinned_memory(size)
     except BaseException:
         _pinned.release(size)
         raise
-    array = np.frombuffer(memory, kind, count)
+    array = np.frombuffer(memory, dtype, count)
     weakref.finalize(array, _pinned.release, size)  # views of the array keep the array
     return array
 
@@ -244,8 +244,8 @@ class HitTransfer:
 
     def __init__(self, cupy: Any, max_hits: int, *, nested: bool) -> None:
         self._outbox = CopyQueue(cupy)
-        kinds = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
-        self._arrays = [pinned_array(cupy, max_hits, kind) for kind in kinds]
+        dtypes = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
+        self._arrays = [pinned_array(cupy, max_hits, dtype) for dtype in dtypes]
         self._max_hits = max_hits
         self._count = 0
 

@@ -67,10 +67,10 @@ typedef long long Count;
 #define DONE ((int)0x80000000)
 #define TINY 8.673617379884035e-19  // 2^-60: replaces zero components of directions
 #define SLACK 9.5367431640625e-07f  // 2^-20: margin of limits in float, exceeds their rounding errors
-#define ACROSS 4.0                  // more than the diagonal of a box (see mesh.py)
+#define MAX_DIAGONAL 4.0            // more than the diagonal of a box (see mesh.py)
 #define RECORD 20                   // doubles per instance
 #define MISSED 1e30f                // distance of a box that the ray does not intersect
-#define SPAN 32                     // number of times that the box of a moving body covers
+#define TIMES_PER_BOX 32            // number of times that the box of a moving body covers
 #define UNIT_SLACK 1e-14            // as in rays.py
 
 struct Scene {
@@ -346,7 +346,7 @@ struct Walk {
 __device__ __forceinline__ float limit(double t, double entry)
 {
     const double left = (t - entry) * (1.0 + SLACK) + SLACK;
-    return (float)(left < ACROSS ? left : ACROSS);
+    return (float)(left < MAX_DIAGONAL ? left : MAX_DIAGONAL);
 }
 
 // Clip [entry, leave] to the part of the ray between two planes.
@@ -402,7 +402,7 @@ __device__ __forceinline__ bool begin(
     w.nx = w.ix < 0.0f ? 3u : 0u;
     w.ny = w.iy < 0.0f ? 4u : 1u;
     w.nz = w.iz < 0.0f ? 5u : 2u;
-    w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -ACROSS);
+    w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -MAX_DIAGONAL);
     w.to = limit(t_max, entry);
     return true;
 }
@@ -694,8 +694,8 @@ KERNEL cast_table(
 // Cast rays at moving bodies that have the shape of the scene, and record closer hits, as `cast_pairs` in
 // body_rays.py does. Ray i is fired at the time index t = when[i] - first_time. If 0 <= t < times, the
 // pose of body k at this time is row t * body_count + k of `poses`, with 12 doubles per row. It starts
-// with NaN while the body is absent. Each of the `boxes` encloses a body during SPAN times and consists
-// of a lower and an upper corner. The arrays `nearest_...` are read and written.
+// with NaN while the body is absent. Each of the `boxes` encloses a body during TIMES_PER_BOX times and
+// consists of a lower and an upper corner. The arrays `nearest_...` are read and written.
 KERNEL cast_bodies(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -718,7 +718,7 @@ KERNEL cast_bodies(
                          masks, opacity,   frame,   top,   instances};
 #pragma unroll 1
     for (int k = 0; k < body_count; ++k) {
-        const double* low = boxes + 6 * ((Count)(time / SPAN) * body_count + k);
+        const double* low = boxes + 6 * ((Count)(time / TIMES_PER_BOX) * body_count + k);
         double enters = 0.0, leaves = nearest_meters[i] * (1.0 + SLACK);
         for (int axis = 0; axis < 3; ++axis) {
             const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];

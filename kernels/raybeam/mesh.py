@@ -17,8 +17,8 @@ from .tree import PAD
 # is first advanced to the box, so that rounding errors depend on the size of the scene and not on
 # the distance to it. The box lies within [-1, 1] in local units, plus padding, so the distance from
 # the start to a hit is at most its diagonal, 2 * sqrt(3) * (1 + 2**-16) = 3.47. Limits in float32
-# are clipped to ACROSS.
-ACROSS = 4.0
+# are clipped to MAX_DIAGONAL.
+MAX_DIAGONAL = 4.0
 TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
 

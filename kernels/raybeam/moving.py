@@ -1,9 +1,9 @@
 """Casting rays at bodies that move while the rays are fired.
 
 No tree is rebuilt. On the CPU, consecutive rays, which are fired at almost the same time, form
-cells of `CELL` rays. First, the cone and the plane around the directions of each cell are compared
-with the bounding sphere of each body along its path. Then the rays of the remaining cells are
-compared with the bounding box of the body at its pose when the cell is fired. Finally, the
+cells of `CELL_RAYS` rays. First, the cone and the plane around the directions of each cell are
+compared with the bounding sphere of each body along its path. Then the rays of the remaining cells
+are compared with the bounding box of the body at its pose when the cell is fired. Finally, the
 remaining rays are transformed to the frame of the body at their own firing times and cast at its
 shape, at close bodies first. The comparisons are compiled loops (moving_loops.py). They are
 conservative, so they do not affect the hits.
@@ -26,7 +26,7 @@ import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints, Ints32
 from .backend import BackendUnavailable
-from .body_rays import SPAN, BodyHits, NearestHits, RayBodyPairs, TimedBodies
+from .body_rays import TIMES_PER_BOX, BodyHits, NearestHits, RayBodyPairs, TimedBodies
 from .caster import RayCaster
 from .deforming import DeformingMesh
 from .installation import install_command
@@ -127,7 +127,7 @@ def nearest_body_hits(
         raise BackendUnavailable(
             f"Moving bodies require numba. Install it with `{install_command('numba')}`."
         )
-    from . import moving_loops as loops  # numba takes half a second to import
+    from . import moving_loops as loops  # Importing numba takes half a second.
 
     end = _exclusive_limit(scan)
     nearest = NearestHits.empty(
@@ -174,7 +174,7 @@ def _hits_on_device(
     if not len(bodies):
         return
     limits = (scan.t_min, scan.t_max)
-    step = max(1, CHUNK_POSES // (SPAN * len(bodies))) * SPAN
+    step = max(1, CHUNK_POSES // (TIMES_PER_BOX * len(bodies))) * TIMES_PER_BOX
     shape = moving.shape[bodies]
     casters = {number: moving.shapes[number] for number in np.unique(shape).tolist()}
     for start, stop in scan.chunks(DEVICE_RAYS):
@@ -223,7 +223,7 @@ def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple
         table[:, rows] = moving.poses(body[rows], time[rows])
     corners = _bounding_boxes(moving, moving.shape[body], table)
     lower, upper = corners.reshape(2, 3, len(times), len(bodies))
-    spans = np.arange(0, len(times), SPAN)
+    spans = np.arange(0, len(times), TIMES_PER_BOX)
     boxes = [np.fmin.reduceat(lower, spans, axis=1), np.fmax.reduceat(upper, spans, axis=1)]
     poses = table.T.reshape(len(times), len(bodies), 12)
     return poses, np.moveaxis(np.concatenate(boxes), 0, -1)
@@ -276,8 +276,8 @@ def pair_cells_with_boxes(
     """
     from . import moving_loops as loops
 
-    cells = loops.make_cells(rays, times, loops.CELL)
-    wide_cells = loops.make_cells(rays, times, loops.CELL * loops.WIDE)
+    cells = loops.make_cells(rays, times, loops.CELL_RAYS)
+    wide_cells = loops.make_cells(rays, times, loops.CELL_RAYS * loops.CELLS_PER_WIDE_CELL)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
     spheres = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), presence])
     sample_of_cell = np.zeros((len(cells), 2), np.int64)
@@ -289,7 +289,7 @@ def pair_cells_with_boxes(
         cell, box = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         parts.append(np.stack([cell, box + first]))
     cell, box = np.concatenate(parts, axis=1)
-    return cell, box, loops.CELL
+    return cell, box, loops.CELL_RAYS
 
 
 class _CellPoses(NamedTuple):
@@ -361,16 +361,18 @@ class _Chunk:
         The hits on close bodies shorten the rays for the following bodies.
         """
         loops = self._loops
-        cells = loops.make_cells(self._rays, self._times, loops.CELL)
-        wide_cells = loops.make_cells(self._rays, self._times, loops.CELL * loops.WIDE)
+        cells = loops.make_cells(self._rays, self._times, loops.CELL_RAYS)
+        wide_cells = loops.make_cells(
+            self._rays, self._times, loops.CELL_RAYS * loops.CELLS_PER_WIDE_CELL
+        )
         samples = self._sample_bodies(bodies, cells)
-        centers = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
+        centers = samples.boxes[:, 0, :3] - cells[0, loops.CENTER : loops.CENTER + 3]
         order = np.argsort((centers**2).sum(axis=1), kind="stable")
         samples = samples._replace(boxes=samples.boxes[order], spheres=samples.spheres[order])
         reach = float(self._nearest.distance.max())
         cell, sampled_body = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         body = bodies[order][sampled_body]
-        spans = cells[:, loops.BEGIN : loops.END + 1]
+        spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
         for start in range(0, len(cell), CHUNK_PAIRS):
             pairs = slice(start, start + CHUNK_PAIRS)
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
@@ -379,7 +381,7 @@ class _Chunk:
         """Sample the boxes of bodies (b,) at regular time steps while cells (c, 15) are fired."""
         loops = self._loops
         moving = self._moving
-        spans = cells[:, loops.BEGIN : loops.END + 1]
+        spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
         first = spans[:, 0].min()
         last = spans[:, 1].max()
         steps = max(1, len(cells) // _CELLS_PER_SAMPLE)

@@ -17,8 +17,8 @@ from .body_rays import NearestHits, RayBodyPairs
 from .cast_record import float64s, int64s
 from .compiled import compiled, inlined, stage
 
-CELL = 64  # rays per cell
-WIDE = 16  # cells per wide cell
+CELL_RAYS = 64  # rays per cell
+CELLS_PER_WIDE_CELL = 16  # cells per wide cell
 # Margin around boxes, in addition to 2e-6 of the distance; exceeds all rounding errors.
 PADS_M = 1e-3
 # Columns of the table of cells: axis of the cone around the directions, and cosine and sine of its
@@ -28,10 +28,10 @@ PADS_M = 1e-3
 AXIS = 0
 COSINE = 3
 SINE = 4
-MIDDLE = 5
+CENTER = 5
 RADIUS = 8
-BEGIN = 9
-END = 10
+FIRST_TIME = 9
+LAST_TIME = 10
 NORMAL = 11
 MAX_SINE = 14
 _TINY = 1e-300
@@ -159,12 +159,12 @@ def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0
         cells[c, AXIS + 2] = az
         cells[c, COSINE] = cosine
         cells[c, SINE] = np.sqrt(1 - cosine * cosine)
-        cells[c, MIDDLE] = px
-        cells[c, MIDDLE + 1] = py
-        cells[c, MIDDLE + 2] = pz
+        cells[c, CENTER] = px
+        cells[c, CENTER + 1] = py
+        cells[c, CENTER + 2] = pz
         cells[c, RADIUS] = np.sqrt(max_squared)
-        cells[c, BEGIN] = first
-        cells[c, END] = last
+        cells[c, FIRST_TIME] = first
+        cells[c, LAST_TIME] = last
         cells[c, NORMAL] = nx
         cells[c, NORMAL + 1] = ny
         cells[c, NORMAL + 2] = nz
@@ -183,9 +183,9 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
     slack = sphere[1]
     first = sphere[2]
     last = sphere[3]
-    x = box[0] - cell[MIDDLE]
-    y = box[1] - cell[MIDDLE + 1]
-    z = box[2] - cell[MIDDLE + 2]
+    x = box[0] - cell[CENTER]
+    y = box[1] - cell[CENTER + 1]
+    z = box[2] - cell[CENTER + 2]
     nx = cell[NORMAL]
     ny = cell[NORMAL + 1]
     nz = cell[NORMAL + 2]
@@ -198,7 +198,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
     distance = np.sqrt(x * x + y * y + z * z)
     margin = slack + cell[RADIUS] + 1e-6 * distance
     radius = radius + margin
-    if distance - radius > reach or cell[END] < first or cell[BEGIN] > last:
+    if distance - radius > reach or cell[LAST_TIME] < first or cell[FIRST_TIME] > last:
         return False
     side = 0.0
     for k in range(3, 12, 3):
@@ -231,8 +231,8 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
         sphere = float64s(spheres.ctypes.data + 32 * b)
         body_boxes = box + 96 * boxes.shape[1] * b
         for w in range(len(wide_cells)):
-            begin = w * WIDE
-            end = min((w + 1) * WIDE, len(cells))
+            begin = w * CELLS_PER_WIDE_CELL
+            end = min((w + 1) * CELLS_PER_WIDE_CELL, len(cells))
             first = sample_of_cell[begin, 0]
             if sample_of_cell[end - 1, 1] - first <= 1:  # The slack covers one time step.
                 sampled_box = float64s(body_boxes + 96 * first)
@@ -258,8 +258,8 @@ def pair_cells_with_bodies(
     Parameters
     ----------
     wide_cells, cells
-        float64 (w, 15) and (c, 15), from `make_cells`: cells of `CELL * WIDE` rays and cells of
-        `CELL` rays. Most wide cells exclude all of their cells at once.
+        float64 (w, 15) and (c, 15), from `make_cells`: cells of `CELL_RAYS * CELLS_PER_WIDE_CELL`
+        rays and cells of `CELL_RAYS` rays. Most wide cells exclude all of their cells at once.
     samples
         The bodies.
     reach
@@ -353,13 +353,13 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
     """Write which rays of a cell intersect a sphere, and return their number.
 
     `rays` is the address of the first ray of the cell in a table (6, n). The output `near` is the
-    address of int64 (`CELL`,) and receives 0 or 1 for each ray. The center and the radius are in
-    meters.
+    address of int64 (`CELL_RAYS`,) and receives 0 or 1 for each ray. The center and the radius are
+    in meters.
     """
     ray = float64s(rays)
     is_near = int64s(near)
     near_count = np.int64(0)
-    for k in range(CELL):
+    for k in range(CELL_RAYS):
         u = x - ray[k]
         v = y - ray[n + k]
         w = z - ray[2 * n + k]
@@ -397,11 +397,11 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
     written = 0
     count = rays.shape[1]
     for pair in range(len(cell)):
-        begin = cell[pair] * CELL
-        end = min((cell[pair] + 1) * CELL, len(reaches))
+        begin = cell[pair] * CELL_RAYS
+        end = min((cell[pair] + 1) * CELL_RAYS, len(reaches))
         corners = box_corners(float64s(boxes.ctypes.data + 48 * shape[pair]))
         p = pose_of_pair[pair]
-        first = min(begin, count - CELL)
+        first = min(begin, count - CELL_RAYS)
         pose = (poses[0, p], poses[1, p], poses[2, p]), pose_rotation(poses, p)
         ray = rays.ctypes.data + 8 * first
         (x, y, z), radius = _bounding_sphere(corners, pose, pads[pair])
@@ -445,11 +445,11 @@ def rays_through_boxes(
     """
     cell = np.ascontiguousarray(pairs.cell)
     pairs = pairs._replace(cell=cell, shape=np.ascontiguousarray(pairs.shape))
-    ray_pairs = np.empty((2, len(cell) * CELL), np.int64)
-    if len(reaches) < CELL:  # The loop over a cell always processes `CELL` rays.
-        rays = np.concatenate([rays, np.zeros((6, CELL - len(reaches)))], axis=1)
+    ray_pairs = np.empty((2, len(cell) * CELL_RAYS), np.int64)
+    if len(reaches) < CELL_RAYS:  # The loop over a cell always processes `CELL_RAYS` rays.
+        rays = np.concatenate([rays, np.zeros((6, CELL_RAYS - len(reaches)))], axis=1)
         # Padding rays end at NaN, so they do not intersect any box.
-        reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
-    near = np.empty(CELL, np.int64)
+        reaches = np.concatenate([reaches, np.full(CELL_RAYS - len(reaches), np.nan)])
+    near = np.empty(CELL_RAYS, np.int64)
     count = _pair_rays(rays, reaches, pairs, poses, boxes, near=near, ray_pairs=ray_pairs)
     return ray_pairs[0, :count], ray_pairs[1, :count]

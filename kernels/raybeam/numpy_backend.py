@@ -21,7 +21,7 @@ from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, ClosestHits
 from .instances import LocalScene
-from .mesh import ACROSS, TINY, clip_to_box
+from .mesh import MAX_DIAGONAL, TINY, clip_to_box
 from .opacity import join_masks
 from .rays import Rays
 from .tree import LEAF_BITS, PAD, WideTree, build_instance_tree, build_tree, join_trees
@@ -408,4 +408,4 @@ def _packet(
 def _limit(t: Floats, entry: Floats) -> Floats32:
     """Return distances from `entry` as float32, never less than the exact distances."""
     remaining = (t - entry) * (1 + _SLACK) + _SLACK
-    return np.clip(remaining, -ACROSS, ACROSS).astype(np.float32)
+    return np.clip(remaining, -MAX_DIAGONAL, MAX_DIAGONAL).astype(np.float32)

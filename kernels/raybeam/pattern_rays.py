@@ -84,7 +84,7 @@ def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple
     """
     if not (_numba_is_installed() and len(ray)):
         return compute_rays_numpy(pattern, first, ray, poses)
-    from . import ray_loops  # numba takes half a second to import
+    from . import ray_loops  # Importing numba takes half a second.
 
     origins, directions = ray_loops.compute_rays_compiled(pattern, first, ray, poses)
     return (poses.positions if origins is None else origins.T), directions.T

@@ -19,7 +19,7 @@ from .cast_record import (
     int64s,
 )
 from .compiled import INT64, called_by_address, inlined, stage
-from .mesh import ACROSS
+from .mesh import MAX_DIAGONAL
 from .mesh_loops import to_mesh_coordinates
 from .ray_loops import entry_distance
 from .tile_exact import intersect_ray
@@ -125,7 +125,7 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
     """Return a distance from the entry as float32, never less than the exact distance."""
-    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -ACROSS), ACROSS))
+    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -MAX_DIAGONAL), MAX_DIAGONAL))
 
 
 @inlined
@@ -220,10 +220,10 @@ def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no
 
 
 @called_by_address(types.void(*7 * INT64))
-def walk_ray(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
+def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: ignore[no-untyped-def]
     """Cast a ray at a mesh.
 
-    `waiting` is the number of entries of the instance tree that are on the stack.
+    `pending` is the number of entries of the instance tree that are on the stack.
     """
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
@@ -235,9 +235,9 @@ def walk_ray(tile, rays, ray, first_row, mesh, instance, waiting):  # type: igno
     t_at = row_index(T, rays) + ray
     length = floats[row_index(LENGTH, rays) + ray]
     limit = _limit_of(floats[t_at] * length, entry)
-    write_entry(stack, codes, waiting, ZERO, 0, 0)
-    count = waiting + 1
-    while count > waiting:
+    write_entry(stack, codes, pending, ZERO, 0, 0)
+    count = pending + 1
+    while count > pending:
         count -= 1
         if stack[ENTRY * count] > limit:
             continue

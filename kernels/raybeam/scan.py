@@ -261,7 +261,7 @@ class HitCollector(HitGroups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add the hits of a chunk that are stored. The indices `ray` are relative to `start`."""
+        """Add the stored hits of a chunk, whose indices `ray` are relative to `start`."""
         ray_number = ray.astype(np.uint32, copy=False)
         ray_number = ray_number + np.uint32(start) if start else ray_number
         self._parts.append((ray_number, distance, triangle, instance))

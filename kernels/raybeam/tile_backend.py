@@ -63,7 +63,7 @@ class TileBackend(Backend):
         self._tiles = tile_memory.thread_tiles
         self._top_nodes = tile_tree.build_instance_nodes
         self._trees = [tile_tree.build_tile_tree(mesh.corners) for mesh in scene.meshes]
-        self._waiting = 2 + max(tree.stack for tree in self._trees)
+        self._pending_nodes = 2 + max(tree.stack for tree in self._trees)
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = self._mesh_records(scene)
         # The index of each triangle in the caller's `faces`, in the order of the corners of all
@@ -165,8 +165,8 @@ class TileBackend(Backend):
     def _tile_address(self, rays: int) -> int:
         """Return the address of this thread's tile memory for a number of rays."""
         nested = self._scene.nested
-        waiting = self._waiting + (self._top_stack if nested else 0)
-        return self._tiles.address(rays, waiting, len(self._scene.mesh) if nested else 0)
+        pending = self._pending_nodes + (self._top_stack if nested else 0)
+        return self._tiles.address(rays, pending, len(self._scene.mesh) if nested else 0)
 
     @staticmethod
     def _local_limits(limits: tuple[float, float], scale: float) -> tuple[float, float]:

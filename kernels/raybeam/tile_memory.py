@@ -85,24 +85,24 @@ class _ThreadTiles(threading.local):
     def __init__(self) -> None:
         self._size = (0, 0, 0)
 
-    def address(self, rays: int, waiting: int, instances: int) -> int:
+    def address(self, rays: int, pending: int, instances: int) -> int:
         """Return the address, a multiple of 64, of memory for a tile with a number of rays.
 
-        `waiting` is the maximum number of pending nodes, and `instances` is the number of
+        `pending` is the maximum number of pending nodes, and `instances` is the number of
         instances. The memory is allocated again if it is too small.
         """
-        size = (rays, waiting, instances)
+        size = (rays, pending, instances)
         if not all(map(operator.le, size, self._size)):
             self._size = tuple(map(max, size, self._size))  # type: ignore[assignment]
             self._allocate(*self._size)
         return self._address
 
-    def _allocate(self, rays: int, waiting: int, instances: int) -> None:
+    def _allocate(self, rays: int, pending: int, instances: int) -> None:
         tables = FIRST_ROW + ROWS * rays + 16
-        memory = np.zeros(tables + 2 * (waiting + instances) + 8, np.int64)
+        memory = np.zeros(tables + 2 * (pending + instances) + 8, np.int64)
         memory = memory[-memory.ctypes.data % 64 // 8 :]
         memory[field_index("stack")] = memory.ctypes.data + 8 * tables
-        memory[field_index("met")] = memory.ctypes.data + 8 * (tables + 2 * waiting)
+        memory[field_index("met")] = memory.ctypes.data + 8 * (tables + 2 * pending)
         bits = memory[field_index("bits") :][:256].view(np.uint8).reshape(256, 8)
         for mask in range(256):
             numbers = [bit for bit in range(8) if mask >> bit & 1]

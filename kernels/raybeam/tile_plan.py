@@ -121,7 +121,7 @@ def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float,
 def _plan_from_rings(
     rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
 ) -> TilePlan:
-    """Return a plan whose tiles cover angles that are as close to squares as possible."""
+    """Return a plan whose tiles cover nearly square ranges of angles."""
     step = len(rings)
     firing = step * subrays
     each = 1 if subrays > 1 else 2  # vectors per subtile, without sub-rays

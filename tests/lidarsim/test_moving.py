@@ -227,8 +227,8 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     def every_ray(rays, reaches, pairs, *_):
         asked.append(1)
         cell = pairs.cell
-        row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
-        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
+        row = (cell[:, None] * moving_loops.CELL_RAYS + np.arange(moving_loops.CELL_RAYS)).ravel()
+        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL_RAYS)
         return row[row < len(reaches)], pair[row < len(reaches)]
 
     def every_cell(wide_cells, cells, samples, reach):
