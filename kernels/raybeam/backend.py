@@ -122,7 +122,7 @@ class Backend(ABC):
     ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device. See `RayCaster.upload_rays`."""
         raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_crossing."
+            f"Backend {self.name!r} does not support devices. Use cast_pairs."
         )
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
@@ -131,7 +131,7 @@ class Backend(ABC):
         The bodies have the shape of this scene.
         """
         raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_crossing."
+            f"Backend {self.name!r} does not support devices. Use cast_pairs."
         )
 
     def cast(self, rays: Rays) -> Hits:

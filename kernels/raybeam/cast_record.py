@@ -1,4 +1,4 @@
-"""Records through which compiled loops read a cast, its meshes and their instances.
+"""Records from which compiled loops read a cast, its meshes and their instances.
 
 The records contain the addresses of arrays, so that a loop takes one argument instead of forty.
 `CastRecord` fills a record and keeps its arrays alive.
@@ -83,11 +83,8 @@ MESH = np.dtype(
 MASK_HEIGHT, NODES, BLOCKS, LEAF_CORNERS, ORDER = 3, 5, 6, 7, 8
 INSTANCE = np.dtype(
     [
-        (
-            "matrix",
-            "f8",
-            12,
-        ),  # (3, 4) matrix from local scene coordinates to local mesh coordinates
+        # (3, 4) matrix from local scene coordinates to local mesh coordinates.
+        ("matrix", "f8", 12),
         ("mesh", "i8"),  # address of the `MESH` record
         ("first", "i8"),  # first row of the mesh in `index`
     ]

@@ -99,7 +99,7 @@ def _source_stamp(path: Path) -> tuple[int, ...]:
 
 # Longest total wait for other processes that compile, because such a process may be suspended.
 _WAIT_S = 60.0
-_STEP_S = 0.02
+_STEP_S = 0.02  # pause between attempts to acquire the lock
 _lock_depth = [0]  # nesting depth of `_compile_lock` in the thread that holds numba's lock
 _locked_folder = [""]  # folder that this process has locked
 _wait_left_s = [_WAIT_S]  # remaining time to wait for other processes
