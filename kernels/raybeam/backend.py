@@ -121,18 +121,14 @@ class Backend(ABC):
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device. See `RayCaster.upload_rays`."""
-        raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_pairs."
-        )
+        raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays at bodies on the device, and record closer hits in `nearest`.
 
         The bodies have the shape of this scene.
         """
-        raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_pairs."
-        )
+        raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 
     def cast(self, rays: Rays) -> Hits:
         """Return the closest hit of each ray, including rays that miss."""

@@ -240,7 +240,7 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
 def called_by_address(signature: Any) -> Callable[[Any], Any]:
     """Compile a function that compiled callers call by its address.
 
-    With `stage`, the function would be compiled again with each of its callers, and with their
+    With `noinline`, the function would be compiled again with each of its callers, and with their
     callers. Callers must pass all arguments by position, because a call by address does not support
     keywords.
     """
@@ -268,7 +268,7 @@ def inlined(function: Any) -> Any:
     return _compile_inner(function, forceinline=True)
 
 
-def stage(function: Any) -> Any:
+def noinline(function: Any) -> Any:
     """Compile a function that compiled callers call, but do not inline.
 
     LLVM vectorizes the loops of such a function, which often fails in the middle of a longer

@@ -9,7 +9,7 @@ from numba import types
 
 from .arrays import Floats, Floats32, Ints, Ints32
 from .cast_record import float32s, float64s
-from .compiled import compiled, inlined, stage
+from .compiled import compiled, inlined, noinline
 from .moving_loops import NEAREST_HITS, PAIRS, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS
 from .triangle_loops import intersect_plane, same_sign, shear_ray
@@ -88,7 +88,7 @@ def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-unt
                     boxes[i, node, 3 + axis, c] = upper
 
 
-@stage
+@noinline
 def _entry_distances(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the distances at which a ray enters the boxes of a node's children, or inf for a miss.
 

@@ -10,7 +10,7 @@ from numba import types
 
 from . import cast_record as memory
 from .cast_record import float32s, float64s, int64s, uint8s
-from .compiled import compiled, inlined, stage
+from .compiled import compiled, inlined, noinline
 from .triangle_loops import intersect_plane, shear_ray
 
 f64_1 = types.float64[::1]
@@ -18,7 +18,7 @@ f64_2 = types.float64[:, ::1]
 i32_1 = types.int32[::1]
 
 
-@stage
+@noinline
 def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Transform a ray from scene to mesh coordinates, as `LocalScene.to_mesh_coordinates` does.
 
@@ -51,7 +51,7 @@ def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
     )
 
 
-@stage
+@noinline
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
     """Return whether a mesh is opaque at a hit, as `MaskTables.is_opaque` does.
 

@@ -15,7 +15,7 @@ from numba import types
 from .arrays import Floats, Indices, Ints
 from .body_rays import NearestHits, RayBodyPairs
 from .cast_record import float64s, int64s
-from .compiled import compiled, inlined, stage
+from .compiled import compiled, inlined, noinline
 
 CELL_RAYS = 64  # rays per cell
 CELLS_PER_WIDE_CELL = 16  # cells per wide cell
@@ -348,7 +348,7 @@ def _bounding_sphere(corners, pose, pad):  # type: ignore[no-untyped-def]  # noq
     return center, radius
 
 
-@stage
+@noinline
 def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
     """Write which rays of a cell intersect a sphere, and return their number.
 

@@ -17,7 +17,7 @@ from numba import carray, types
 from . import cast_record as memory
 from .arrays import Floats, Ints
 from .cast_record import casts_at, float64s, int64s
-from .compiled import INT64, called_by_address, compiled, inlined, stage
+from .compiled import INT64, called_by_address, compiled, inlined, noinline
 from .pattern import Pattern
 from .poses import Poses
 from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_index, thread_tiles
@@ -86,7 +86,7 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
     return p, q, r, u, v, w
 
 
-@stage
+@noinline
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
     """Write the pattern rows of a tile's rays, where each sub-ray is a row.
 
@@ -101,7 +101,7 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
         numbers[target + lane] = row - _floor_divide(row, row_count) * row_count
 
 
-@stage
+@noinline
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
     """Write the poses of a tile's rays, and the indices of the rays within their poses.
 
@@ -119,7 +119,7 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
         numbers[within_at + lane] = inside - later * rays_per_pose
 
 
-@stage
+@noinline
 def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyped-def]
     """Write the directions of a tile's rays, given their pattern rows."""
     numbers = int64s(tile)
@@ -140,7 +140,7 @@ def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
     return a * x + b * y
 
 
-@stage
+@noinline
 def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the directions of a tile's sub-rays, and their starts relative to the beam origins.
 
@@ -196,7 +196,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
                 store(floats, i + 2 * rays, _combine(lateral, splat(c), vertical, splat(f)))
 
 
-@stage
+@noinline
 def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the directions and starts like `_make_sub_rays`, if each beam has a single sub-ray."""
     numbers = int64s(tile)
@@ -283,7 +283,7 @@ def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def
     floats[i] = (p * matrices[k + 6 * n] + q * matrices[k + 7 * n]) + r * matrices[k + 8 * n]
 
 
-@stage
+@noinline
 def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
     """Rotate vectors of a tile to the axes of the scene.
 
@@ -310,7 +310,7 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
             _rotate_one(floats, target + lane, rays, matrices, numbers[pose_at + lane], poses)
 
 
-@stage
+@noinline
 def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Rotate vectors of a tile by the angular velocities of their poses. See `PoseMotion`."""
     numbers = int64s(tile)
@@ -336,7 +336,7 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
         floats[i + 2 * rays] = r + delay * (a * q - b * p)
 
 
-@stage
+@noinline
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
     """Add vectors of a table (3, count) to the origins of a tile's rays.
 
@@ -354,7 +354,7 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
         floats[target + 2 * rays + lane] += vectors[k + 2 * count]
 
 
-@stage
+@noinline
 def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
     """Add the position of the only pose, given its address, to the origins of a tile's rays."""
     floats = float64s(tile)
@@ -366,7 +366,7 @@ def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
             store(floats, k, load(floats, k) + number)
 
 
-@stage
+@noinline
 def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
     """Move the origins of a tile's rays by the velocities of their poses."""
     numbers = int64s(tile)
@@ -385,7 +385,7 @@ def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
         floats[target + 2 * rays + lane] += delay * velocities[k + 2 * poses]
 
 
-@stage
+@noinline
 def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
     """Set the origins of a tile's rays to zero."""
     floats = float64s(tile)
@@ -394,7 +394,7 @@ def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
         store(floats, k, zero)
 
 
-@stage
+@noinline
 def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
     """Write the origins of a tile's rays in the scene, in meters.
 
@@ -418,7 +418,7 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
         _apply_velocities(tile, rays, cast)
 
 
-@stage
+@noinline
 def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
     """Convert the origins of a tile's rays from meters to local coordinates."""
     floats = float64s(tile)
@@ -431,7 +431,7 @@ def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
         store(floats, i + 2 * rays, (load(floats, i + 2 * rays) - splat(z)) * factor)
 
 
-@stage
+@noinline
 def _write_output(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
     """Write vectors of a tile to an output array (3, total) for all rays of a cast.
 
@@ -499,7 +499,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
         _to_local(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
 
 
-@stage
+@noinline
 def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
     """Write the origin that all rays of a cast share to the rays of a tile, in local coordinates.
 

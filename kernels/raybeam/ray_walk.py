@@ -18,7 +18,7 @@ from .cast_record import (
     int32s,
     int64s,
 )
-from .compiled import INT64, called_by_address, inlined, stage
+from .compiled import INT64, called_by_address, inlined, noinline
 from .mesh import MAX_DIAGONAL
 from .mesh_loops import to_mesh_coordinates
 from .ray_loops import entry_distance
@@ -250,7 +250,7 @@ def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: igno
             limit = _limit_of(floats[t_at] * length, entry)
 
 
-@stage
+@noinline
 def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write a ray in the mesh coordinates of an instance, whose record is given by its address."""
     floats = float64s(tile)

@@ -18,7 +18,7 @@ from .cast_record import (
     int32s,
     int64s,
 )
-from .compiled import compiled, inlined, stage
+from .compiled import compiled, inlined, noinline
 from .moving_loops import (
     NEAREST_HITS,
     PADS_M,
@@ -38,7 +38,7 @@ _T_MIN = field_index("t_min")
 _TILE_RAYS = 8 * SUBTILES  # rays per tile if rays are cast at bodies
 
 
-@stage
+@noinline
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
     """Write the ray indices of a tile, and return whether any of them belongs to the call.
 
@@ -56,7 +56,7 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
     return exists != 0
 
 
-@stage
+@noinline
 def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
     """Clear the hits of a tile, and set the maximum distance of each ray.
 
@@ -75,7 +75,7 @@ def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
         numbers[key_at + k] = -1
 
 
-@stage
+@noinline
 def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
     """Store the hits of a tile in the scratch memory of a call with `count` rays.
 

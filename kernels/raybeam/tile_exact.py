@@ -7,7 +7,7 @@ from numba import types
 
 from . import tile_memory as memory
 from .cast_record import LEAF_CORNERS, MASK_HEIGHT, ORDER, float64s, int32s, int64s
-from .compiled import INT64, called_by_address, inlined, stage
+from .compiled import INT64, called_by_address, inlined, noinline
 from .mesh_loops import is_opaque
 from .tile_memory import AXIS, KEY, LENGTH, SX, T, U, field_index, row_index
 from .triangle_loops import PlaneHit, shear_ray
@@ -107,7 +107,7 @@ def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
     )
 
 
-@stage
+@noinline
 def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Test a ray against a triangle in float64, and return whether it is a closer hit.
 

@@ -12,7 +12,7 @@ from numba import types
 
 from . import tile_memory as memory
 from .cast_record import float32s, float64s, int64s
-from .compiled import INT64, called_by_address, inlined, stage
+from .compiled import INT64, called_by_address, inlined, noinline
 from .tile_memory import LENGTH, T, field_index, row_index
 from .tile_sizes import SUBTILES
 from .vectors import (
@@ -91,7 +91,7 @@ def _load_eight(floats, k):  # type: ignore[no-untyped-def]
     return to_float32(load(floats, k), load(floats, k + 4))
 
 
-@stage
+@noinline
 def _write_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
     """Write the axes of a tile and its point, and return the largest coordinate of the point.
 
@@ -146,7 +146,7 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
     singles[_AXES + 8] = np.float32(z)
 
 
-@stage
+@noinline
 def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write su, sv and the depths of a tile's rays, with their bounds.
 
@@ -217,7 +217,7 @@ def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noq
     return min_lane(cosine)
 
 
-@stage
+@noinline
 def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the sides of the tile and of its subtiles, with margins, and the margin of depths."""
     singles = float32s(tile)

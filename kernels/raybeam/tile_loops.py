@@ -53,7 +53,7 @@ from .cast_record import (
     int32s,
     int64s,
 )
-from .compiled import INT64, called_by_address, stage
+from .compiled import INT64, called_by_address, noinline
 from .ray_walk import SLACK, walk_ray, walk_ray_over_instances
 from .tile_exact import shear_rays
 from .tile_frame import prepare_tile
@@ -72,7 +72,7 @@ _MAX_SKIPS = 31  # maximum number of tiles that are cast ray by ray before the n
 _FEW = 6  # up to this number of rays, tiles are cast ray by ray
 
 
-@stage
+@noinline
 def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[no-untyped-def]
     """Cast the rays of a mask of subtiles at a mesh, as a tile or ray by ray.
 
@@ -132,7 +132,7 @@ def _transform_rays(tile, rays, instance):  # type: ignore[no-untyped-def]  # no
         store(floats, i + 2 * rays + ray, w)
 
 
-@stage
+@noinline
 def _reaching_subtiles(tile, rays, near, mask):  # type: ignore[no-untyped-def]
     """Return the subtiles of a mask that contain a ray which reaches a depth along the axis m.
 

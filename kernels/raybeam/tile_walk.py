@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 
 from .cast_record import BLOCKS, NODES, float32s, int32s, int64s, uint8s
-from .compiled import INT64, called_by_address, inlined, stage
+from .compiled import INT64, called_by_address, inlined, noinline
 from .tile_frame import FAR, ZERO, update_depths
 from .tile_leaf import test_leaf
 from .tile_memory import ENTRY, field_index
@@ -137,7 +137,7 @@ def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ig
     return count
 
 
-@stage
+@noinline
 def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
     """Return the mask of the subtiles that reach one of the first `count` pending nodes."""
     reach = load(float32s(tile), _REACH)

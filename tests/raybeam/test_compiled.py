@@ -203,7 +203,7 @@ def test_a_loop_that_cannot_be_kept_runs_with_a_note(package, function, caplog):
 def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
     """Numba would compile it for 0, and again for what the loop counts."""
 
-    @compiled.stage
+    @compiled.noinline
     def more(number):
         return number + 1
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 from raybeam.ray_loops import perpendicular_axes
 
 from ...base.arrays import Bools, Floats, Ints
@@ -148,7 +148,7 @@ def bound_cells(origins, directions, cones):
         cones[c, 4] = math.sqrt(max_square)
 
 
-@stage
+@noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
     """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
 
