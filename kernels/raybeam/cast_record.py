@@ -35,7 +35,7 @@ CAST = np.dtype(
         ("beam_count", "i8"),  # number of beams in the pattern
         ("poses", "i8"),  # number of poses
         ("rays_per_pose", "i8"),
-        ("first", "i8"),  # pattern row of ray 0, where each sub-ray is a row
+        ("first", "i8"),  # pattern row of ray 0, counting each sub-ray as a row
         ("subrays", "i8"),  # sub-rays per beam
         ("sub_ray_table", "i8"),  # float64 (5, lanes_per_beam): `SubRays.loop_table`
         ("lanes_per_beam", "i8"),  # `tile_sizes.lanes_per_beam`

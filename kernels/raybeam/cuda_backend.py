@@ -455,8 +455,8 @@ class CudaBackend(Backend):
     ) -> _CastChunk:
         """Compute the cumulative number of hits, and start to copy the counts to the host.
 
-        The hits are compacted by these sums and not by atomic operations, so that they are in ray
-        order and every run returns the same bytes.
+        The hits are compacted by these sums instead of atomic operations, so that they are in ray
+        order and each run returns the same bytes.
         """
         cp = self._cupy
         n = len(hits[1])

@@ -35,7 +35,7 @@ class FirstRay(NamedTuple):
     Attributes
     ----------
     row
-        Row in the pattern, where each sub-ray is a row.
+        Row in the pattern, counting each sub-ray as a row.
     pose, within
         Index of its pose, and index of the ray within the pose.
     ray
@@ -88,7 +88,7 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 @noinline
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
-    """Write the pattern rows of a tile's rays, where each sub-ray is a row.
+    """Write the pattern rows of a tile's rays, counting each sub-ray as a row.
 
     `first_row` is the row of the first ray of the call. The pattern has `row_count` rows and
     repeats.

@@ -113,10 +113,7 @@ def _split_costs(
 
 
 def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
-    """Return half the surface area of the box around each position and all earlier positions.
-
-    Only positions of the same node are included.
-    """
+    """Return half the surface area of each box combined with the earlier boxes of its node."""
     # Each node is shifted by a different offset, so that one pass over all nodes restarts at each
     # node.
     shift = _NODE_SPACING * node
