@@ -76,7 +76,7 @@ def rates(
     def pack() -> None:
         groups = HitGroups(scan.groups, 1)
         for (start, _), hit in zip(parts, hit_parts, strict=True):
-            chunk = engine._counted(start, None, hit, groups, engine._no_other_hits)
+            chunk = engine._count_chunk_hits(start, None, hit, groups, engine._no_external_hits)
             engine._pack(chunk, groups, 1.0, engine._no_counters)
 
     calls: dict[str, tuple[Any, Callable[[], object]]] = {
