@@ -227,8 +227,8 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     def every_ray(rays, reaches, pairs, *_):
         asked.append(1)
         cell = pairs.cell
-        row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
-        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
+        row = (cell[:, None] * moving_loops.CELL_RAYS + np.arange(moving_loops.CELL_RAYS)).ravel()
+        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL_RAYS)
         return row[row < len(reaches)], pair[row < len(reaches)]
 
     def every_cell(wide_cells, cells, samples, reach):
@@ -236,7 +236,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
         return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
 
     monkeypatch.setattr(moving_loops, "rays_through_boxes", every_ray)
-    monkeypatch.setattr(moving_loops, "cells_near_bodies", every_cell)
+    monkeypatch.setattr(moving_loops, "pair_cells_with_bodies", every_cell)
     every = made(survey, scene)
     assert asked
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)

@@ -6,19 +6,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, noinline
 
 TILE_ROWS = 512  # rows at a time: they stay in the first cache while all columns are written
 
 
-@stage
+@noinline
 def _scatter(values, fields):
     """Write values (n,) into a field of n rows."""
     for k in range(len(fields)):
         fields[k] = values[k]
 
 
-@stage
+@noinline
 def _round_positions(cells, scale, origin, positions):
     """Write the positions of cells (n,), rounded as by `part_columns.positions_of`.
 

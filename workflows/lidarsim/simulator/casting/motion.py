@@ -222,13 +222,13 @@ def poses_of_firings(
     firings = np.arange(first, stop + 1, dtype=np.int64)
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns + late_ns, path.duration_ns)
     positions, carrier_rotations = path.poses(station, times)
-    positions = raybeam.poses.by_component(positions)
+    positions = raybeam.poses.component_major(positions)
     carrier_rotations = (
         np.broadcast_to(np.eye(3), (len(times), 3, 3))
         if carrier_rotations is None
         else carrier_rotations
     )
-    carrier_rotations = raybeam.poses.by_component(carrier_rotations)
+    carrier_rotations = raybeam.poses.component_major(carrier_rotations)
     spins = sensor.spins(firings[:-1])
     rotations = carrier_rotations[:-1]
     if spins is not None:

@@ -13,9 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from raybeam import Deforming, Instance, Moving, Pattern, RayCaster, ScanReturns, available_backends
-from raybeam.device import OtherHits
-from raybeam.moving import hits_on, listed_hits_on
+from raybeam import (
+    DeformingMesh,
+    Instance,
+    MovingBodies,
+    Pattern,
+    RayCaster,
+    ScanReturns,
+    available_backends,
+)
+from raybeam.device import ExternalHits
+from raybeam.moving import body_hits, nearest_body_hits
 from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import Bools, Floats, Indices, Ints, Ints32
@@ -53,7 +61,7 @@ class _ActorShapes(NamedTuple):
     an instance of the shape's caster.
     """
 
-    casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
+    casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the frame of the mesh
     boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, meters
     part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
     shape: Indices  # (a,): shape of each actor
@@ -150,7 +158,7 @@ class SceneCaster:
         return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
-        """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
+        """Return the counter table for `RayCaster.scan_on_device`, and the number of counters.
 
         The table is int64 (bodies, 2): a hit of triangle t of body i counts in the counter
         ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the
@@ -199,14 +207,14 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
-        room: Floats | None = None,
+        out: Floats | None = None,
     ) -> ScanReturns:
         """Cast rays of a pattern as `RayCaster.scan`, at actors too.
 
         The arguments are as in `RayCaster.scan`; if there are actors, `poses` have a clock.
         `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
         `t_min` to `t_max`, meters; of each group of rays every n-th is returned, by `keep_every`.
-        `groups` are the first rays of the groups. `room` (6, n) receives origins and
+        `groups` are the first rays of the groups. `out` (6, n) receives origins and
         directions of all rays; without actors also (3, n), directions alone.
 
         Returns
@@ -217,14 +225,14 @@ class SceneCaster:
             `instance` is 0.
         """
         window = (0, len(pattern)) if window is None else window
-        if room is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
-            room = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
+        if out is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
+            out = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
         common: dict[str, Any] = {
             **poses.caster_arguments,
             "window": window,
             "t_min": t_min,
             "t_max": t_max,
-            "room": room,
+            "out": out,
         }
         trees = self._static.trees
         if self._instances is None and self._shapes is None and not trees.origins:
@@ -281,7 +289,7 @@ class SceneCaster:
         static_distance = np.full(len(scan), np.inf)
         static_distance[static_hits.ray] = static_hits.distance
         moving, shapes = self._moving_actors(poses)
-        nearest = hits_on(moving, scan, poses.times, static_distance)
+        nearest = nearest_body_hits(moving, scan, poses.times, static_distance)
         joined = surface_loops.JoinedHits(
             np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
         )
@@ -296,17 +304,17 @@ class SceneCaster:
         )
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
-    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
+    def on_actors(self, scan: Scan, poses: CastPoses) -> ExternalHits:
         """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
         if self._shapes is None:
-            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
+            return ExternalHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         moving, shapes = self._moving_actors(poses)
-        ray, distance, actor, instance, triangle = listed_hits_on(moving, scan, poses.times)
+        ray, distance, actor, instance, triangle = body_hits(moving, scan, poses.times)
         part_triangle = shapes.part_triangles[shapes.shape[actor], instance]
         triangle = triangle + part_triangle + self._actor_triangles[actor]
-        return OtherHits(ray.astype(np.uint32), distance, triangle)
+        return ExternalHits(ray.astype(np.uint32), distance, triangle)
 
-    def _moving_actors(self, poses: CastPoses) -> tuple[Moving, _ActorShapes]:
+    def _moving_actors(self, poses: CastPoses) -> tuple[MovingBodies, _ActorShapes]:
         """Return the actors as moving bodies, and their shapes."""
         shapes = self._shapes
         assert shapes is not None, "without actors"
@@ -319,7 +327,7 @@ class SceneCaster:
         presence_ns = trajectories.presence_ns
         if self._unseen_actors is not None:
             presence_ns = np.where(self._unseen_actors[:, None], _NEVER_NS, presence_ns)
-        moving = Moving(
+        moving = MovingBodies(
             shapes.casters,
             shapes.boxes,
             shapes.shape,
@@ -446,7 +454,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):
         row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]
     casters = tuple(
-        Deforming(mesh.animation.vertices, mesh.faces)
+        DeformingMesh(mesh.animation.vertices, mesh.faces)
         if mesh.animation
         else RayCaster.from_instances([Instance(mesh_of(part)) for part in mesh_parts], **options)
         for mesh, mesh_parts in zip(meshes, parts_of_meshes, strict=True)

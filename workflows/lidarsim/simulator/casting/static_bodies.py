@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
-from raybeam.registry import choose
+from raybeam.registry import choose_backend
 
 from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ...scene.scene import Scene
@@ -136,7 +136,7 @@ class StaticBodies:
         self._options = options
         self._lock = threading.Lock()
         self._center = scene.bounds.mean(axis=0)
-        on_device = choose(options.get("backend", "auto")).on_device
+        on_device = choose_backend(options.get("backend", "auto")).on_device
         # Whether bodies may be left out once some are remote, and whether some are.
         self._can_cut = _is_short(range_m) and not on_device
         self._may_cut = self._can_cut and _half_side(scene.bounds) > MAX_REACH_M
@@ -156,7 +156,7 @@ class StaticBodies:
     def backend(self) -> str:
         """Name of the backend in use."""
         if self._trees is None:
-            return choose(self._options.get("backend", "auto")).name
+            return choose_backend(self._options.get("backend", "auto")).name
         return self._trees.caster.backend
 
     @property
@@ -207,11 +207,13 @@ class StaticBodies:
             return
         first = trees.face_bodies
         if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
-            trees.caster.move(first + instance_indices, instances.transforms[instance_indices])
+            trees.caster.set_transforms(
+                first + instance_indices, instances.transforms[instance_indices]
+            )
             return
         numbers = first + np.searchsorted(trees.instance_indices, instance_indices)
         if trees.region is None:
-            trees.caster.move(numbers, instances.transforms[instance_indices])
+            trees.caster.set_transforms(numbers, instances.transforms[instance_indices])
             return
         has_tree = np.isin(instance_indices, trees.instance_indices)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
@@ -219,7 +221,9 @@ class StaticBodies:
         if (is_cut | comes | (has_tree & is_remote)).any():
             self._trees = self._build(trees.region)
             return
-        trees.caster.move(numbers[has_tree], instances.transforms[instance_indices[has_tree]])
+        trees.caster.set_transforms(
+            numbers[has_tree], instances.transforms[instance_indices[has_tree]]
+        )
 
     def _build(self, region: Floats | None) -> _Trees:
         """Build the trees of the bodies within a region (2, 3), or of all bodies.

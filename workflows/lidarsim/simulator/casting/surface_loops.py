@@ -389,7 +389,7 @@ def merge(ray, triangle, nearest, actors, output):
 
     The nearest hit of each ray is written to `output`, which is a `JoinedHits`. `ray` and
     `triangle` (k,) are the hits on static bodies, in ray order. `nearest` is a
-    `raybeam.crossing.Nearest` with one entry per ray. In `nearest`, the body is the actor, or
+    `raybeam.body_rays.NearestHits` with one entry per ray. In `nearest`, the body is the actor, or
     negative if the ray hits no actor or hits a static body first. For such rays, the distance is
     that to the static body. `actors` is an `ActorTriangles`.
     """

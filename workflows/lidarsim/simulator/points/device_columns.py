@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from raybeam import Pattern
-from raybeam.device import DeviceHits, OtherHits, Outbox, filled, host_array, to_device
+from raybeam.device import (
+    CopyQueue,
+    DeviceHits,
+    ExternalHits,
+    pinned_array,
+    to_device,
+    trim_to_count,
+)
 from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
@@ -196,7 +203,7 @@ class DeviceColumns:
             self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
         )
         try:
-            hit_counts, tally = seen.caster.caster.visit(
+            hit_counts, tally = seen.caster.caster.scan_on_device(
                 scan, transfer.make, seen.counters, actor_hits
             )
         finally:  # else the device would write to memory that goes back to the pool
@@ -251,7 +258,7 @@ class DeviceColumns:
                 images.append(hits.cupy.full(len(image), np.inf, np.float32))
             images[0][hits.ray] = hits.distance
 
-        seen.caster.caster.visit(scan, take, other_hits=_actor_hits(seen, scan, poses))
+        seen.caster.caster.scan_on_device(scan, take, external_hits=_actor_hits(seen, scan, poses))
         for device_image in images:
             device_image.get(out=image)
 
@@ -277,7 +284,7 @@ class DeviceColumns:
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 
 
-def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
+def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> ExternalHits | None:
     """Find the hits of a scan on actors that are seen, or return None without actors.
 
     All actors are the last body: its triangles count from 0.
@@ -382,10 +389,11 @@ class _ColumnTransfer:
         self._buffers.outbox.wait()
         sizes = (self._count, self._max_points)
         columns = {
-            column.name: filled(host, *sizes) for column, host in self._buffers.columns.items()
+            column.name: trim_to_count(host, *sizes)
+            for column, host in self._buffers.columns.items()
         }
         if self._buffers.hits:
-            return columns, tuple(filled(host, *sizes) for host in self._buffers.hits)
+            return columns, tuple(trim_to_count(host, *sizes) for host in self._buffers.hits)
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
@@ -393,13 +401,13 @@ class _ColumnTransfer:
         """Allocate host arrays, and send the kernel's arguments that are the same for all hits."""
         maker = self._maker
         kernel_arguments = self._kernel_arguments(cupy)
-        outbox = Outbox(cupy)
+        outbox = CopyQueue(cupy)
         columns = {
-            column: host_array(cupy, self._max_points, column.dtype)
+            column: pinned_array(cupy, self._max_points, column.dtype)
             for column in maker.device_columns
         }
         hits = (
-            [host_array(cupy, self._max_points, kind) for kind in _HITS]
+            [pinned_array(cupy, self._max_points, kind) for kind in _HITS]
             if maker.needs_all_hits
             else []
         )
@@ -442,7 +450,7 @@ class _TransferBuffers:
 
     kernel: Any
     kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
-    outbox: Outbox
+    outbox: CopyQueue
     columns: dict[Column, AnyArray]  # columns with room for all rays
     hits: list[AnyArray]  # arrays as in `_HITS`; empty unless NumPy needs all hits
 

@@ -299,7 +299,7 @@ class CastStep(PulseStep):
             window=batch.window,
             t_min=nearest_m,
             t_max=self._reach_m,
-            room=rays,
+            out=rays,
         )
         light = self._light_of_rays(hits.ray.astype(np.int64), rays, batch)
         start_m = np.full(len(light.ray), nearest_m)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
-from raybeam.sub_rays import any_axes
+from raybeam.sub_rays import perpendicular_axes
 
 from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ...base.elementary import exp, log
@@ -111,7 +111,7 @@ class RayDifferentials:
     @classmethod
     def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
         """Return the differentials of light at its origin, from directions (n, 3)."""
-        derivatives = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
+        derivatives = np.stack([axis.T for axis in perpendicular_axes(directions.T)], axis=1)
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 

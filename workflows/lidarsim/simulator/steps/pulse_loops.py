@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 
@@ -117,7 +117,7 @@ def _half_way(hit, neighbor, inverse_distance, neighbors):
     return 2 / (inverse_distance * ratio)
 
 
-@stage
+@noinline
 def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901, PLR0914 - a compiled loop
     """Clear `marks.starts_surface` at hits of a beam where the last hit's surface continues.
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.cast_memory import float64s, int64s, uint8s
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.cast_record import float64s, int64s, uint8s
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
@@ -120,7 +120,7 @@ def _pointers_to_returns(output):
     )
 
 
-@stage
+@noinline
 def _max_hits(ray, subrays):
     """Return the largest number of hits of a beam."""
     max_count = 0
@@ -134,7 +134,7 @@ def _max_hits(ray, subrays):
     return max_count
 
 
-@stage
+@noinline
 def _room_for_hits(size, subrays):
     """Return scratch memory for up to `size` hits of a beam."""
     pulse_hits = PulseHits(
@@ -392,7 +392,7 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
     return count
 
 
-@stage
+@noinline
 def _mark(energy, begin, stop, mode, shown):
     """Mark which returns of a pulse a mode reports, the nearest of equally strong returns.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from raybeam.moving import near_boxes
+from raybeam.moving import pair_cells_with_boxes
 
 from ...base.arrays import Floats, Ints, owned
 from ...base.random_numbers import Purpose
@@ -174,7 +174,7 @@ class SprayStep(PulseStep):
             [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
         )
         reach_m = np.minimum(reach_m[ring_order], self._clump_distribution[1][0, -1])
-        cell, box, cell_rays = near_boxes(
+        cell, box, cell_rays = pair_cells_with_boxes(
             rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
         )
         order = np.argsort(cell, kind="stable")

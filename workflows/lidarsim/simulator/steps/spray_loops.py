@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Floats, Ints
 from ...base.elementary_loops import exp
@@ -58,7 +58,7 @@ class ClumpTables(NamedTuple):
     exponential: Floats  # quantiles of the exponential distribution
 
 
-@stage
+@noinline
 def _ball_radii(boxes):
     """Return the radii of balls around boxes (b, 12): (b,), meters."""
     radii = np.zeros(len(boxes))
@@ -157,7 +157,7 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
     return count
 
 
-@stage
+@noinline
 def _column(ranges, guide, part_m, distance):
     """Return the first column at a distance or farther.
 
@@ -172,7 +172,7 @@ def _column(ranges, guide, part_m, distance):
     return column
 
 
-@stage
+@noinline
 def _guide(ranges, part_m):
     """Return columns at which searches for distances start: (_GUIDE_PARTS + 4,).
 

@@ -203,7 +203,7 @@ class Emitter:
             return pattern
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
         sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self._about_axis else None)
-        return pattern.divided(sub_rays, offsets, beam_indices)
+        return pattern.with_sub_rays(sub_rays, offsets, beam_indices)
 
 
 @dataclass(eq=False)

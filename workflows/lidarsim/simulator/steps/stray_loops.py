@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
-from raybeam.ray_loops import any_axes
+from raybeam.compiled import compiled, inlined, noinline
+from raybeam.ray_loops import perpendicular_axes
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.elementary_loops import arctan2, sin_cos
@@ -148,7 +148,7 @@ def bound_cells(origins, directions, cones):
         cones[c, 4] = math.sqrt(max_square)
 
 
-@stage
+@noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
     """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
 
@@ -156,7 +156,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
     if the ray meets the triangle, and -1 if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
-    a, b, c, d, e, f = any_axes(dx, dy, dz)
+    a, b, c, d, e, f = perpendicular_axes(dx, dy, dz)
     min_tangent = np.inf
     nearest = (0.0, 0.0, 0.0)
     all_left = True

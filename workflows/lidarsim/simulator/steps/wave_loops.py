@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.elementary_loops import exp, log
@@ -158,7 +158,7 @@ class SampledWaveform(NamedTuple):
     sigma: float  # standard deviation of the system waveform, samples
 
 
-@stage
+@noinline
 def _sample(light, begin, stop, first, length, sigma, samples):
     """Write the sum of the pulses of hits `begin` to `stop`, and return the highest sample.
 
@@ -201,7 +201,7 @@ def _vertex(samples, peak):
     return shift, height
 
 
-@stage
+@noinline
 def _peaks(wave, stops, peaks):
     """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
 
@@ -241,7 +241,7 @@ def _peaks(wave, stops, peaks):
     return count
 
 
-@stage
+@noinline
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
     """Write residual and slopes of a sum of `count` Gaussians, and return the sum of squares.
 
@@ -268,7 +268,7 @@ def _residual(x, y, sample_count, gaussians, count, residual, slopes):
     return cost
 
 
-@stage
+@noinline
 def _solve(lower, size, step):
     """Solve equations by their Cholesky factor, and replace the right side `step` by the result."""
     for row in range(size):
@@ -282,7 +282,7 @@ def _solve(lower, size, step):
         step[row] /= lower[row, row]
 
 
-@stage
+@noinline
 def _step(residual, slopes, sample_count, count, damping, lower, step):
     """Write a step of Levenberg and Marquardt for `count` Gaussians, by Cholesky's method."""
     size = 3 * count
@@ -306,7 +306,7 @@ def _step(residual, slopes, sample_count, count, damping, lower, step):
     _solve(lower, size, step)
 
 
-@stage
+@noinline
 def _fit(x, y, sample_count, count, scratch):
     """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x`, by least squares.
 
@@ -370,7 +370,7 @@ def _fit(x, y, sample_count, count, scratch):
         damping = damping / 10 if better else damping * 10
 
 
-@stage
+@noinline
 def _find_minima(wave, scratch):
     """Write the samples with minimal second derivative, and return their number.
 
@@ -394,7 +394,7 @@ def _find_minima(wave, scratch):
     return count
 
 
-@stage
+@noinline
 def _fit_piece(wave, begin, stop, first, end, scratch):
     """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform.
 
@@ -428,7 +428,7 @@ def _fit_piece(wave, begin, stop, first, end, scratch):
         scratch.width[k] = fit[2, k - begin]
 
 
-@stage
+@noinline
 def _sort_gaussians(scratch, count, faintest):
     """Sort Gaussians by time, without any lower than `faintest`, and return their number.
 
@@ -457,7 +457,7 @@ def _sort_gaussians(scratch, count, faintest):
     return sorted_count
 
 
-@stage
+@noinline
 def _join_gaussians(wave, scratch, count, stops, peaks):
     """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
 
@@ -495,7 +495,7 @@ def _join_gaussians(wave, scratch, count, stops, peaks):
     return peak
 
 
-@stage
+@noinline
 def _gaussians(wave, scratch, stops, peaks):
     """Decompose a waveform into Gaussians, and write and return the same as `_peaks`.
 
