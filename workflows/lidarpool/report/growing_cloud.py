@@ -358,9 +358,8 @@ class GrowingCloud:
         if self._writer is not None:  # as many parts as there are threads may not be written yet
             rows_bytes = part.point_count * self._writer.file.row.itemsize * self._writer.threads
         self._appended_bytes += part.size
-        bytes_left = (
-            self._appended_bytes * self._job.committed.missing_count // (part.stop - self._job.scans.start)
-        )
+        appended_scans = part.stop - self._job.scans.start
+        bytes_left = self._appended_bytes * self._job.committed.missing_count // appended_scans
         free_bytes = shutil.disk_usage(self._path.parent).free
         if free_bytes < rows_bytes + bytes_left:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
