@@ -20,8 +20,8 @@ from .division import ask, ask_to_dissolve, grow, resize, shrink
 from .errors import PoolError
 from .extras.background import in_background
 from .extras.cancelling import ask_to_cancel
-from .extras.for_each import ItemTasks
 from .extras.notebook import table_of_partition
+from .for_each import ItemTasks
 from .internals.names import CANCELLING, MAP, require
 from .mapping import Results, Stage
 from .membership import MemberName, register
@@ -534,7 +534,7 @@ class Partition:
             key: "ended" if task.status in ("finished", "error") else "cancelled"
             for key, task in tasks.items()
         }
-        outcomes |= ask_to_cancel(tasks, self, running == "restart")
+        outcomes |= ask_to_cancel(tasks, self.client, self.name, running == "restart")
         self.client.cancel(
             [task for key, task in tasks.items() if not outcomes[key].startswith("kept")]
         )

@@ -538,7 +538,7 @@ class Pipe:
         ...     gpu.submit(cast, scans, hits).result()
         """
         _ = self.client  # the thread of the listener would get another client on a worker
-        return Listener(self, function)
+        return Listener(self, function, partial(put_back, self))
 
 
 def _deadline(timeout_s: float | None) -> float:

@@ -150,7 +150,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
         pool = Pool.from_client(client)
         monkeypatch.setattr("poolpart.internals.client.ANSWER_S", 0.03)
         monkeypatch.setattr("poolpart.division.ANSWER_S", 0.03)
-        monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.1)
+        monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.1)
         os.kill(scheduler.pid, signal.SIGSTOP)
         calls = {
             "get": empty.get,

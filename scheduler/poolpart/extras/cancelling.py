@@ -11,9 +11,9 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Collection, Coroutine, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from distributed import Future, Status
+from distributed import Client, Future, Status
 
 from ..errors import PoolError
 from ..fetch import holds_for_driver
@@ -21,9 +21,6 @@ from ..internals.scheduler import asks_for, call, cancel_keys, holds_nothing, re
 from ..internals.worker import running_keys, task_of_thread
 from ..pipe_states import fail_pipes_of_killed
 from ..workers import on_scheduler
-
-if TYPE_CHECKING:
-    from ..partition import Partition
 
 T = TypeVar("T")
 Outcomes = dict[Any, str]  # {key of a task: what happened}
@@ -50,18 +47,19 @@ def cancelled() -> bool:
     return running is not None and running[1].state == "cancelled"
 
 
-def ask_to_cancel(tasks: Mapping[Any, Future], partition: Partition, restarts: bool) -> Outcomes:
+def ask_to_cancel(
+    tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
+) -> Outcomes:
     """Cancel tasks of a partition, by key, on the scheduler.
 
     Returns {key: what happened}, without tasks that had not started, or had ended.
     """
-    client = partition.client
     outcomes, complaint = on_scheduler(
         client,
         _cancel_tasks,
         keys=list(tasks),
         pending_keys=[key for key, task in tasks.items() if task.status == "pending"],
-        name=partition.name,
+        name=name,
         asking=client.id,
         restarts=restarts,
     )

@@ -6,17 +6,26 @@ import concurrent.futures
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Protocol, Self
 
 from dask.utils import funcname
 
 from ..errors import PipeClosed, PipeFailed
 from .background import in_background
 
-if TYPE_CHECKING:
-    from ..pipe import Pipe
-
 _CHECK_S = 1.0  # interval at which the thread checks whether the listener was closed
+
+
+class ItemSource(Protocol):
+    """The part of a `Pipe` that a listener uses."""
+
+    name: str
+
+    def get(self, timeout_s: float | None = None) -> Any:
+        """Remove and return the next item."""
+
+    def fail(self, reason: str) -> None:
+        """Make the pipe fail."""
 
 
 class Listener:
@@ -36,8 +45,14 @@ class Listener:
     >>> listener.join(timeout_s=60)                                      # doctest: +SKIP
     """
 
-    def __init__(self, pipe: Pipe, function: Callable[[Any], Any]) -> None:
+    def __init__(
+        self,
+        pipe: ItemSource,
+        function: Callable[[Any], Any],
+        put_back: Callable[[Any], None],
+    ) -> None:
         self._pipe = pipe
+        self._put_back = put_back
         self._function = function
         self._closed = threading.Event()
         self._calling = threading.Lock()  # held while the function runs
@@ -101,8 +116,6 @@ class Listener:
 
     def _listen(self) -> None:
         """Call the function until the pipe ends or the listener is closed."""
-        from ..pipe import put_back  # `pipe` imports this module
-
         self._thread = threading.current_thread()
         try:
             while not self._closed.is_set():
@@ -118,7 +131,7 @@ class Listener:
                     raise
                 with self._calling:
                     if self._closed.is_set():
-                        put_back(self._pipe, item)
+                        self._put_back(item)
                         return
                     self._function(item)
         except BaseException as error:

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 from dask.utils import funcname
 from distributed import Client, Future, wait
 
-from ..errors import PipeFailed, PoolError
-from ..membership import prospects
-from ..pipe import Pipe, take_beside
-from ..worker_wait import WorkerWait, check_wait
+from .errors import PipeFailed, PoolError
+from .membership import prospects
+from .pipe import Pipe, take_beside
+from .worker_wait import WorkerWait, check_wait
 
 LOOK_S = 5.0  # between looks at the number of slots
 MOST_PER_SLOT = 16  # tasks in flight, without a window
