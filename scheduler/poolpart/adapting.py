@@ -26,17 +26,17 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
-from .fetch import holds_for_driver
+from .fetch import holds_bytes
 from .internals.scheduler import (
-    call,
+    accepts_tasks,
+    call_worker,
     is_bound,
     is_idle,
-    reopen,
-    retire,
-    shut,
-    takes_tasks,
-    turn_away,
-    waiting_for_workers,
+    reject_worker,
+    resume_assigning,
+    retire_workers,
+    stop_assigning,
+    unrunnable_tasks,
 )
 from .internals.worker import has_running_tasks
 from .rules import check_count
@@ -48,7 +48,7 @@ _LOST_S = 120.0  # without a report, after which the process that starts jobs co
 
 
 @dataclass(frozen=True)
-class Bounds:
+class JobBounds:
     """Number of jobs that a partition may have."""
 
     minimum: int
@@ -56,7 +56,7 @@ class Bounds:
     idle_s: float = IDLE_S
 
     @classmethod
-    def checked(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> Bounds:
+    def validated(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> JobBounds:
         """Return checked bounds.
 
         Raises
@@ -75,17 +75,17 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class JobKind:
+class JobSpec:
     """Size of the jobs of a partition, and their number."""
 
     slots: int  # slots per worker
     workers: int = 1  # workers per job
-    bounds: Bounds | None = None  # None for a fixed number of jobs
+    bounds: JobBounds | None = None  # None for a fixed number of jobs
     cancellable: bool = True  # before its workers have joined
 
 
 @dataclass(frozen=True)
-class Advice:
+class JobAdvice:
     """Jobs of a partition that the cluster's process has to start and to forget."""
 
     jobs_to_start: int = 0
@@ -112,7 +112,7 @@ class GroupAdvice:
 class _Decision:
     """What happens to the jobs of a partition."""
 
-    advice: Advice
+    advice: JobAdvice
     idle: dict[str, list[Any]]  # {job: states of its workers, which are to be closed}
 
 
@@ -120,7 +120,7 @@ class _Decision:
 class _Record:
     """State of a partition, with times from `time.monotonic`."""
 
-    kind: JobKind
+    kind: JobSpec
     queued_jobs: int = 0  # jobs whose workers have not joined
     reported_at: float = 0.0  # when the process that starts jobs reported them
     missing_slots: float = 0.0  # at the last report
@@ -133,7 +133,7 @@ class _Record:
         return time.monotonic() - self.reported_at <= _LOST_S
 
 
-class Adaptation(SchedulerPlugin):
+class AdaptivePartitions(SchedulerPlugin):
     """The record of partitions whose jobs a cluster object starts."""
 
     name = NAME
@@ -152,7 +152,7 @@ class Adaptation(SchedulerPlugin):
         self._busy_at[worker] = time.monotonic()
         state = scheduler.workers[worker]
         if str(state.name) in self._cancelled:
-            turn_away(scheduler, state)
+            reject_worker(scheduler, state)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker."""
@@ -189,7 +189,7 @@ class Adaptation(SchedulerPlugin):
     def waiting_slots(self) -> dict[str, float]:
         """Return the slots that tasks without a worker wait for, by partition."""
         waiting: dict[str, float] = {}
-        for task in waiting_for_workers(self.scheduler):  # there may be 100,000
+        for task in unrunnable_tasks(self.scheduler):  # there may be 100,000
             if task.resource_restrictions and not is_bound(task):
                 for name, slots in task.resource_restrictions.items():
                     waiting[name] = waiting.get(name, 0.0) + slots
@@ -213,7 +213,7 @@ class Adaptation(SchedulerPlugin):
         members = [
             worker
             for worker in self.scheduler.workers.values()
-            if worker.resources.get(name) and takes_tasks(worker)
+            if worker.resources.get(name) and accepts_tasks(worker)
         ]
         total = sum(worker.resources[name] for worker in members)
         free = 0.0
@@ -288,11 +288,11 @@ class Adaptation(SchedulerPlugin):
         self._cancelled.update(worker for job in cancelled for worker in jobs[job])
         to_start = max(0, jobs_needed(lasting) - len(queued))
         # Jobs that have ended are named again: an earlier answer may not have arrived.
-        advice = Advice(to_start, [*cancelled, *ended])
+        advice = JobAdvice(to_start, [*cancelled, *ended])
         return _Decision(advice, self._idle(name, running, -missing / slots_per_job, bounds))
 
     def _idle(
-        self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: Bounds
+        self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: JobBounds
     ) -> dict[str, list[Any]]:
         """Return the workers to close by job: of the jobs that have been idle for longest."""
         decided_at = time.monotonic()
@@ -320,17 +320,17 @@ class Adaptation(SchedulerPlugin):
         If a worker turns out to be busy, let all of them receive tasks again, and return False.
         """
         addresses = [worker.address for worker in workers]
-        requests = (call(self.scheduler, address, _is_busy) for address in addresses)
+        requests = (call_worker(self.scheduler, address, _is_busy) for address in addresses)
         try:
             busy = any(await asyncio.wait_for(asyncio.gather(*requests), _ANSWER_S))
         except (OSError, TimeoutError):  # stopped, or leaving by itself
             busy = True
-        if not busy and await retire(self.scheduler, workers):
+        if not busy and await retire_workers(self.scheduler, workers):
             # The container of a worker of Kubernetes is started again until it is removed.
             self._cancelled.update(str(worker.name) for worker in workers)
             return True
         for worker in workers:
-            reopen(self.scheduler, worker)
+            resume_assigning(self.scheduler, worker)
             if worker.address in self._busy_at:
                 self._busy_at[worker.address] = time.monotonic()
         return False
@@ -338,24 +338,24 @@ class Adaptation(SchedulerPlugin):
 
 def _is_busy(dask_worker: Any = None) -> bool:
     """Return whether a worker runs a task, or holds data, unknown to its scheduler."""
-    return has_running_tasks(dask_worker) or holds_for_driver()
+    return has_running_tasks(dask_worker) or holds_bytes()
 
 
 # -- requests of the process that starts jobs ----------------------------------------------
 
 
-def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
+def add_partitions(kinds: Mapping[str, JobSpec], dask_scheduler: Any = None) -> None:
     """Create the records of partitions whose jobs a process starts."""
-    record = _adaptation_of(dask_scheduler) or Adaptation(dask_scheduler)
+    record = _adaptation_of(dask_scheduler) or AdaptivePartitions(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
     for name, kind in kinds.items():
         record.records[name] = _Record(kind)
 
 
-async def look(
+async def advise_jobs(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
-) -> dict[str, Advice]:
+) -> dict[str, JobAdvice]:
     """Close idle workers, then return which jobs to start and which to forget, by partition.
 
     `jobs` maps each partition to its jobs, and each job to the names of its workers. Partitions
@@ -365,7 +365,7 @@ async def look(
     if adaptation is None:
         return {}
     waiting = adaptation.waiting_slots()
-    advice: dict[str, Advice] = {}
+    advice: dict[str, JobAdvice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
     for name, jobs_of_partition in jobs.items():
         decision = adaptation.decide(name, jobs_of_partition, waiting.get(name, 0.0))
@@ -374,7 +374,7 @@ async def look(
         advice[name] = decision.advice
         for job, workers in decision.idle.items():
             for worker in workers:  # one step of the event loop: no task can arrive before
-                shut(dask_scheduler, worker)
+                stop_assigning(dask_scheduler, worker)
             closing.append((name, job, workers))
     results = await asyncio.gather(*(adaptation.close_idle(workers) for *_, workers in closing))
     for (name, job, _), closed in zip(closing, results, strict=True):
@@ -384,7 +384,7 @@ async def look(
     return advice
 
 
-async def look_at_groups(
+async def advise_groups(
     reports: Mapping[str, GroupReport], dask_scheduler: Any = None
 ) -> dict[str, GroupAdvice]:
     """Close idle workers, then return the target sizes of the worker groups, by partition.
@@ -397,7 +397,7 @@ async def look_at_groups(
         return {}
     jobs = {name: adaptation.group_jobs(name, report) for name, report in reports.items()}
     advice: dict[str, GroupAdvice] = {}
-    for name, change in (await look(jobs, dask_scheduler)).items():
+    for name, change in (await advise_jobs(jobs, dask_scheduler)).items():
         leaving = adaptation.records[name].leaving
         leaving.update(change.jobs_to_forget)
         size = len(jobs[name]) + change.jobs_to_start - len(change.jobs_to_forget)
@@ -405,10 +405,10 @@ async def look_at_groups(
     return advice
 
 
-# -- requests of clients, by `on_scheduler` ----------------------------------------------------
+# -- requests of clients, by `run_on_scheduler` ----------------------------------------------------
 
 
-def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
+def set_bounds(name: str, bounds: JobBounds, dask_scheduler: Any = None) -> bool:
     """Change the number of jobs of a partition, or return False if no process starts its jobs."""
     record = _record(dask_scheduler, name)
     if record is not None:
@@ -416,7 +416,7 @@ def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
     return record is not None
 
 
-def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
+def request_slots(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
     """Request slots of a partition for a client, by its id, or end the request with 0 slots.
 
     Returns False if the partition does not adapt.
@@ -486,8 +486,8 @@ def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
     return record.kind.bounds.maximum * record.kind.workers, record.kind.slots
 
 
-def _adaptation_of(scheduler: Any) -> Adaptation | None:
-    adaptation: Adaptation | None = scheduler.plugins.get(NAME)
+def _adaptation_of(scheduler: Any) -> AdaptivePartitions | None:
+    adaptation: AdaptivePartitions | None = scheduler.plugins.get(NAME)
     return adaptation
 
 

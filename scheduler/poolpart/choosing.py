@@ -22,19 +22,19 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import NAME as FENCES
 from .fence import Fences
-from .internals.method_rules import Rules, rule_for_choice
+from .internals.method_rules import MethodRules, add_choice_rule
 from .internals.placing import (
+    can_run,
+    count_declaring,
+    earliest_worker,
     free_slots_of,
-    group_of,
     holders_of_inputs,
-    may_take,
-    number_declaring,
-    start_first,
+    only_resource_of,
     workers_declaring,
 )
 
 NAME = "poolpart-choice"
-COMPARED = 10  # workers that are compared for a task; smaller groups are left to Dask
+MAX_COMPARED = 10  # workers that are compared for a task; smaller groups are left to Dask
 _EXAMINED = 50  # workers that are examined for free slots
 _OUTSIDE = ""  # name of the group of the workers outside all fences
 
@@ -51,7 +51,7 @@ class _Group:
         self._next_index = 0  # the first worker that `in_turn` returns next
 
     def with_free_slots(self, slots: float) -> list[Any]:
-        """Return up to `COMPARED` workers with enough free slots, and forget full workers."""
+        """Return up to `MAX_COMPARED` workers with enough free slots, and forget full workers."""
         workers: list[Any] = []
         for worker in list(islice(self.free, _EXAMINED)):
             free = free_slots_of(worker, self.name)
@@ -59,19 +59,21 @@ class _Group:
                 workers.append(worker)
             elif free < 1:
                 del self.free[worker]
-            if len(workers) == COMPARED:
+            if len(workers) == MAX_COMPARED:
                 break
         return workers
 
     def in_turn(self) -> list[Any]:
-        """Return `COMPARED` workers, evenly spread and different at each call."""
+        """Return `MAX_COMPARED` workers, evenly spread and different at each call."""
         number = len(self.workers)
         start = self._next_index
         self._next_index = (start + 1) % number
-        return [self.workers[(start + n * number // COMPARED) % number] for n in range(COMPARED)]
+        return [
+            self.workers[(start + n * number // MAX_COMPARED) % number] for n in range(MAX_COMPARED)
+        ]
 
 
-class WorkerChoice(SchedulerPlugin):
+class WorkerChooser(SchedulerPlugin):
     """The rule: chooses workers for tasks of partitions, and for tasks outside fences."""
 
     name = NAME
@@ -81,18 +83,18 @@ class WorkerChoice(SchedulerPlugin):
         self.names = names  # the partitions: the caller adds and removes names
         self._changes = 0  # how often workers, or what they declare, have changed
         self._groups: dict[str, _Group] = {}
-        self._rules = Rules()
-        rule_for_choice(self._rules, scheduler, self.choose)
+        self._rules = MethodRules()
+        add_choice_rule(self._rules, scheduler, self.choose)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Take the rule back."""
-        self._rules.take_back()
+        self._rules.remove_all()
         self.scheduler.remove_plugin(NAME)
 
     # -- groups ------------------------------------------------------------------------
 
-    def note_change(self) -> None:
+    def invalidate_groups(self) -> None:
         """Note that a worker declares different resources than before."""
         self._changes += 1
 
@@ -118,7 +120,7 @@ class WorkerChoice(SchedulerPlugin):
         """Return the group of the workers that may take tasks, made anew after changes."""
         fences: Fences | None = self.scheduler.plugins.get(FENCES)
         if name != _OUTSIDE:
-            version = self._changes, number_declaring(self.scheduler, name)
+            version = self._changes, count_declaring(self.scheduler, name)
         elif fences is not None:
             version = self._changes, fences.changes
         else:
@@ -142,14 +144,14 @@ class WorkerChoice(SchedulerPlugin):
 
         Returns NotImplemented to leave the choice to Dask.
         """
-        resource = group_of(task)
+        resource = only_resource_of(task)
         if resource is None:
             return NotImplemented
         name, slots = resource
         if name != _OUTSIDE and name not in self.names:
             return NotImplemented
         group = self._group(name)
-        if group is None or len(group.workers) <= 2 * COMPARED:
+        if group is None or len(group.workers) <= 2 * MAX_COMPARED:
             return NotImplemented
         holders = holders_of_inputs(task)
         if len(holders) > _EXAMINED:
@@ -160,14 +162,14 @@ class WorkerChoice(SchedulerPlugin):
             workers = self._permitted(group.with_free_slots(slots), name, slots)
         if not workers:
             workers = self._permitted(group.in_turn(), name, slots)
-        return start_first(self.scheduler, task, workers) if workers else NotImplemented
+        return earliest_worker(self.scheduler, task, workers) if workers else NotImplemented
 
     def _permitted(self, workers: list[Any], name: str, slots: float) -> list[Any]:
-        return [worker for worker in workers if may_take(self.scheduler, worker, name, slots)]
+        return [worker for worker in workers if can_run(self.scheduler, worker, name, slots)]
 
 
-def note_change(scheduler: Any) -> None:
+def invalidate_groups(scheduler: Any) -> None:
     """Note that a worker of a scheduler declares different resources than before."""
-    choice: WorkerChoice | None = scheduler.plugins.get(NAME)
+    choice: WorkerChooser | None = scheduler.plugins.get(NAME)
     if choice is not None:
-        choice.note_change()
+        choice.invalidate_groups()

@@ -14,15 +14,15 @@ from typing import Any
 from distributed import get_worker
 
 from . import probe
-from .task_context import WorkerLeft, own_client, telling_departure
-from .workers import on_scheduler
+from .task_context import WorkerLeavingError, own_client, translate_leaving_errors
+from .workers import run_on_scheduler
 
 _HELD = "poolpart-gpu"  # key in the scheduler's state of a worker: UUID of its device
 
 _own: dict[str, int | None] = {}  # {address of a worker of this process: its device}
 
 
-@telling_departure()
+@translate_leaving_errors()
 def own_device() -> int | None:
     """Return the index of the CUDA device for this task's worker, or None if the worker has no GPU.
 
@@ -34,7 +34,7 @@ def own_device() -> int | None:
 
     Raises
     ------
-    WorkerLeft
+    WorkerLeavingError
         If the worker is leaving the cluster.
     ValueError
         If the function is called outside of a task.
@@ -58,14 +58,14 @@ def own_device() -> int | None:
     if address not in _own:
         device: int | None = None
         if gpus := probe.visible_gpus():
-            device = on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
+            device = run_on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
             if device is None:
-                raise WorkerLeft(f"The scheduler has removed the worker at {address}.")
+                raise WorkerLeavingError(f"The scheduler has removed the worker at {address}.")
         _own[address] = device
     return _own[address]
 
 
-@telling_departure()
+@translate_leaving_errors()
 def own_device_share() -> float:
     """Return the fraction of the device memory that this task's worker may use, between 0 and 1.
 
@@ -75,7 +75,7 @@ def own_device_share() -> float:
 
     Raises
     ------
-    WorkerLeft, ValueError, PoolError
+    WorkerLeavingError, ValueError, PoolError
         In the same cases as `own_device`.
 
     Examples
@@ -86,7 +86,7 @@ def own_device_share() -> float:
         return 1.0
     address = get_worker().address
     gpus = probe.visible_gpus()
-    sharers: int = on_scheduler(own_client(), count_sharers, address=address, gpus=gpus)
+    sharers: int = run_on_scheduler(own_client(), count_sharers, address=address, gpus=gpus)
     return 1 / sharers
 
 

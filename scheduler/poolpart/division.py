@@ -15,16 +15,24 @@ from typing import Any
 from distributed import Client
 
 from .errors import PoolError
-from .features import FEATURES, begin_features, features_settled, names_with_features
-from .fence import enclose, lower
+from .features import FEATURES, begin_features, names_with_features, wait_for_features
+from .fence import lower_fence, raise_fence
 from .internals.client import ANSWER_S
-from .internals.scheduler import asks_for, lift_restrictions
-from .membership import release, release_statistics
+from .internals.scheduler import lift_restrictions, requires_any
+from .membership import release_partitions, release_statistics
 from .registration import forget_registrations
-from .rules import Rule, check_count, divide, n_workers, rest, shortfalls, workers_in_words
+from .rules import (
+    Rule,
+    check_count,
+    divide_workers,
+    find_shortfalls,
+    format_workers,
+    n_workers,
+    rest,
+)
 from .stats import statistics_of
-from .steward import Seat, Steward, names_of, steward_of
-from .workers import WorkerInfo, on_scheduler
+from .steward import Steward, WorkerRecord, names_of, steward_of
+from .workers import WorkerInfo, run_on_scheduler
 
 PATIENCE_S = 60.0  # seconds that a worker has to answer
 _RETURN_S = 10.0  # minimum time for workers to declare their former resources
@@ -34,7 +42,7 @@ _MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
-def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
+def call_steward(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
     """Call `question(steward, **arguments)` on the scheduler, and return its result.
 
     `question` is a coroutine function of this module, such as `grow`. If it raises a PoolError on
@@ -42,7 +50,7 @@ def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
     """
     # The steward waits for tasks, and then for workers, for `timeout_s` each.
     answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
-    result, complaint = on_scheduler(
+    result, complaint = run_on_scheduler(
         client, _answer, question=question, arguments=arguments, answer_s=answer_s
     )
     if complaint:
@@ -65,7 +73,7 @@ async def _answer(
 # -- making partitions -----------------------------------------------------------------
 
 
-async def declare(
+async def create_partitions(
     steward: Steward,
     rules: Mapping[str, Rule],
     pool: Mapping[str, WorkerInfo],
@@ -102,21 +110,24 @@ async def declare(
         leaves meanwhile.
     """
     # Up to the first await nothing else happens on the scheduler.
-    seats = {seat.info.address: seat for seat in steward.seats.values() if not seat.away}
+    records = {
+        record.info.address: record for record in steward.records.values() if not record.is_absent
+    }
     present = [
-        replace(seat.info, resources=steward.target_resources(seat)) for seat in seats.values()
+        replace(record.info, resources=steward.target_resources(record))
+        for record in records.values()
     ]
     # By name: a restarted worker has another address.
     candidates = [w.with_gpus(pool[w.name].gpus) for w in present if w.name in pool]
-    chosen, notes = divide(rules, candidates)
+    chosen, notes = divide_workers(rules, candidates)
     as_seen = [
         worker
         if worker.partitions & {*own_partitions}
         else replace(worker, resources=pool[worker.name].resources)
         for worker in candidates
     ]
-    notes = {**shortfalls(rules, candidates, as_seen), **notes}
-    other = steward.remainder()
+    notes = {**find_shortfalls(rules, candidates, as_seen), **notes}
+    other = steward.remainder_name()
     for name in rules:
         if isinstance(rules[name], rest) and other not in (None, *rules):
             note = (
@@ -133,23 +144,23 @@ async def declare(
             if name in worker.partitions and worker.address not in permitted
         ]
         if foreign:
-            raise PoolError(_exists(steward, name, [seats[address] for address in foreign]))
+            raise PoolError(_exists(steward, name, [records[address] for address in foreign]))
     common_note = _begin(steward, rules)
     for worker in candidates:
         if worker.gpus:
-            seats[worker.address].info = seats[worker.address].info.with_gpus(worker.gpus)
+            records[worker.address].info = records[worker.address].info.with_gpus(worker.gpus)
     for name, rule in rules.items():
-        steward.enter(name, rule)
+        steward.set_rule(name, rule)
         for worker in chosen[name]:
-            steward.assign(seats[worker.address], name, rule.slots_of(worker))
-    await features_settled()  # before the members get tasks, which lend slots
-    members = [seats[worker.address] for group in chosen.values() for worker in group]
+            steward.set_home(records[worker.address], name, rule.slots_of(worker))
+    await wait_for_features()  # before the members get tasks, which lend slots
+    members = [records[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: " ".join(filter(None, (notes.get(name), common_note))) for name in rules}
-    return notes_of_all, [worker for worker in candidates if seats[worker.address] not in members]
+    return notes_of_all, [worker for worker in candidates if records[worker.address] not in members]
 
 
-def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
+def _exists(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
     """Return the message for workers that have a partition and are not chosen by its rule."""
     if name in steward.rules:
         return (
@@ -159,11 +170,11 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
             "different name."
         )
     use = f"Use the existing partition with `Pool.from_client(client)[{name!r}]`"
-    for seat in members:
-        names = [resource for resource, slots in seat.original.items() if slots]
+    for record in members:
+        names = [resource for resource, slots in record.original.items() if slots]
         if len(names) > 1:
             return (
-                f"Worker {seat.info.name} was started with the resources {', '.join(names)}, but "
+                f"Worker {record.info.name} was started with the resources {', '.join(names)}, but "
                 f"a worker can belong to only one partition. {use}, or start the worker with only "
                 f'`--resources "{name}=1"`.'
             )
@@ -176,16 +187,16 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
     )
 
 
-async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
+async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> None:
     """Wait until new members of partitions declare their resources.
 
     Raises PoolError if a member does not.
     """
-    late = await steward.arrive(members, PATIENCE_S)
-    if absent := [seat for seat in members if seat in late or seat.removed]:
+    late = await steward.wait_until_settled(members, PATIENCE_S)
+    if absent := [record for record in members if record in late or record.is_removed]:
         raise PoolError(
             "Some workers left or did not respond while they were assigned to "
-            f"{_in_words(sorted({str(seat.partition) for seat in absent}))}: {names_of(absent)}. "
+            f"{_in_words(sorted({str(record.partition) for record in absent}))}: {names_of(absent)}. "
             "The other workers were assigned. Create a new pool to divide it again."
         )
 
@@ -202,14 +213,14 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
         note = begin_features(scheduler, rules)
         for name, rule in rules.items():
             if rule.exclusive:
-                enclose(scheduler, name)
+                raise_fence(scheduler, name)
             elif name in steward.rules and steward.rules[name].exclusive:
-                lower(scheduler, name)
+                lower_fence(scheduler, name)
     except PoolError:  # this version of Dask lacks what fences need
         added = rules.keys() - steward.rules.keys()
         for name in added:
-            lower(scheduler, name)
-        release(scheduler, added)
+            lower_fence(scheduler, name)
+        release_partitions(scheduler, added)
         raise
     statistics_of(scheduler)
     return note
@@ -222,43 +233,43 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
 # another partition, leave first.
 
 
-async def grow(
+async def grow_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
     """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
-    steward.adopt(name)
+    steward.adopt_partition(name)
     joining = _joining(steward, name, count, source)
     return await _move(steward, dict.fromkeys(joining, name), timeout_s)
 
 
-async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition and return their names."""
     check_count(_MOVES, count)
-    steward.adopt(name)
+    steward.adopt_partition(name)
     return await _move(steward, _leaving(steward, name, count), timeout_s)
 
 
-async def resize(
+async def resize_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
     """Resize a partition to a number of workers, and return the names of the moved workers."""
     check_count(f"the number of workers of partition {name!r}", count, minimum=0)
-    steward.adopt(name)
+    steward.adopt_partition(name)
     rule = steward.rules[name]
     if count < rule.minimum:
         raise PoolError(
-            f"Partition {name!r} cannot be resized to {workers_in_words(count)}, because its "
+            f"Partition {name!r} cannot be resized to {format_workers(count)}, because its "
             f"minimum is {rule.minimum}."
         )
     size = len(steward.members(name))  # includes members that are starting again
-    targets: dict[Seat, str | None] = {}
+    targets: dict[WorkerRecord, str | None] = {}
     if count > size:
         targets = dict.fromkeys(_joining(steward, name, count - size, source), name)
     elif count < size:
         targets = _leaving(steward, name, size - count)
     # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
-    steward.resize(name, size - _asked(rule, size))
+    steward.change_target(name, size - _asked(rule, size))
     try:
         return await _move(steward, targets, timeout_s)
     finally:
@@ -272,8 +283,8 @@ def _asked(rule: Rule, default: int) -> int:
     return rule.workers if isinstance(rule, n_workers) else default
 
 
-def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[Seat]:
-    """Return the seats of workers that can move into a partition.
+def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[WorkerRecord]:
+    """Return the records of workers that can move into a partition.
 
     Raises PoolError if there are fewer than `count`.
     """
@@ -283,15 +294,19 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
             "`source`."
         )
     if source is not None:
-        steward.adopt(source)
-    donor = source or steward.remainder()
-    spare = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
+        steward.adopt_partition(source)
+    donor = source or steward.remainder_name()
+    spare = (
+        []
+        if source
+        else [record for record in steward.free_records() if steward.is_settled(record)]
+    )
     if donor is not None and donor != name:
         members = _settled_members(steward, donor)
         spared = max(0, len(members) - steward.rules[donor].minimum)
         spare += _in_order(steward, members, name)[:spared]
     if len(spare) < count:
-        available = f"only {workers_in_words(len(spare))}" if spare else "no workers"
+        available = f"only {format_workers(len(spare))}" if spare else "no workers"
         if source:
             reason = f"partition {source!r} has {available} to spare beyond its minimum"
             advice = "pass another partition as `source`"
@@ -299,14 +314,14 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
             reason = f"the remainder of the pool has {available} to spare"
             advice = "pass the partition that should provide them as `source`"
         raise PoolError(
-            f"Partition {name!r} cannot grow by {workers_in_words(count)}, because {reason}. "
+            f"Partition {name!r} cannot grow by {format_workers(count)}, because {reason}. "
             f"Start more workers, or {advice}."
         )
     return _in_order(steward, spare, name)[:count]
 
 
-def _leaving(steward: Steward, name: str, count: int) -> dict[Seat, str | None]:
-    """Return the seats of workers that can leave a partition, with their destinations.
+def _leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
+    """Return the records of workers that can leave a partition, with their destinations.
 
     Raises PoolError if fewer than its minimum would be left.
     """
@@ -314,98 +329,100 @@ def _leaving(steward: Steward, name: str, count: int) -> dict[Seat, str | None]:
     minimum = steward.rules[name].minimum
     if len(members) - count < minimum:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {workers_in_words(count)}, because it has "
-            f"{workers_in_words(len(members))} and its minimum is {minimum}."
+            f"Partition {name!r} cannot shrink by {format_workers(count)}, because it has "
+            f"{format_workers(len(members))} and its minimum is {minimum}."
         )
     leaving = _in_order(steward, members)[:count]
-    return {seat: _destination(steward, seat) for seat in leaving}
+    return {record: _destination(steward, record) for record in leaving}
 
 
-def _destination(steward: Steward, seat: Seat) -> str | None:
+def _destination(steward: Steward, record: WorkerRecord) -> str | None:
     """Return the partition of a worker that leaves its partition, or None for no partition.
 
     A borrowed worker returns to its home, and other workers go to the partition with the rule
     `rest`. Workers that leave this partition are in none.
     """
-    if seat.partition == (remainder := steward.remainder()):
+    if record.partition == (remainder := steward.remainder_name()):
         return None
-    home = steward.home(seat)
-    return remainder if home == seat.partition else home or remainder
+    home = steward.home_of(record)
+    return remainder if home == record.partition else home or remainder
 
 
 async def _move(
-    steward: Steward, targets: Mapping[Seat, str | None], timeout_s: float
+    steward: Steward, targets: Mapping[WorkerRecord, str | None], timeout_s: float
 ) -> list[str]:
     """Move workers to partitions, or out of all partitions if the target is None.
 
     Returns the names of the workers. Raises PoolError if tasks of a worker do not end in time. Such
     a worker stays where it is.
     """
-    origins = {seat: (seat.partition, seat.slots) for seat in targets}
-    for seat, target in targets.items():
-        steward.resize(seat.partition, -1)
-        steward.resize(target, 1)
-        steward.put(seat, target)
-    late = await steward.arrive(targets, timeout_s)
-    for seat in late:
-        origin, slots = origins[seat]
-        target = targets[seat]
-        if seat.partition != target or (origin and origin not in steward.rules):
+    origins = {record: (record.partition, record.slots) for record in targets}
+    for record, target in targets.items():
+        steward.change_target(record.partition, -1)
+        steward.change_target(target, 1)
+        steward.set_partition(record, target)
+    late = await steward.wait_until_settled(targets, timeout_s)
+    for record in late:
+        origin, slots = origins[record]
+        target = targets[record]
+        if record.partition != target or (origin and origin not in steward.rules):
             continue  # another client has moved it, or dissolved its partition
-        steward.resize(target, -1)
-        steward.resize(origin, 1)
-        steward.put(seat, origin, slots)
+        steward.change_target(target, -1)
+        steward.change_target(origin, 1)
+        steward.set_partition(record, origin, slots)
     if late:
-        await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
+        await steward.wait_until_settled(late, _STAY_S)  # so that they can be moved again at once
         raise PoolError(
-            f"{len(late)} of {workers_in_words(len(targets))} could not be moved within "
+            f"{len(late)} of {format_workers(len(targets))} could not be moved within "
             f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
             f"These workers stay in their partition: {names_of(late)}. Wait for their tasks, or "
             "pass a longer `timeout_s`."
         )
-    return [seat.info.name for seat in targets if not seat.removed]
+    return [record.info.name for record in targets if not record.is_removed]
 
 
-def _settled_members(steward: Steward, name: str) -> list[Seat]:
+def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
     """Return the members that may be moved.
 
     Members that are just arriving do not count: they may return to their former partition.
     """
-    return [seat for seat in steward.members(name) if steward.settled(seat)]
+    return [record for record in steward.members(name) if steward.is_settled(record)]
 
 
 def _in_order(
-    steward: Steward, seats: Sequence[Seat], destination: str | None = None
-) -> list[Seat]:
-    """Sort seats by the order in which their workers are moved to a destination.
+    steward: Steward, records: Sequence[WorkerRecord], destination: str | None = None
+) -> list[WorkerRecord]:
+    """Sort records by the order in which their workers are moved to a destination.
 
     Workers whose home is the destination come first, then workers without a partition and borrowed
     workers. Among these, the least busy workers come first, and those with long-running tasks last.
     """
 
-    def order(seat: Seat) -> tuple[bool, bool, int, int]:
-        worker = steward.scheduler.workers[seat.info.address]
-        is_home = seat.partition is not None and steward.home(seat) == seat.partition
-        returns = destination is not None and steward.home(seat) == destination
+    def order(record: WorkerRecord) -> tuple[bool, bool, int, int]:
+        worker = steward.scheduler.workers[record.info.address]
+        is_home = record.partition is not None and steward.home_of(record) == record.partition
+        returns = destination is not None and steward.home_of(record) == destination
         return not returns, is_home, len(worker.long_running), len(worker.processing)
 
-    return sorted(seats, key=order)
+    return sorted(records, key=order)
 
 
 # -- dissolving partitions ------------------------------------------------------------------------
 
 
-def ask_to_dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+def request_dissolution(
+    client: Client, names: Collection[str] | None, timeout_s: float
+) -> list[str]:
     """Ask the steward to undo partitions, or every partition if `names` is None."""
     arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
     try:
-        dissolved: list[str] = ask(client, dissolve, **arguments)
+        dissolved: list[str] = call_steward(client, dissolve_partitions, **arguments)
     finally:
         forget_registrations()
     return dissolved
 
 
-async def dissolve(
+async def dissolve_partitions(
     steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
 ) -> list[str]:
     """Undo partitions, or every partition if `names` is None, and return their names.
@@ -417,30 +434,30 @@ async def dissolve(
     # Until the next await nothing else happens on the scheduler; before, another client may have
     # dissolved the same partitions, or made some.
     dissolved = _existing(steward, names)
-    seats = [seat for seat in steward.seats.values() if _belongs(seat, dissolved)]
+    records = [record for record in steward.records.values() if _belongs(record, dissolved)]
     for name in dissolved:
         del steward.rules[name]
-        for seat in steward.seats.values():
-            if seat.home == name:  # also if another partition has borrowed the worker
-                seat.home = None
+        for record in steward.records.values():
+            if record.home == name:  # also if another partition has borrowed the worker
+                record.home = None
         # At once, even if the client dies or workers do not answer.
-        lower(scheduler, name)
-    release(scheduler, dissolved, client_id, had_rule=True)
+        lower_fence(scheduler, name)
+    release_partitions(scheduler, dissolved, client_id, had_rule=True)
     if names is None:  # this includes partitions that workers were started with: these have no rule
-        release(scheduler, names_with_features(scheduler), client_id)
+        release_partitions(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
         for feature in FEATURES:
             feature.end_all(scheduler)
         release_statistics(scheduler)
-    for seat in seats:
-        home = steward.home(seat)
-        steward.resize(home, 1)
-        steward.assign(seat, home)
+    for record in records:
+        home = steward.home_of(record)
+        steward.change_target(home, 1)
+        steward.set_home(record, home)
     lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
-    await features_settled()  # then tasks lend no more
+    await wait_for_features()  # then tasks lend no more
     # An absent worker comes back as it was started.
-    present = [seat for seat in seats if not seat.away]
-    if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
+    present = [record for record in records if not record.is_absent]
+    if late := await steward.wait_until_settled(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
             f"Some workers did not respond while {_in_words(dissolved)} "
             f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. Their "
@@ -460,14 +477,14 @@ def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
     return [name for name in steward.rules if names is None or name in names]
 
 
-def _belongs(seat: Seat, names: Collection[str]) -> bool:
+def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
     """Return whether a worker is in a partition of `names`, or was started in such a partition.
 
     Only workers without a partition are judged by their start.
     """
-    if seat.partition is None:
-        return not seat.original.keys().isdisjoint(names)
-    return seat.partition in names
+    if record.partition is None:
+        return not record.original.keys().isdisjoint(names)
+    return record.partition in names
 
 
 async def _wait_for_tasks(
@@ -495,4 +512,4 @@ async def _wait_for_tasks(
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
     """Return the states of the tasks of partitions that have not ended."""
     tasks = scheduler.tasks.values()
-    return [task for task in tasks if task.state in _UNFINISHED and asks_for(task, names)]
+    return [task for task in tasks if task.state in _UNFINISHED and requires_any(task, names)]

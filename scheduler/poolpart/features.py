@@ -24,14 +24,14 @@ class Feature:
         """Return the partitions that the feature has begun in."""
         return frozenset()
 
-    async def settle(self) -> None:
+    async def wait_for_workers(self) -> None:
         """Wait, for a limited time, until workers know what has started and stopped."""
 
     def end_all(self, scheduler: Any) -> None:
         """End with the last partition that has a rule."""
 
     def begin_counting(self, statistics: Any) -> None:
-        """Begin when a scheduler begins to count its tasks, in a `Statistics`."""
+        """Begin when a scheduler begins to count its tasks, in a `TaskStatistics`."""
 
     def end_counting(self, statistics: Any) -> None:
         """End when a scheduler ends to count its tasks."""
@@ -57,7 +57,7 @@ def names_with_features(scheduler: Any) -> frozenset[str]:
     return frozenset().union(*(feature.names(scheduler) for feature in FEATURES))
 
 
-async def features_settled() -> None:
+async def wait_for_features() -> None:
     """Wait, for a limited time, until workers know which features have started and stopped."""
     for feature in FEATURES:
-        await feature.settle()
+        await feature.wait_for_workers()

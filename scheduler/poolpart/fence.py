@@ -32,9 +32,14 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals.method_rules import Rules, rule_for_fences, take_back_fences, workers_without_fences
+from .internals.method_rules import (
+    MethodRules,
+    add_fence_rules,
+    remove_fence_rules,
+    workers_without_fences,
+)
 from .internals.names import FENCES, require
-from .internals.scheduler import open_to_all
+from .internals.scheduler import admit_other_tasks
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +48,7 @@ WARN_EVERY_S = 10.0
 _EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker
 
 
-def enclose(scheduler: Any, name: str) -> None:
+def raise_fence(scheduler: Any, name: str) -> None:
     """Raise a fence: from now on, tasks without the resource of a partition stay out.
 
     Raises
@@ -54,19 +59,19 @@ def enclose(scheduler: Any, name: str) -> None:
     require(FENCES)
     fences: Fences = scheduler.plugins.get(NAME) or Fences(scheduler)
     fences.names.add(name)
-    fences.look_again()
+    fences.update_workers()
 
 
-def expect(scheduler: Any, worker: Any, name: str | None) -> None:
+def set_expected_partition(scheduler: Any, worker: Any, name: str | None) -> None:
     """Record the future partition of a worker, which is behind its fence from now on."""
     worker.extra.pop(_EXPECTED, None)
     if name is not None:
         worker.extra[_EXPECTED] = name
     if fences := scheduler.plugins.get(NAME):
-        fences.look_at(worker)
+        fences.update_worker(worker)
 
 
-def lower(scheduler: Any, name: str) -> None:
+def lower_fence(scheduler: Any, name: str) -> None:
     """Lower a fence, and uninstall the scheduler plugin if no fences remain."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
@@ -74,10 +79,10 @@ def lower(scheduler: Any, name: str) -> None:
     fences.names.discard(name)
     if not fences.names:
         fences.uninstall()
-    fences.look_again()
+    fences.update_workers()
 
 
-def fences_of(scheduler: Any) -> frozenset[str]:
+def fence_names(scheduler: Any) -> frozenset[str]:
     """Return the names of the raised fences."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     return frozenset(fences.names) if fences else frozenset()
@@ -93,24 +98,24 @@ class Fences(SchedulerPlugin):
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
         self.changes = 0  # changes of the set `closed`
-        self._rules = Rules()
+        self._rules = MethodRules()
         self._warned_at = float("-inf")  # time.monotonic()
-        rule_for_fences(self._rules, scheduler, self.closed, self.stop)
+        add_fence_rules(self._rules, scheduler, self.closed, self.keeps_out)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Remove all rules."""
-        take_back_fences(self._rules, self.scheduler)
+        remove_fence_rules(self._rules, self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
     # -- who is behind a fence ---------------------------------------------------------
 
-    def look_again(self) -> None:
+    def update_workers(self) -> None:
         """Enclose or release each worker, after a change of the fences."""
         for worker in self.scheduler.workers.values():
-            self.look_at(worker)
+            self.update_worker(worker)
 
-    def look_at(self, worker: Any) -> None:
+    def update_worker(self, worker: Any) -> None:
         """Enclose or release a worker, by its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
@@ -120,11 +125,11 @@ class Fences(SchedulerPlugin):
         elif worker in self.closed:
             self.closed.discard(worker)
             self.changes += 1
-            open_to_all(self.scheduler, worker)
+            admit_other_tasks(self.scheduler, worker)
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
         """Enclose a worker that joins, if necessary."""
-        self.look_at(scheduler.workers[worker])
+        self.update_worker(scheduler.workers[worker])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker that has left."""
@@ -132,7 +137,7 @@ class Fences(SchedulerPlugin):
 
     # -- the rule ----------------------------------------------------------------------
 
-    def stop(self, task: Any) -> bool:
+    def keeps_out(self, task: Any) -> bool:
         """Return whether fences keep a task out: the task asks for no resource of a fence."""
         resources = task.resource_restrictions
         return not resources or self.names.isdisjoint(resources)
@@ -148,7 +153,7 @@ class Fences(SchedulerPlugin):
             return
         task = self.scheduler.tasks[key]
         elapsed_s = time.monotonic() - self._warned_at
-        if elapsed_s < WARN_EVERY_S or not self.stop(task):
+        if elapsed_s < WARN_EVERY_S or not self.keeps_out(task):
             return
         if not workers_without_fences(self.scheduler, task):  # it waits also without fences
             return

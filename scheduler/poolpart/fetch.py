@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from .internals.client import as_bytes, ask, take_from_worker
+from .internals.client import fetch_from_worker, send_request, wrap_bytes
 from .internals.names import FETCHING, require
-from .internals.worker import answer_to
+from .internals.worker import add_handler
 
 T = TypeVar("T")
 
-_HANDLER = "poolpart_take_held"  # name of the worker's handler for held bytes
+_HANDLER = "poolpart_fetch_held_bytes"  # name of the worker's handler for held bytes
 
 _held: dict[str, Any] = {}  # {name: bytes that this process holds}
 
@@ -58,7 +58,9 @@ def fetch_available(
         if holder is not None:
             return await _take(client, holder, list(keys), patience_s)
         try:
-            holders = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
+            holders = await wait_for(
+                send_request(client, None, "who_has", keys=list(keys)), patience_s
+            )
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
@@ -75,7 +77,7 @@ def fetch_available(
 
 
 async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
-    request = take_from_worker(client, address, held)
+    request = fetch_from_worker(client, address, held)
     return await _unless_silent(client, address, request, patience_s) or {}
 
 
@@ -90,7 +92,7 @@ async def _unless_silent(
         # reads to its end (the error holds its own stream).
         while not (await asyncio.wait([answer_task], timeout=patience_s))[0]:
             try:
-                await wait_for(ask(client, address, "ping"), patience_s)
+                await wait_for(send_request(client, address, "ping"), patience_s)
             except (TimeoutError, OSError):
                 return None
         return answer_task.result()
@@ -98,31 +100,31 @@ async def _unless_silent(
         answer_task.cancel()
 
 
-def hold_for_driver(name: str, data: Any) -> str:
-    """Keep bytes in this worker's memory until `take_held` and return the worker's address.
+def hold_bytes(name: str, data: Any) -> str:
+    """Keep bytes in this worker's memory until `fetch_held_bytes` and return the worker's address.
 
     The caller has to limit the amount: bytes that nobody fetches stay for ever.
     """
     worker = get_worker()
     _held[name] = data
-    answer_to(worker, _HANDLER, _hand_over)
+    add_handler(worker, _HANDLER, _hand_over)
     return str(worker.address)
 
 
-def holds_for_driver() -> bool:
+def holds_bytes() -> bool:
     """Whether this process holds bytes that no driver has fetched yet."""
     return bool(_held)
 
 
-def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
+def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
     """Fetch bytes that a worker holds under a name and then forgets.
 
-    The address is the result of `hold_for_driver`. Returns None if the bytes were taken before, or
+    The address is the result of `hold_bytes`. Returns None if the bytes were taken before, or
     if the worker has died or is silent for `patience_s`; a transfer may take longer.
     """
 
     async def take() -> Any:
-        request = ask(client, address, _HANDLER, name=name)
+        request = send_request(client, address, _HANDLER, name=name)
         answer = await _unless_silent(client, address, request, patience_s)
         return answer and answer["data"]
 
@@ -135,4 +137,4 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
 def _hand_over(name: str) -> dict[str, Any]:
     """Return and forget held bytes, as a handler of a worker."""
     data = _held.pop(name, None)
-    return {"data": None if data is None else as_bytes(data)}
+    return {"data": None if data is None else wrap_bytes(data)}

@@ -13,15 +13,15 @@ from dask.utils import funcname
 from distributed import Client, Future, wait
 
 from .errors import PipeFailed, PoolError
-from .membership import prospects
-from .pipe import Pipe, take_beside
-from .worker_wait import WorkerWait, check_wait
+from .membership import request_capacity
+from .pipe import Pipe, take_items
+from .worker_wait import WorkerWait, check_wait_s
 
 LOOK_S = 5.0  # between looks at the number of slots
 MOST_PER_SLOT = 16  # tasks in flight, without a window
 
 
-class Submitter(Protocol):
+class TaskSubmitter(Protocol):
     """What the tasks need of a partition."""
 
     name: str
@@ -47,7 +47,7 @@ class _PipeItems:
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
         """Return up to `limit` items, as soon as there are any or a task has ended."""
-        items, self.closed, self.drained = take_beside(self._pipe, futures, limit, seconds)
+        items, self.closed, self.drained = take_items(self._pipe, futures, limit, seconds)
         return items
 
     def fail(self, reason: str) -> None:
@@ -96,14 +96,14 @@ class ItemTasks:
 
     def __init__(
         self,
-        partition: Submitter,
+        partition: TaskSubmitter,
         source: Pipe | Iterable[Any],
         function: Callable[..., Any],
         window: int | None,
         options: dict[str, Any],
         empty_s: float,
     ) -> None:
-        check_wait(empty_s)
+        check_wait_s(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
             raise ValueError(
                 f"Invalid value {window!r} for `window`. Expected an integer of at least 1."
@@ -174,14 +174,14 @@ class ItemTasks:
         if time.monotonic() <= self._next_look:
             return
         partition = self._partition
-        of_partition = prospects(
+        of_partition = request_capacity(
             partition.client, partition.name, self._options["slots"], partition.by_rule
         )
-        self._slots = of_partition.running
+        self._slots = of_partition.max_running
         self._set_window()
         if self._running:
             self._wait.check(of_partition)
-        self._until_next_s = self._wait.until_next_check(LOOK_S)
+        self._until_next_s = self._wait.seconds_until_check(LOOK_S)
         self._next_look = time.monotonic() + self._until_next_s
 
     def _set_window(self) -> None:

@@ -19,12 +19,12 @@ _TABLE = Template("""<table>
 """)
 _PARAGRAPH = Template("<p>{{ text }}</p>\n")
 # Columns of words, which begin at the left; numbers end at the right.
-WORDS = frozenset({"", "partition", "stage", "worker", "pipe", "state", "status", "address"})
+TEXT_COLUMNS = frozenset({"", "partition", "stage", "worker", "pipe", "state", "status", "address"})
 
 
 def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a table with a title, the names of the columns and rows of cells."""
-    sides = {name: "left" if name in WORDS else "right" for name in head}
+    sides = {name: "left" if name in TEXT_COLUMNS else "right" for name in head}
     return _TABLE.generate(title=title, head=head, rows=rows, sides=sides).decode()
 
 
@@ -43,7 +43,7 @@ def html_paragraph(text: str) -> str:
     return _PARAGRAPH.generate(text=text).decode()
 
 
-def shown_seconds(seconds: float) -> str:
+def format_seconds(seconds: float) -> str:
     """Return a running time with three digits, or a dash if nothing has run."""
     if not seconds:
         return "–"

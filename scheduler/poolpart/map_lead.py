@@ -11,7 +11,7 @@ MOST_LEAD_S = 3600.0
 IDLE = 0.1  # share of the time for which both sides wait, that shows a lead which is too short
 
 
-class Lead:
+class LeadTime:
     """Work in flight for each slot of a map, in seconds.
 
     A client that computes between results, or a machine that is short of processor time, sends the

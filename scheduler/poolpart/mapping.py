@@ -26,10 +26,10 @@ from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
-from .internals.client import gather, slots_lent, when_done
-from .map_lead import Lead
-from .membership import Prospects, prospects
-from .worker_wait import WAIT_S, WorkerWait, check_wait
+from .internals.client import call_when_done, gather, lend_slots
+from .map_lead import LeadTime
+from .membership import PartitionCapacity, request_capacity
+from .worker_wait import WAIT_S, WorkerWait, check_wait_s
 
 logger = logging.getLogger(__name__)
 
@@ -231,11 +231,11 @@ class Stage:
                     f"Invalid value {value!r} for `{name}`. Expected an integer of at least "
                     f"{minimum}."
                 )
-        check_wait(self.empty_s)
+        check_wait_s(self.empty_s)
 
-    def prospects(self) -> Prospects:
+    def request_capacity(self) -> PartitionCapacity:
         """Ask what the tasks of this stage may expect of the partition."""
-        return prospects(self.client, self.partition, self.slots, self.by_rule)
+        return request_capacity(self.client, self.partition, self.slots, self.by_rule)
 
     def send(
         self,
@@ -294,7 +294,7 @@ class Results(Iterator[Any]):
         self._items_read = 0  # items read from the source
         self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent again
         self._size = ChunkSize()
-        self._lead = Lead()
+        self._lead = LeadTime()
         self._running: dict[Future, Chunk] = {}
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that were sent
         # {index of the first item: a chunk that has ended, and its result or the failed task}
@@ -412,11 +412,11 @@ class Results(Iterator[Any]):
 
         PoolError if tasks of a stage could never run, or have waited for workers too long.
         """
-        prospects = [stage.prospects() for stage in self._stages]
-        self._slots = [of_stage.running for of_stage in prospects]
-        for wait, of_stage in zip(self._waits, prospects, strict=True):
+        request_capacity = [stage.request_capacity() for stage in self._stages]
+        self._slots = [of_stage.max_running for of_stage in request_capacity]
+        for wait, of_stage in zip(self._waits, request_capacity, strict=True):
             wait.check(of_stage)
-        until_next = min(wait.until_next_check(LOOK_S) for wait in self._waits)
+        until_next = min(wait.seconds_until_check(LOOK_S) for wait in self._waits)
         self._next_look = time.monotonic() + until_next
 
     def _submit(self) -> None:
@@ -474,7 +474,7 @@ class Results(Iterator[Any]):
             futures = stage.send(patience_s, firsts, calls, futures)
         for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
-            when_done(future, self._ended.put)
+            call_when_done(future, self._ended.put)
 
     def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
         """Return a chunk of items to send again or, if `fresh`, of new items, or None if empty."""
@@ -503,7 +503,7 @@ class Results(Iterator[Any]):
         """Wait until tasks are done, and lend the slots of a task of a partition meanwhile."""
         ended: list[Future] = []
         started = time.monotonic()
-        with slots_lent(self._ended.empty()):
+        with lend_slots(self._ended.empty()):
             while not ended:
                 self._check_while_waiting()
                 with suppress(queue.Empty):
@@ -530,7 +530,7 @@ class Results(Iterator[Any]):
             if future.status == "finished":
                 finished.append(future)
             elif future.status in ("pending", "lost"):  # lost with its worker: run it again
-                when_done(future, self._ended.put)
+                call_when_done(future, self._ended.put)
             else:
                 chunk = self._running.pop(future)
                 self._undelivered[chunk.first] = chunk, future

@@ -29,17 +29,17 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .adapting import adaptive_names, expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
-from .features import begin_features, end_features, features_settled, names_with_features
-from .internals.method_rules import Rules, rule_for_arriving_graphs
+from .features import begin_features, end_features, names_with_features, wait_for_features
+from .internals.method_rules import MethodRules, add_arrival_rule
 from .internals.names import REFUSING, require
 from .internals.placing import has_worker_for, workers_declaring
-from .internals.worker import task_of_thread
-from .registration import is_registered, note_registration
+from .internals.worker import current_task
+from .registration import is_registered, record_registration
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
 from .steward import Steward, names_with_rule
-from .workers import on_scheduler
+from .workers import run_on_scheduler
 
 logger = logging.getLogger(__name__)
 
@@ -75,14 +75,14 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
     if is_registered(client, name):
         return by_rule
     connection = client.scheduler_comm
-    has_or_had_rule, objection, others = on_scheduler(
+    has_or_had_rule, objection, others = run_on_scheduler(
         client,
         _register,
         name=name,
         slots=slots,
         by_rule=by_rule,
         client_id=client.id,
-        in_task=task_of_thread() is not None,
+        in_task=current_task() is not None,
     )
     if objection:
         raise PoolError(objection)
@@ -95,25 +95,27 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
             name,
             existing,
         )
-    note_registration(client, name, connection)
+    record_registration(client, name, connection)
     return bool(has_or_had_rule)
 
 
 @dataclass(frozen=True)
-class Prospects:
+class PartitionCapacity:
     """What tasks of a partition may expect of its workers."""
 
-    running: int  # tasks that run at a time, now or with all workers that may be started
+    max_running: int  # tasks that run at a time, now or with all workers that may be started
     has_workers: bool  # now, or a worker is starting, waits in a queue, or may be started
-    objection: str  # why the tasks could never run, or ""
+    rejection: str  # why the tasks could never run, or ""
 
 
-def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects:
+def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> PartitionCapacity:
     """Ask what tasks of so many slots may expect of a partition.
 
     The arguments are as in `register`.
     """
-    answer: Prospects = on_scheduler(client, _prospects, name=name, slots=slots, by_rule=by_rule)
+    answer: PartitionCapacity = run_on_scheduler(
+        client, _prospects, name=name, slots=slots, by_rule=by_rule
+    )
     return answer
 
 
@@ -130,10 +132,10 @@ class Registrations(SchedulerPlugin):
         # {partition: {id of a client: whether the client keeps the registrations of all clients}}
         self.clients: dict[str, dict[str, bool]] = {}
         self.with_rule: set[str] = set()  # partitions that have, or had, a rule
-        self._rules = Rules()
+        self._rules = MethodRules()
         try:
             require(REFUSING)
-            rule_for_arriving_graphs(self._rules, scheduler, self._check)
+            add_arrival_rule(self._rules, scheduler, self._check)
         except PoolError as error:  # partitions are of use without
             logger.warning(
                 "Partitions: Tasks that can never run wait instead of failing. %s", error
@@ -142,7 +144,7 @@ class Registrations(SchedulerPlugin):
 
     # -- clients -----------------------------------------------------------------------
 
-    def add(self, name: str, client: str, keeps: bool, has_or_had_rule: bool) -> None:
+    def register(self, name: str, client: str, keeps: bool, has_or_had_rule: bool) -> None:
         """Register a client for a partition."""
         self.clients.setdefault(name, {})[client] = keeps
         if has_or_had_rule:
@@ -151,9 +153,9 @@ class Registrations(SchedulerPlugin):
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Remove a client that has left."""
         for name in [name for name, clients in self.clients.items() if client in clients]:
-            self.remove(name, client)
+            self.unregister(name, client)
 
-    def remove(self, name: str, client: str) -> None:
+    def unregister(self, name: str, client: str) -> None:
         """Remove the registration of a client, and all of a partition that nothing keeps."""
         clients = self.clients[name]
         clients.pop(client, None)
@@ -164,7 +166,7 @@ class Registrations(SchedulerPlugin):
             del self.clients[name]
             self.with_rule.discard(name)
         if not self.clients:
-            self._rules.take_back()
+            self._rules.remove_all()
             self.scheduler.remove_plugin(NAME)
             statistics = self.scheduler.plugins.get(STATISTICS)
             if statistics is not None and not statistics.is_kept:
@@ -189,14 +191,14 @@ class Registrations(SchedulerPlugin):
         if not workers or not all(isinstance(worker, MemberName) for worker in workers):
             return graph
         [name] = resources
-        workers = addresses_of(self.scheduler, name, workers)
+        workers = addresses_of_members(self.scheduler, name, workers)
         return {**graph, "global_annotations": {**annotations, "workers": workers}}
 
     def _refuse(self, client: str, resources: Mapping[str, float]) -> None:
         """Raise a PoolError if tasks of a client with these resources could never run."""
         for name, slots in resources.items():
             if client in self.clients.get(name, ()):
-                objection = objection_to(self.scheduler, name, slots, name in self.with_rule)
+                objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
                 if objection:
                     raise PoolError(objection)
 
@@ -218,18 +220,18 @@ async def _register(
     ruled = has_rule(dask_scheduler, name)
     was_ruled = registrations is not None and name in registrations.with_rule
     has_or_had_rule = by_rule or ruled or was_ruled
-    objection = objection_to(dask_scheduler, name, slots, has_or_had_rule)
+    objection = rejection_reason(dask_scheduler, name, slots, has_or_had_rule)
     # The last request of a client that was killed may come after it has left.
     if not objection and client_id in dask_scheduler.clients:
         # A worker's client closes only with the worker, so that it must not prolong an inheritance
         # that other clients have begun.
         keeps = not (in_task and (ruled or name in names_with_features(dask_scheduler)))
         registrations = registrations or Registrations(dask_scheduler)
-        registrations.add(name, client_id, keeps, has_or_had_rule)
+        registrations.register(name, client_id, keeps, has_or_had_rule)
         statistics_of(dask_scheduler, keep=False)
         if not ruled:  # or the division of the pool has begun it
             begin_features(dask_scheduler, [name])
-        await features_settled()
+        await wait_for_features()
     others = None
     if not expects_any_worker(dask_scheduler, name, slots):
         others = partition_names(dask_scheduler)
@@ -260,15 +262,19 @@ def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
     )
 
 
-def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None) -> Prospects:
-    return Prospects(
+def _prospects(
+    name: str, slots: int, by_rule: bool, dask_scheduler: Any = None
+) -> PartitionCapacity:
+    return PartitionCapacity(
         max_running_tasks(dask_scheduler, name, slots),
         expects_any_worker(dask_scheduler, name, slots),
-        objection_to(dask_scheduler, name, slots, by_rule),
+        rejection_reason(dask_scheduler, name, slots, by_rule),
     )
 
 
-def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False) -> None:
+def release_partitions(
+    scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False
+) -> None:
     """End features in partitions without a rule, unless further clients are registered.
 
     Parameters
@@ -287,7 +293,7 @@ def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bo
             continue
         if had_rule:
             registrations.with_rule.add(name)
-        registrations.remove(name, client)
+        registrations.unregister(name, client)
 
 
 def release_statistics(scheduler: Any) -> None:
@@ -304,7 +310,7 @@ def has_rule(scheduler: Any, name: str) -> bool:
     return steward is not None and name in steward.rules
 
 
-def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
+def rejection_reason(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
     """Return why a task could never run in a partition, or "".
 
     Without any members the task waits: the only member may be starting again.
@@ -315,11 +321,11 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     if has_or_had_rule and not members and not has_rule(scheduler, name):
         return f"Partition {name!r} was dissolved. Divide the pool again, or use another partition."
     steward: Steward | None = scheduler.plugins.get(STEWARD)
-    seats = steward.members(name) if steward is not None else []
+    records = steward.members(name) if steward is not None else []
     max_slots = max(
         slots_of_new_worker(scheduler, name),
         *(worker.resources[name] for worker in members),
-        *(seat.slots for seat in seats),  # includes members that are starting
+        *(record.slots for record in records),  # includes members that are starting
         0,
     )
     if not max_slots or slots <= max_slots:
@@ -331,7 +337,7 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     )
 
 
-def addresses_of(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
+def addresses_of_members(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
     """Return the present addresses of members, given by names or addresses.
 
     An address without any worker is returned as given: the worker may have just left.

@@ -15,11 +15,17 @@ import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
-from .adapting import IDLE_S, Bounds, adapt, want
-from .division import ask, ask_to_dissolve, grow, resize, shrink
+from .adapting import IDLE_S, JobBounds, request_slots, set_bounds
+from .division import (
+    call_steward,
+    grow_partition,
+    request_dissolution,
+    resize_partition,
+    shrink_partition,
+)
 from .errors import PoolError
-from .extras.background import in_background
-from .extras.cancelling import ask_to_cancel
+from .extras.background import run_in_background
+from .extras.cancelling import cancel_tasks
 from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
 from .internals.names import CANCELLING, MAP, require
@@ -31,9 +37,9 @@ from .pipe_states import USES_PIPES
 from .rules import check_count
 from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
-from .task_table import TaskTable, moment
+from .task_table import TaskTable, to_datetime
 from .worker_wait import WAIT_S
-from .workers import WorkerInfo, all_workers, ask_for_repr, on_scheduler
+from .workers import WorkerInfo, all_workers, query_for_repr, run_on_scheduler
 
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
@@ -122,7 +128,7 @@ class Partition:
 
     def _size_in_words(self) -> str:
         """Return the number of workers and slots, or "" where the scheduler cannot be asked."""
-        return str(ask_for_repr(self._client, size_of, name=self.name) or "")
+        return str(query_for_repr(self._client, size_of, name=self.name) or "")
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
@@ -145,7 +151,7 @@ class Partition:
         >>> gpu.stats().running                                          # doctest: +SKIP
         4
         """
-        stats: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
+        stats: list[PartitionStats] = run_on_scheduler(self.client, stats_of, names=[self.name])
         return stats[0]
 
     def tasks(self) -> TaskTable:
@@ -164,8 +170,8 @@ class Partition:
         >>> [task.function for task in gpu.tasks() if task.state == "failed"]  # doctest: +SKIP
         ['cast']
         """
-        rows, since = on_scheduler(self.client, tasks_of, name=self.name)
-        return TaskTable.from_rows(rows, moment(since))
+        rows, since = run_on_scheduler(self.client, tasks_of, name=self.name)
+        return TaskTable.from_rows(rows, to_datetime(since))
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -473,7 +479,7 @@ class Partition:
         _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._taking(slots)
         tasks = ItemTasks(self, items, function, window, options, empty_s)
-        return tasks.run() if wait else in_background(tasks.run, tasks.stop)
+        return tasks.run() if wait else run_in_background(tasks.run, tasks.stop)
 
     def cancel(
         self,
@@ -534,7 +540,7 @@ class Partition:
             key: "ended" if task.status in ("finished", "error") else "cancelled"
             for key, task in tasks.items()
         }
-        outcomes |= ask_to_cancel(tasks, self.client, self.name, running == "restart")
+        outcomes |= cancel_tasks(tasks, self.client, self.name, running == "restart")
         self.client.cancel(
             [task for key, task in tasks.items() if not outcomes[key].startswith("kept")]
         )
@@ -674,7 +680,7 @@ class Partition:
         ['5', '6']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, grow, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, grow_partition, name=self.name, **arguments)
         return moved
 
     def resize(
@@ -719,7 +725,7 @@ class Partition:
         ['5']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, resize, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, resize_partition, name=self.name, **arguments)
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
@@ -743,7 +749,7 @@ class Partition:
         ['6']
         """
         arguments = {"count": workers, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, shrink, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, shrink_partition, name=self.name, **arguments)
         return moved
 
     # -- workers that come and go ------------------------------------------------------
@@ -752,7 +758,7 @@ class Partition:
         """Set the minimum and maximum number of jobs for an adaptive partition.
 
         Once per second, jobs are started for tasks that are ready to run but have no slot, and for
-        slots that clients request with `want`. A job that has not been needed for `idle_s` seconds
+        slots that clients request with `request_slots`. A job that has not been needed for `idle_s` seconds
         is ended or, if it is still queued, canceled. A worker is kept as long as it has a task
         (even if the task has seceded), an actor, or the only copy of a result. A lost worker is
         replaced as long as there is work. For a fixed number of jobs, pass the same number as
@@ -775,20 +781,20 @@ class Partition:
         --------
         >>> gpu.adapt(0, 8)                                              # doctest: +SKIP
         """
-        bounds = Bounds.checked(self.name, minimum, maximum, idle_s)
-        if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
+        bounds = JobBounds.validated(self.name, minimum, maximum, idle_s)
+        if not run_on_scheduler(self.client, set_bounds, name=self.name, bounds=bounds):
             raise PoolError(
                 f"Partition {self.name!r} has no jobs that can be started. Only partitions that "
                 "`start_partitions` or `scale_groups` created are adaptive. To change the size of "
                 "a partition of a divided pool, use `Partition.resize`."
             )
 
-    def want(self, slots: int) -> bool:
+    def request_slots(self, slots: int) -> bool:
         """Request slots for this client, and return whether the partition is adaptive.
 
         This method is intended for programs that assign each task to a specific worker, so that
         their tasks never wait for a slot. While slots are requested, jobs are started and kept as
-        if tasks were waiting for the slots. The request ends with ``want(0)`` or when the client
+        if tasks were waiting for the slots. The request ends with ``request_slots(0)`` or when the client
         closes. Tasks that wait for a slot do not need a request.
 
         Raises
@@ -798,12 +804,12 @@ class Partition:
 
         Examples
         --------
-        >>> gpu.want(4)                                                  # doctest: +SKIP
+        >>> gpu.request_slots(4)                                                  # doctest: +SKIP
         True
         """
         check_count("the number of requested slots", slots, minimum=0)
         asking = {"slots": slots, "asking": self.client.id}
-        return bool(on_scheduler(self.client, want, name=self.name, **asking))
+        return bool(run_on_scheduler(self.client, request_slots, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions.
@@ -811,7 +817,7 @@ class Partition:
         Workers that this partition has borrowed return to the partition that they were started in
         or that a rule has selected them for. Other workers declare their original resources again.
         """
-        ask_to_dissolve(self.client, [self.name], timeout_s)
+        request_dissolution(self.client, [self.name], timeout_s)
 
 
 _SLOTS_INSTEAD = "To request several slots of the partition, pass `slots`."

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .html_table import html_table, shown_seconds, text_table
-from .rules import workers_in_words
+from .html_table import format_seconds, html_table, text_table
+from .rules import format_workers
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
@@ -15,11 +15,11 @@ NO_PARTITION = "no partition"  # row of workers without a partition, and of ordi
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 
 
-def size_in_words(workers: int, target: int | None, slots: int) -> str:
+def describe_size(workers: int, target: int | None, slots: int) -> str:
     """Return the size of a partition in words, such as "1 of 2 workers, 4 slots"."""
-    counted = workers_in_words(workers)
+    counted = format_workers(workers)
     if target is not None and target != workers:
-        counted = f"{workers} of {workers_in_words(target)}"
+        counted = f"{workers} of {format_workers(target)}"
     return f"{counted}, {slots} {'slot' if slots == 1 else 'slots'}"
 
 
@@ -72,7 +72,7 @@ class StageStats:
     @property
     def _figures(self) -> list[object]:
         """Cells of a row of a table: the counts, and the running time in seconds."""
-        return [*(getattr(self, count) for count in COUNTS), shown_seconds(self.seconds)]
+        return [*(getattr(self, count) for count in COUNTS), format_seconds(self.seconds)]
 
 
 @dataclass(frozen=True, repr=False)
@@ -111,7 +111,7 @@ class PartitionStats(StageStats):
     target: int | None = None
 
     def __repr__(self) -> str:
-        size = size_in_words(self.workers, self.target, self.slots)
+        size = describe_size(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
         stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
         lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""

@@ -31,25 +31,25 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 
 from .errors import PipeClosed, PipeFailed
-from .extras.listening import Listener
+from .extras.listening import PipeListener
 from .extras.notebook import table_of_pipe
-from .internals.client import ask
+from .internals.client import send_request
 from .internals.names import PIPES, require
-from .internals.queues import Packed, unpack
-from .internals.worker import task_of_thread
+from .internals.queues import Packed, unpack_item
+from .internals.worker import current_task
 from .pipe_states import (
     CHANGE,
     PUT,
     TAKE,
     Replies,
     Reply,
-    answer_pipes,
-    delete_pipes,
-    open_pipe,
-    state_in_words,
+    create_pipe,
+    delete_existing_pipes,
+    describe_pipe,
+    install_pipe_handlers,
 )
 from .task_context import own_client
-from .workers import ask_for_repr, check_client, on_scheduler
+from .workers import check_client, query_for_repr, run_on_scheduler
 
 WAIT_S = 1.0  # longest wait of a request, seconds; a pipe that is closed or fails ends it
 _AGAIN_S = 0.01  # between two requests of one wait
@@ -177,7 +177,7 @@ class Pipe:
 
     def _state_in_words(self) -> str:
         """Return the number of items and the state, or "" where the scheduler cannot be asked."""
-        return str(ask_for_repr(self._client, state_in_words, name=self.name) or "")
+        return str(query_for_repr(self._client, describe_pipe, name=self.name) or "")
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show: depth, capacity and state."""
@@ -206,7 +206,7 @@ class Pipe:
         require(PIPES)
         client = self.client
         state = {"owner": client.id, "capacity": self.capacity, "producers": self.producers}
-        if not on_scheduler(client, open_pipe, name=self.name, **state):
+        if not run_on_scheduler(client, create_pipe, name=self.name, **state):
             raise ValueError(
                 f"The cluster already has a queue or variable named {self.name!r}. Choose another "
                 "name for the pipe, or delete an earlier pipe of this name."
@@ -215,7 +215,7 @@ class Pipe:
 
     def delete(self) -> None:
         """Delete the pipe and its queued items from the scheduler, if the pipe exists."""
-        forget_pipes(self.client, [self.name])
+        delete_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
         return self.create()
@@ -446,7 +446,7 @@ class Pipe:
                 if not self._buffer:
                     self._raise_at_end(reply, deadline, timeout_s)
             else:
-                return unpack(self.client, packed)
+                return unpack_item(self.client, packed)
 
     def _fill_buffer(
         self,
@@ -490,7 +490,7 @@ class Pipe:
         items: list[Any] = []
         for number, packed_item in enumerate(packed):
             try:
-                items.append(unpack(self.client, packed_item))
+                items.append(unpack_item(self.client, packed_item))
             except Exception:
                 remaining = packed[number:] if items else packed[1:]
                 self._buffer.extendleft(reversed(remaining))
@@ -512,7 +512,7 @@ class Pipe:
             while True:
                 yield self.get()
 
-    def listen(self, function: Callable[[Any], Any]) -> Listener:
+    def listen(self, function: Callable[[Any], Any]) -> PipeListener:
         """Start calling a function in this process for each item, until the pipe ends.
 
         The function is called in a single background thread, in the order of the items. The
@@ -538,7 +538,7 @@ class Pipe:
         ...     gpu.submit(cast, scans, hits).result()
         """
         _ = self.client  # the thread of the listener would get another client on a worker
-        return Listener(self, function, partial(put_back, self))
+        return PipeListener(self, function, partial(put_back, self))
 
 
 def _deadline(timeout_s: float | None) -> float:
@@ -553,7 +553,7 @@ def _is_answered(reply: Reply) -> bool:
 
 def _key_of_task() -> str:
     """Return the key of this thread's task, or "" elsewhere."""
-    running = task_of_thread()
+    running = current_task()
     return "" if running is None else str(running[1].key)
 
 
@@ -562,12 +562,12 @@ def _producer() -> str:
     return _key_of_task() or uuid.uuid4().hex
 
 
-def forget_pipes(client: Client, names: Sequence[str]) -> None:
+def delete_pipes(client: Client, names: Sequence[str]) -> None:
     """Delete pipes on the scheduler, with their items, if they exist."""
-    on_scheduler(client, delete_pipes, names=list(names))
+    run_on_scheduler(client, delete_existing_pipes, names=list(names))
 
 
-def advice_of(pipe: Pipe) -> int:
+def get_advice(pipe: Pipe) -> int:
     """Return the number of records that the consumer of a pipe wants bundled in an item.
 
     The number is as old as the last request of the object; before the first request, the scheduler
@@ -576,7 +576,7 @@ def advice_of(pipe: Pipe) -> int:
     return int(pipe._change()["advice"] if pipe._advice is None else pipe._advice)
 
 
-def advise(pipe: Pipe, amount: int) -> None:
+def set_advice(pipe: Pipe, amount: int) -> None:
     """Set the number of records that producers should bundle in an item, 1 or more.
 
     Only one consumer may call this.
@@ -585,7 +585,7 @@ def advise(pipe: Pipe, amount: int) -> None:
         raise ValueError(
             f"Invalid advice {amount} for pipe {pipe.name!r}. Expected an integer of at least 1."
         )
-    if amount != advice_of(pipe):
+    if amount != get_advice(pipe):
         pipe._change(advice=amount)
 
 
@@ -594,7 +594,7 @@ def put_back(pipe: Pipe, item: Any) -> None:
     pipe._buffer.appendleft(dumps(item))
 
 
-def take_beside(
+def take_items(
     pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float
 ) -> tuple[list[Any], bool, bool]:
     """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
@@ -626,7 +626,7 @@ def take_beside(
     return items, closed, closed and not pipe._buffer and len(items) < limit
 
 
-def take_news(
+def exchange_items(
     client: Client,
     seconds: float,
     pipes: Collection[str],
@@ -668,7 +668,7 @@ def take_news(
         puts=pickled,
     )
     answers = {name: reply["answer"] for name, reply in replies.items() if reply["answer"]}
-    return {name: [unpack(client, item) for item in items] for name, items in answers.items()}
+    return {name: [unpack_item(client, item) for item in items] for name, items in answers.items()}
 
 
 # {client: connection on which the client has asked its scheduler to answer requests}
@@ -679,7 +679,7 @@ def _let_answer(client: Client) -> None:
     """Have the scheduler answer requests, whether it has pipes or not, once a connection."""
     connection = client.scheduler_comm
     if connection is None or _connections.get(client) is not connection:
-        on_scheduler(client, answer_pipes)
+        run_on_scheduler(client, install_pipe_handlers)
         _connections[client] = connection
     else:
         check_client(client)
@@ -694,7 +694,9 @@ def _ask(client: Client, question: str, **arguments: Any) -> Replies:
     scheduler. The handler takes `arguments`.
     """
     _let_answer(client)
-    replies: Replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
+    replies: Replies = client.sync(
+        send_request, client, None, question, asker=client.id, **arguments
+    )
     return replies
 
 
@@ -728,7 +730,7 @@ def _ask_until(
     async def request() -> Replies:
         seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
         options = {"asker": client.id, "seconds": seconds, **arguments}
-        replies: Replies = await ask(client, None, question, **options)
+        replies: Replies = await send_request(client, None, question, **options)
         on_replies(replies)
         return replies
 

@@ -65,7 +65,7 @@ class PipeState:
         self.owner = owner  # cannot change, and outlasts a Variable that a client has deleted
         self.putters: set[str] = set()  # keys of the tasks that have put items
         self.takers: set[str] = set()  # keys of the tasks that have requested items
-        self.queue = BoundedQueue(capacity, self.why_no_put, self.why_no_get)
+        self.queue = BoundedQueue(capacity, self.put_error, self.get_error)
         value = {
             "owner": owner,
             "capacity": capacity,
@@ -77,7 +77,7 @@ class PipeState:
         }
         self._dask = QueueAndVariable(scheduler, name, self.queue, value)
         self.put = self._dask.put
-        self.take = self._dask.take
+        self.pop_items = self._dask.pop_items
         self.delete = self._dask.delete
         self.wake_early_readers = self._dask.wake_early_readers
 
@@ -97,23 +97,23 @@ class PipeState:
         """Whether the pipe was closed or deleted, or has failed."""
         return not self.exists or self.value["closed"] or bool(self.value["failure"])
 
-    def why_no_get(self) -> PipeFailed | None:
+    def get_error(self) -> PipeFailed | None:
         """Return the error of taking items now, or None while items may be taken."""
         if not self.exists:
             return PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
-    def why_no_put(self) -> PipeFailed | PipeClosed | None:
+    def put_error(self) -> PipeFailed | PipeClosed | None:
         """Return the error of putting items now, or None while items may be put."""
-        if (error := self.why_no_get()) is not None:
+        if (error := self.get_error()) is not None:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
     @property
-    def figures(self) -> tuple[int, int, str]:
+    def summary(self) -> tuple[int, int, str]:
         """Number of queued items, capacity, and the state in words."""
-        end = self.why_no_put()
+        end = self.put_error()
         words = "closed" if isinstance(end, PipeClosed) else f"failed: {end}" if end else "open"
         return self.queue.qsize(), self.queue.capacity, words
 
@@ -180,7 +180,7 @@ def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
     return list(pipes_of(dask_scheduler))
 
 
-def state_in_words(name: str, dask_scheduler: Any = None) -> str:
+def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
     """Return the number of queued items of a pipe and its state in words.
 
     Runs on the scheduler.
@@ -188,11 +188,11 @@ def state_in_words(name: str, dask_scheduler: Any = None) -> str:
     pipe = pipes_of(dask_scheduler).get(name)
     if pipe is None:
         return "does not exist"
-    depth, capacity, state = pipe.figures
+    depth, capacity, state = pipe.summary
     return f"{depth} of {capacity} items, {state}"
 
 
-async def open_pipe(
+async def create_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
     """Create a pipe, or return False if its name is used.
@@ -204,40 +204,42 @@ async def open_pipe(
     if QueueAndVariable.is_used(dask_scheduler, name) or owner not in dask_scheduler.clients:
         return False
     if NAME not in dask_scheduler.plugins:
-        dask_scheduler.add_plugin(Pipes(dask_scheduler))
+        dask_scheduler.add_plugin(PipeRegistry(dask_scheduler))
     state = PipeState(dask_scheduler, name, owner, capacity, producers)
     pipes_of(dask_scheduler)[name] = state
     await state.wake_early_readers()
     return True
 
 
-def no_pipes(**_: Any) -> Replies:
+def reply_without_pipes(**_: Any) -> Replies:
     """Answer a request of a client while the scheduler has no pipes."""
     return {}
 
 
-def answer_pipes(dask_scheduler: Any = None) -> None:
+def install_pipe_handlers(dask_scheduler: Any = None) -> None:
     """Answer requests from now on, also without any pipes. Runs on the scheduler.
 
     Dask would log a traceback for a request that it does not know, besides the client's error.
     """
     for question in (CHANGE, PUT, TAKE):
-        handlers_of(dask_scheduler).setdefault(question, no_pipes)
+        handlers_of(dask_scheduler).setdefault(question, reply_without_pipes)
 
 
-def fail_pipes_of_killed(scheduler: Any, key: Any, annotations: Mapping[str, Any] | None) -> None:
+def fail_pipes_of_killed_task(
+    scheduler: Any, key: Any, annotations: Mapping[str, Any] | None
+) -> None:
     """Let the pipes of a cancelled task fail whose worker was restarted under it."""
     if NAME in scheduler.plugins:
         scheduler.plugins[NAME].fail_for_killed(key, (annotations or {}).get(USES_PIPES, ()))
 
 
-def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
+def delete_existing_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
     """Delete pipes, as far as they exist. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].delete(names)
 
 
-class Pipes(SchedulerPlugin):
+class PipeRegistry(SchedulerPlugin):
     """The pipes of a scheduler, which exists as long as there are any pipes."""
 
     name = NAME
@@ -251,7 +253,7 @@ class Pipes(SchedulerPlugin):
         # they are either run again or forgotten.
         self._released: set[str] = set()
         handlers = handlers_of(scheduler)
-        handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.take})
+        handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.pop_items})
         self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
 
     # -- what happens on the scheduler -------------------------------------------------
@@ -334,7 +336,9 @@ class Pipes(SchedulerPlugin):
             self.scheduler.remove_plugin(NAME)
             self._end_interception()
             # Clients that have used pipes may ask again.
-            handlers_of(self.scheduler).update(dict.fromkeys((CHANGE, PUT, TAKE), no_pipes))
+            handlers_of(self.scheduler).update(
+                dict.fromkeys((CHANGE, PUT, TAKE), reply_without_pipes)
+            )
 
     def _check(self, name: str, value: Any) -> None:
         """Check a value that a client sets a Variable to."""
@@ -384,12 +388,12 @@ class Pipes(SchedulerPlugin):
         def put_into(state: PipeState) -> int:
             if state.has_ended or asker not in self.scheduler.clients:
                 return 0
-            fitting = items if unbounded else items[: state.queue.room]
+            fitting = items if unbounded else items[: state.queue.free_capacity]
             state.put(fitting)
             return len(fitting)
 
         def ready() -> bool:
-            return unbounded or all(s.has_ended or s.queue.room for s in states.values())
+            return unbounded or all(s.has_ended or s.queue.free_capacity for s in states.values())
 
         async def later() -> Replies:
             await wait_until(ready, [state.queue.waiters for state in states.values()], seconds)
@@ -400,7 +404,7 @@ class Pipes(SchedulerPlugin):
             state.putters |= {task} - {""}
         return self._replies(states, put_into) if ready() else later()
 
-    async def take(
+    async def pop_items(
         self,
         names: Sequence[str],
         asker: str,
@@ -449,10 +453,12 @@ class Pipes(SchedulerPlugin):
             )
 
         def is_full_or_ended() -> bool:
-            return any(state.has_ended or not state.queue.room for state in states.values())
+            return any(
+                state.has_ended or not state.queue.free_capacity for state in states.values()
+            )
 
         def take_from(state: PipeState) -> list[Any]:
-            return state.take(limit) if asker in self.scheduler.clients else []
+            return state.pop_items(limit) if asker in self.scheduler.clients else []
 
         states = self._taken_by(task, names)
         pipe_waiters = [state.queue.waiters for state in states.values()]

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 from distributed import Client
 
 from .adapting import adaptive_names
-from .division import ask, ask_to_dissolve, declare
+from .division import call_steward, create_partitions, request_dissolution
 from .errors import PoolError
-from .extras.dashboard_page import leave_page, partitions_page
+from .extras.dashboard_page import leave_page, open_page
 from .extras.notebook import table_of_partitions
 from .membership import partition_names
 from .partition import Partition
@@ -23,7 +23,7 @@ from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
 from .steward import names_with_rule
-from .workers import WorkerInfo, all_workers, ask_workers, note_on_slots, on_scheduler
+from .workers import WorkerInfo, all_workers, run_on_scheduler, run_on_workers, slots_note
 
 if TYPE_CHECKING:
     from .deploy.local_pool import LocalPool
@@ -90,7 +90,7 @@ class Pool:
         >>> Pool.from_client(client)                                       # doctest: +SKIP
         <Pool: workers 3, hosts 1, GPUs 0; partitions: IO 1, OTHER 2>
         """
-        if not all_workers(client) and not on_scheduler(client, adaptive_names):
+        if not all_workers(client) and not run_on_scheduler(client, adaptive_names):
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers. Start workers, for "
                 f'example with `dask worker {client.scheduler.address} --resources "GPU=1"`.'
@@ -159,7 +159,7 @@ class Pool:
     def __repr__(self) -> str:
         try:
             workers = self.workers
-            declared = Counter(dict.fromkeys(on_scheduler(self.client, partition_names), 0))
+            declared = Counter(dict.fromkeys(run_on_scheduler(self.client, partition_names), 0))
             declared.update(name for w in all_workers(self.client) for name in w.partitions)
         except (PoolError, OSError):  # its client was closed
             workers = self._workers
@@ -227,12 +227,12 @@ class Pool:
         ['GPU', 'IO']
         """
         workers = all_workers(self.client)
-        names, with_rule = on_scheduler(self.client, _all_and_divided)
+        names, with_rule = run_on_scheduler(self.client, _all_and_divided)
         return {
             name: Partition(
                 name,
                 self.client,
-                "" if name in with_rule else note_on_slots(name, workers),
+                "" if name in with_rule else slots_note(name, workers),
                 by_rule=name in with_rule,
             )
             for name in names
@@ -298,7 +298,7 @@ class Pool:
             return
         try:
             if self._partition_names:  # `dissolve` may have undone them by now
-                ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)
+                request_dissolution(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
@@ -444,18 +444,18 @@ class Pool:
         >>> pool.page()                                                    # doctest: +SKIP
         'http://127.0.0.1:8787/partitions'
         """
-        return partitions_page(self.client)
+        return open_page(self.client)
 
     def pipes(self) -> list[str]:
         """Return the names of all pipes in the cluster, whichever client created them.
 
         Dask's ``Queue(name)`` contains the items of a pipe, and ``Variable(name)`` its state.
         """
-        return sorted(on_scheduler(self.client, names_of_pipes))
+        return sorted(run_on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
         """Remove the page, unless another client has opened it as well."""
-        on_scheduler(self.client, leave_page, owner=self.client.id)
+        run_on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
         """Dissolve all partitions that any client has created on this cluster.
@@ -480,7 +480,7 @@ class Pool:
         PoolError
             If tasks have not finished in time. In this case, nothing changes.
         """
-        names = ask_to_dissolve(self.client, None, timeout_s)
+        names = request_dissolution(self.client, None, timeout_s)
         self._partition_names.clear()
         return names
 
@@ -501,9 +501,9 @@ class Pool:
         for worker in self.workers:  # workers that have joined since the pool was made
             first_seen = self._first_seen.get(worker.name, worker)
             self._first_seen[worker.name] = first_seen.with_gpus(worker.gpus)
-        notes, remaining_workers = ask(
+        notes, remaining_workers = call_steward(
             self.client,
-            declare,
+            create_partitions,
             rules=dict(rules),
             pool=self._first_seen,
             known_partitions=set(self.partitions()),
@@ -544,7 +544,7 @@ def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tu
 
     Raises PoolError if a worker cannot describe its machine.
     """
-    answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
+    answers = run_on_workers(client, worker_gpus, [worker.address for worker in workers])
     for worker in workers:
         if isinstance(error := answers.get(worker.address), BaseException):
             raise PoolError(

@@ -22,7 +22,7 @@ def is_registered(client: Client, name: str) -> bool:
     return connection is not None and _connections.get(client, {}).get(name) is connection
 
 
-def note_registration(client: Client, name: str, connection: Any) -> None:
+def record_registration(client: Client, name: str, connection: Any) -> None:
     """Note that a client has registered for a partition by a connection to its scheduler."""
     _connections.setdefault(client, {})[name] = connection
 

@@ -50,7 +50,7 @@ class Rule:
         """
         return []
 
-    def wants(
+    def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
         """Return whether to add a worker to the members, given all workers (`everyone`)."""
@@ -96,14 +96,14 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
                     chosen.append(worker)
         return chosen
 
-    def wants(
+    def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
         """Return whether to add a worker, which must have a GPU if any worker has one."""
         if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
         same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
-        return super().wants(worker, same_kind, everyone)
+        return super().accepts(worker, same_kind, everyone)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class n_workers(Rule):  # noqa: N801
 
 
 @dataclass(frozen=True)
-class Named(Rule):
+class NamedWorkers(Rule):
     """The workers of a list of names or addresses, as `named` makes it."""
 
     names: tuple[str, ...]
@@ -168,7 +168,7 @@ class Named(Rule):
         """Number of names."""
         return len(self.names)
 
-    def missing(self, members: Sequence[WorkerInfo]) -> list[str]:
+    def missing_names(self, members: Sequence[WorkerInfo]) -> list[str]:
         """Return the names that none of the members has."""
         present = {name for worker in members for name in (worker.name, worker.address)}
         return [name for name in self.names if name not in present]
@@ -193,7 +193,7 @@ class rest(Rule):  # noqa: N801
         return list(free)
 
 
-def named(*names: str | int, **common: Any) -> Named:
+def named(*names: str | int, **common: Any) -> NamedWorkers:
     """Return a rule that selects workers by name or address, including those that join later.
 
     Raises
@@ -213,10 +213,10 @@ def named(*names: str | int, **common: Any) -> Named:
             f"The rule `named` was called with {problem}. Pass the name or address of each worker "
             'as a separate argument, for example `named("0", "1")`.'
         )
-    return Named(tuple(map(str, names)), **common)
+    return NamedWorkers(tuple(map(str, names)), **common)
 
 
-def divide(
+def divide_workers(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
     """Divide workers by rules, in order: each rule takes workers that earlier rules have left.
@@ -252,7 +252,7 @@ def divide(
         earlier_rules = len(chosen) - 1
         if len(workers) < rule.minimum:
             raise PoolError(
-                f"Partition {name!r} requires at least {workers_in_words(rule.minimum)}, but its "
+                f"Partition {name!r} requires at least {format_workers(rule.minimum)}, but its "
                 f"rule selects {len(workers)}. {_advice(rule, free, pool, earlier_rules)}"
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
@@ -261,11 +261,11 @@ def divide(
             source = _largest_partition(worker for worker in pool if worker not in free)
             move = f", and `resize(…, source={source!r})` moves existing workers into it"
             notes[name] = (
-                f"The partition has {len(workers)} of the {workers_in_words(rule.workers)} that "
+                f"The partition has {len(workers)} of the {format_workers(rule.workers)} that "
                 f"its rule requests. Workers that join the cluster later are added to it"
                 f"{move if source else ''}."
             )
-        if isinstance(rule, Named) and (missing := rule.missing(workers)):
+        if isinstance(rule, NamedWorkers) and (missing := rule.missing_names(workers)):
             notes[name] = (
                 "The partition does not have all workers that its rule names. "
                 f"{_whereabouts(missing, pool)}"
@@ -285,11 +285,13 @@ def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str,
     """Return the choice of each rule, by partition, even of fewer workers than its minimum."""
     choices: dict[str, _Choice] = {}
     chosen_addresses: set[str] = set()  # not names, which may repeat
-    named_by_rules = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
+    named_by_rules = {
+        n for rule in rules.values() if isinstance(rule, NamedWorkers) for n in rule.names
+    }
     for name, rule in rules.items():
         declaring = [worker for worker in pool if worker.partitions == {name}]
         free = [w for w in pool if not w.partitions and w.address not in chosen_addresses]
-        if not isinstance(rule, Named):
+        if not isinstance(rule, NamedWorkers):
             free = [w for w in free if not named_by_rules & {w.name, w.address}]
         free = [*declaring, *free]
         choices[name] = _Choice(rule, free, rule.choose(free))
@@ -297,7 +299,7 @@ def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str,
     return choices
 
 
-def shortfalls(
+def find_shortfalls(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo], pool_as_seen: Sequence[WorkerInfo]
 ) -> dict[str, str]:
     """Return a note for each partition that gets fewer workers than the client could expect.
@@ -313,7 +315,7 @@ def shortfalls(
     expected = _choices(rules, pool_as_seen)
     return {
         name: f"The partition has {len(now[name].workers)} of the "
-        f"{workers_in_words(len(choice.workers))} that its rule would have selected when the pool "
+        f"{format_workers(len(choice.workers))} that its rule would have selected when the pool "
         "was created. The other workers have been assigned to other partitions since then."
         for name, choice in expected.items()
         if len(now[name].workers) < len(choice.workers)
@@ -364,14 +366,14 @@ def _advice(
     """Return advice about a rule that has too few workers, with the number of rules before it."""
     if isinstance(rule, n_workers) and rule.workers < rule.minimum:
         return (
-            f"The rule allows at most {workers_in_words(rule.workers)}. Increase this number, or "
+            f"The rule allows at most {format_workers(rule.workers)}. Increase this number, or "
             f"pass `minimum={rule.workers}`."
         )
     elsewhere = [worker for worker in pool if worker.partitions and worker not in free]
     sentences = []
-    if isinstance(rule, Named):
+    if isinstance(rule, NamedWorkers):
         elsewhere = [w for w in elsewhere if {w.name, w.address} & {*rule.names}]
-        sentences.append(_whereabouts(rule.missing(rule.choose(free)), pool))
+        sentences.append(_whereabouts(rule.missing_names(rule.choose(free)), pool))
     else:
         verb = "is" if len(free) == 1 else "are"
         reorder = ", or place this partition before the others" if earlier_rules else ""
@@ -381,11 +383,11 @@ def _advice(
         )
     if elsewhere:
         source = _largest_partition(elsewhere)
-        if not isinstance(rule, Named):
+        if not isinstance(rule, NamedWorkers):
             names = sorted({name for worker in elsewhere for name in worker.partitions})
             verb = "declares" if len(elsewhere) == 1 else "declare"
             sentences.append(
-                f"{workers_in_words(len(elsewhere))} already {verb} the "
+                f"{format_workers(len(elsewhere))} already {verb} the "
                 f"resource{'s' if len(names) > 1 else ''} {_listed(names)}."
             )
         sentences.append(
@@ -408,17 +410,19 @@ def partition_for(
     minimum or with none, then the order of the rules.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
-    willing = [name for name, rule in rules.items() if rule.wants(worker, members[name], everyone)]
+    willing = [
+        name for name, rule in rules.items() if rule.accepts(worker, members[name], everyone)
+    ]
     short = [
         name
         for name in willing
         if len(members[name]) < max(rules[name].minimum, not isinstance(rules[name], rest))
     ]
-    by_name = [name for name in willing if isinstance(rules[name], Named)]
+    by_name = [name for name in willing if isinstance(rules[name], NamedWorkers)]
     return next(iter([*by_name, *short, *willing]), None)
 
 
-def workers_in_words(count: int) -> str:
+def format_workers(count: int) -> str:
     """Return a number of workers for a message, such as "1 worker"."""
     return f"{count} {'worker' if count == 1 else 'workers'}"
 

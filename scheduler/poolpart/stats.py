@@ -17,10 +17,10 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .features import FEATURES
-from .fence import fences_of
-from .partition_stats import PartitionStats, StageStats, size_in_words
+from .fence import fence_names
+from .partition_stats import PartitionStats, StageStats, describe_size
 from .steward import target_of
-from .task_table import KEPT, TaskRow, moment
+from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
 NAME = "poolpart-stats"
 _ERROR_LETTERS = 200  # letters kept of the error of a task
@@ -35,7 +35,7 @@ _WAITING = {
 }
 
 
-class Statistics(SchedulerPlugin):
+class TaskStatistics(SchedulerPlugin):
     """Counts the scheduler's tasks that end, from its creation on."""
 
     name = NAME
@@ -48,7 +48,7 @@ class Statistics(SchedulerPlugin):
         # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         # {partition: its tasks that have ended, newest first}
-        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=KEPT))
+        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=MAX_ENDED_TASKS))
         self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
         self._deaths: dict[Any, int] = {}  # {key of a task: workers that died while they ran it}
         for feature in FEATURES:
@@ -96,8 +96,8 @@ class Statistics(SchedulerPlugin):
         """Keep a task that has ended: `report` is what its worker told of it."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
-        started = moment(computing[0]["start"] if computing else None)
-        finished = moment(computing[-1]["stop"] if computing else None)
+        started = to_datetime(computing[0]["start"] if computing else None)
+        finished = to_datetime(computing[-1]["stop"] if computing else None)
         seconds = (finished - started).total_seconds() if started and finished else None
         self.recent[partition].appendleft(
             TaskRow(
@@ -106,7 +106,7 @@ class Statistics(SchedulerPlugin):
                 function=task.prefix.name,
                 worker="" if worker is None else str(worker.name),
                 slots=_slots_taken(task, partition),
-                queued=moment(runnable),
+                queued=to_datetime(runnable),
                 started=started,
                 finished=finished,
                 error=" ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
@@ -137,7 +137,7 @@ def partition_of(task: Any) -> str:
     return next(iter(resources)) if resources else ""
 
 
-def members(scheduler: Any, partition: str) -> list[Any]:
+def workers_of(scheduler: Any, partition: str) -> list[Any]:
     """Return the states of the workers of a partition or, for "", of workers without resources."""
     workers = scheduler.workers.values()
     if partition:
@@ -186,7 +186,7 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     running = {
-        task.key for worker in members(scheduler, name) for task in _running_tasks(worker, name)
+        task.key for worker in workers_of(scheduler, name) for task in _running_tasks(worker, name)
     }
     rows = []
     for task in scheduler.tasks.values():
@@ -204,8 +204,8 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
                 function=task.prefix.name,
                 worker="" if worker is None else str(worker.name),
                 slots=_slots_taken(task, name),
-                queued=moment(statistics.queued_since(task.key)),
-                started=moment(started),
+                queued=to_datetime(statistics.queued_since(task.key)),
+                started=to_datetime(started),
                 seconds=seconds,
             )
         )
@@ -231,19 +231,19 @@ def size_of(name: str, dask_scheduler: Any = None) -> str:
 
     Runs on the scheduler.
     """
-    workers = members(dask_scheduler, name)
+    workers = workers_of(dask_scheduler, name)
     slots = sum(slots_of(worker, name) for worker in workers)
-    return size_in_words(len(workers), target_of(dask_scheduler, name), slots)
+    return describe_size(len(workers), target_of(dask_scheduler, name), slots)
 
 
-def statistics_of(scheduler: Any, keep: bool = True) -> Statistics:
+def statistics_of(scheduler: Any, keep: bool = True) -> TaskStatistics:
     """Find the scheduler's statistics, or start counting.
 
     With `keep`, the counts outlive the clients that submit to partitions.
     """
-    statistics: Statistics | None = scheduler.plugins.get(NAME)
+    statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is None:
-        statistics = Statistics(scheduler)
+        statistics = TaskStatistics(scheduler)
         scheduler.add_plugin(statistics)
     statistics.is_kept |= keep
     return statistics
@@ -251,7 +251,7 @@ def statistics_of(scheduler: Any, keep: bool = True) -> Statistics:
 
 def forget_statistics(scheduler: Any) -> None:
     """Stop counting, and delete the counts."""
-    statistics: Statistics | None = scheduler.plugins.get(NAME)
+    statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is not None:
         statistics.stop()
         scheduler.remove_plugin(NAME)
@@ -271,7 +271,7 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
     all_stages = sorted(under_way.keys() | statistics.ended.keys())
     answers = []
     for name in names:
-        workers = members(scheduler, name)
+        workers = workers_of(scheduler, name)
         by_worker = [running_on(worker, name) for worker in workers]
         running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
         stages = {}
@@ -292,8 +292,8 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 workers=len(workers),
                 slots=sum(slots_of(worker, name) for worker in workers),
                 busy=sum(held for _, held in by_worker),
-                exclusive=name in fences_of(scheduler),
-                since=moment(statistics.since),
+                exclusive=name in fence_names(scheduler),
+                since=to_datetime(statistics.since),
                 target=target_of(scheduler, name),
                 stages=stages,
                 **sums,

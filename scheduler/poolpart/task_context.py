@@ -51,7 +51,7 @@ def in_event_loop() -> bool:
 _LEAVING = (Status.closing, Status.closed, Status.failed)
 
 
-class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
+class WorkerLeavingError(RuntimeError):
     """A long task has ended because its worker is leaving.
 
     Submit the task again.
@@ -59,8 +59,8 @@ class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
 
 
 @contextmanager
-def telling_departure() -> Iterator[None]:
-    """Raise `WorkerLeft` instead of any error while the worker is leaving.
+def translate_leaving_errors() -> Iterator[None]:
+    """Raise `WorkerLeavingError` instead of any error while the worker is leaving.
 
     A worker that is retired or restarted closes its client under the tasks that still run. They
     fail with CommClosedError, CancelledError, an AttributeError from within Dask and others,
@@ -70,7 +70,7 @@ def telling_departure() -> Iterator[None]:
 
     Raises
     ------
-    WorkerLeft
+    WorkerLeavingError
         If the worker is leaving; otherwise, and outside of a worker, errors pass unchanged.
     """
     try:
@@ -80,5 +80,5 @@ def telling_departure() -> Iterator[None]:
             if get_worker().status in _LEAVING:
                 # Without the cause, which may not be picklable.
                 message = f"The worker has left the cluster ({type(error).__name__}: {error})"
-                raise WorkerLeft(message) from None
+                raise WorkerLeavingError(message) from None
         raise

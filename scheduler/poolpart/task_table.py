@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple, SupportsIndex, overload
 
 from .errors import PoolError
-from .html_table import html_paragraph, html_table, shown_seconds, text_table
+from .html_table import format_seconds, html_paragraph, html_table, text_table
 
-KEPT = 1_000  # tasks of a partition that have ended
+MAX_ENDED_TASKS = 1_000  # tasks of a partition that have ended
 _SHOWN = 20  # rows of a table that is printed
 STATES = ("waiting", "queued", "running", "done", "failed")
 _ENDED = STATES.index("done")  # this and later states have ended
@@ -137,7 +137,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
 def _cells(row: TaskRow) -> tuple[str, ...]:
     """Return the cells of a row, with times of the day in UTC."""
-    seconds = "" if row.seconds is None else shown_seconds(row.seconds)
+    seconds = "" if row.seconds is None else format_seconds(row.seconds)
     times = [_time(row.queued), _time(row.started)]
     return (
         row.state,
@@ -155,6 +155,6 @@ def _time(moment: datetime | None) -> str:
     return "" if moment is None else f"{moment:%H:%M:%S}"
 
 
-def moment(seconds: float | None) -> datetime | None:
+def to_datetime(seconds: float | None) -> datetime | None:
     """Return a time in seconds since 1970 as a date in UTC."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

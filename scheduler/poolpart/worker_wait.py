@@ -7,7 +7,7 @@ import math
 import time
 
 from .errors import PoolError
-from .membership import Prospects
+from .membership import PartitionCapacity
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ class WorkerWait:
         self._seconds = seconds
         self._since: float | None = None  # time.monotonic()
 
-    def check(self, prospects: Prospects) -> None:
+    def check(self, prospects: PartitionCapacity) -> None:
         """Note the present state of the partition, and warn at the beginning of a wait.
 
         Raises
@@ -41,8 +41,8 @@ class WorkerWait:
         PoolError
             If the tasks could never run, or the wait has been too long.
         """
-        if prospects.objection:
-            raise PoolError(prospects.objection)
+        if prospects.rejection:
+            raise PoolError(prospects.rejection)
         if prospects.has_workers:
             self._since = None
             return
@@ -63,14 +63,14 @@ class WorkerWait:
                 "a longer `empty_s`."
             )
 
-    def until_next_check(self, longest_s: float) -> float:
+    def seconds_until_check(self, longest_s: float) -> float:
         """Return after how many seconds to check again, at most `longest_s`."""
         if self._since is None:
             return longest_s
         return max(0.0, min(longest_s, self._since + self._seconds - time.monotonic()))
 
 
-def check_wait(seconds: object) -> None:
+def check_wait_s(seconds: object) -> None:
     """Raise ValueError unless a value is a number of seconds for `WorkerWait`."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
         raise ValueError(

@@ -12,8 +12,8 @@ from distributed import Client
 from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
-from .internals.client import answer_of_scheduler, ask
-from .internals.worker import resources_here as resources_here  # records of tasks use it
+from .internals.client import await_scheduler, send_request
+from .internals.worker import declared_resources as declared_resources
 
 SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
 MISSED_BEATS = 3  # heartbeats that a worker may miss at least
@@ -72,7 +72,7 @@ class WorkerInfo:
         )
 
 
-def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
+def slots_note(name: str, workers: Iterable[WorkerInfo]) -> str:
     """Return a note on a worker whose slots of a partition differ from its threads, or ""."""
     for worker in workers:
         slots = worker.resources.get(name, 0)
@@ -85,13 +85,13 @@ def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
     return ""
 
 
-def on_scheduler(
+def run_on_scheduler(
     client: Client, function: Callable[..., Any], *, answer_s: float | None = None, **kwargs: Any
 ) -> Any:
     """Call `function(**kwargs, dask_scheduler=…)` in the scheduler's event loop.
 
     `answer_s` is the longest wait for the answer in seconds, by default that of
-    `answer_of_scheduler`.
+    `await_scheduler`.
 
     Raises
     ------
@@ -103,9 +103,7 @@ def on_scheduler(
     check_client(client)
 
     async def request() -> Any:
-        return await answer_of_scheduler(
-            client, client.run_on_scheduler(function, **kwargs), answer_s
-        )
+        return await await_scheduler(client, client.run_on_scheduler(function, **kwargs), answer_s)
 
     try:
         return client.sync(request)
@@ -116,7 +114,7 @@ def on_scheduler(
         ) from error
 
 
-def ask_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
+def query_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
     """Call a function on the scheduler for a `repr`.
 
     Returns None if there is no answer in 2 s, or if waiting for one would block an event loop.
@@ -128,7 +126,7 @@ def ask_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: 
         if asyncio.get_running_loop() is client.loop.asyncio_loop:
             return None
     try:
-        return on_scheduler(client, function, answer_s=_REPR_S, **kwargs)
+        return run_on_scheduler(client, function, answer_s=_REPR_S, **kwargs)
     except (PoolError, OSError):
         return None
 
@@ -160,7 +158,7 @@ def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
     # `Client.scheduler_info(n_workers=-1)` asks too, but returns an attribute, into which the
     # client puts an answer without workers every two seconds: on a busy machine a cluster of
     # hundreds looks empty now and then.
-    identity = client.sync(ask, client, None, "identity", n_workers=-1)
+    identity = client.sync(send_request, client, None, "identity", n_workers=-1)
     workers: dict[str, dict[str, Any]] = identity["workers"]
     return workers
 
@@ -170,7 +168,7 @@ def all_workers(client: Client) -> list[WorkerInfo]:
     return [WorkerInfo.from_identity(a, i) for a, i in worker_identities(client).items()]
 
 
-def ask_workers(
+def run_on_workers(
     client: Client, question: Callable[..., Any], addresses: Sequence[str]
 ) -> dict[str, Any]:
     """Run a function on workers, outside their tasks, by `Client.run`.
@@ -190,7 +188,9 @@ def ask_workers(
                     finished, _ = await asyncio.wait([answers], timeout=_LOOK_S)
                     if finished:
                         return dict(answers.result())
-                    present = (await ask(client, None, "identity", n_workers=-1))["workers"]
+                    present = (await send_request(client, None, "identity", n_workers=-1))[
+                        "workers"
+                    ]
                     silent = silent_workers({a: w["last_seen"] for a, w in present.items()})
             finally:
                 answers.cancel()  # also the answers of the workers that are not silent

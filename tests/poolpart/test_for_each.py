@@ -10,7 +10,7 @@ from distributed import Client, Event, Queue, as_completed, wait
 from tests.poolpart.helpers import LONG_S, join, leave, wait_for, worker_name
 
 from poolpart import Partition, Pipe, PipeClosed, PipeFailed, PoolError
-from poolpart.membership import prospects
+from poolpart.membership import request_capacity
 
 
 @pytest.fixture
@@ -78,9 +78,9 @@ def test_of_a_partition_that_is_empty_for_a_while(start, monkeypatch, pool, wait
 
     def look(*args):
         looks.append(args)
-        return prospects(*args)
+        return request_capacity(*args)
 
-    monkeypatch.setattr("poolpart.for_each.prospects", look)
+    monkeypatch.setattr("poolpart.for_each.request_capacity", look)
     client = start({"b": {}})
     pipe = Pipe("of-nobody", 3, client).create()
     # Nothing waits for a worker before the first item.

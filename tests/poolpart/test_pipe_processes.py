@@ -172,7 +172,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
             "dissolve": lambda: pool.dissolve(timeout_s=0.1),
             "divide": lambda: pool.divide({"Q": rest()}),
             "adapt": lambda: part.adapt(0, 1),
-            "want": lambda: part.want(1),
+            "want": lambda: part.request_slots(1),
             "first submit": lambda: Partition("Q", client).submit(abs, 1),
         }
         message = f"^The scheduler at {address} has not responded for 0.[0-9]+ s. Check that"

@@ -21,10 +21,10 @@ from distributed import SpecCluster, Status
 from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
-from ..adapting import IDLE_S, Bounds, JobKind, begin, look
+from ..adapting import IDLE_S, JobBounds, JobSpec, add_partitions, advise_jobs
 from ..errors import PoolError
 from ..internals.names import ADAPTING, CLUSTERS, require
-from ..internals.scheduler import ask_of_cluster
+from ..internals.scheduler import run_on_cluster_scheduler
 from ..rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
@@ -32,14 +32,14 @@ logger = logging.getLogger(__name__)
 _NAME = "poolpart"  # name of what looks after the jobs of a cluster
 ADAPT_EVERY_S = 1.0  # seconds between two adaptations of the partitions to their tasks
 LOOK_EVERY_S = 5.0  # seconds between two looks for workers that are gone
-INFORMATION = " - INFO - "  # marks lines of Dask's logs that are not complaints
+INFO_MARK = " - INFO - "  # marks lines of Dask's logs that are not complaints
 _DEATH_S = 60  # a worker that finds no scheduler for so long ends, like a worker of dask-jobqueue
 
 
 def start_partitions(
     cluster: SpecCluster,
     partitions: Mapping[str, Mapping[str, Any]],
-    tell: Callable[[str], object] = logger.warning,
+    report: Callable[[str], object] = logger.warning,
 ) -> None:
     """Start the workers of partitions on a dask-jobqueue cluster or an `SSHCluster`.
 
@@ -63,7 +63,7 @@ def start_partitions(
         example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster` accepts
         ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and ``hosts``.
         Workers are distributed over the hosts in turn. By default, there is one for each host.
-    tell
+    report
         Function that is called with problems that occur later: the last line of a job's log while
         workers are missing, or the reason why a worker cannot be started.
 
@@ -108,7 +108,7 @@ def start_partitions(
         name: _PartitionJobs.from_options(cluster, describe, name, options)
         for name, options in partitions.items()
     }
-    cluster.sync(_JobStarter(cluster, parts, tell).begin)
+    cluster.sync(_JobStarter(cluster, parts, report).begin)
 
 
 Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]]
@@ -121,7 +121,7 @@ class _PartitionJobs:
     name: str
     options: Mapping[str, Any]  # options of the cluster's class, where this partition differs
     initial_count: int  # number of jobs
-    kind: JobKind
+    kind: JobSpec
     describe: Describe
     submitted: int = 0  # jobs so far
     host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
@@ -141,7 +141,7 @@ class _PartitionJobs:
         cluster_options = dict(options)
         slots = cluster_options.pop("slots", 1)
         check_count(f"the number of slots of partition {name!r}", slots)
-        bounds = take_bounds(name, cluster_options)
+        bounds = pop_bounds(name, cluster_options)
         try:
             if bounds is not None:
                 count = bounds.minimum
@@ -153,7 +153,7 @@ class _PartitionJobs:
             sample = describe(cluster, f"{name}-0", name, slots, 0, cluster_options)
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started. {error}") from error
-        kind = JobKind(slots, len(sample.get("group", ".")), bounds)
+        kind = JobSpec(slots, len(sample.get("group", ".")), bounds)
         return cls(name, cluster_options, count, kind, describe)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
@@ -178,7 +178,7 @@ class _PartitionJobs:
         }
 
 
-def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
+def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
     """Remove `adapt` and `idle_s` from the options of a partition, or return None if absent."""
     adapt = options.pop("adapt", None)
     idle_s = options.pop("idle_s", None)
@@ -197,7 +197,7 @@ def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
             "`workers`."
         )
     minimum, maximum = adapt
-    return Bounds.checked(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
+    return JobBounds.validated(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
 
 
 class _JobStarter:
@@ -207,11 +207,11 @@ class _JobStarter:
         self,
         cluster: SpecCluster,
         partition_jobs: Mapping[str, _PartitionJobs],
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
     ) -> None:
         self._cluster = cluster
         self._parts = partition_jobs
-        self._tell = tell
+        self._report = report
         samples = (
             part.describe(cluster, "", part.name, 1, 0, part.options)
             for part in partition_jobs.values()
@@ -224,7 +224,7 @@ class _JobStarter:
         """Submit the first jobs, and manage all jobs as long as the cluster is open."""
         kinds = {name: part.kind for name, part in self._parts.items()}
         try:
-            await ask_of_cluster(self._cluster, begin, kinds=kinds)
+            await run_on_cluster_scheduler(self._cluster, add_partitions, kinds=kinds)
         except ModuleNotFoundError as error:
             raise PoolError(
                 f"The scheduler of the cluster cannot import {error.name!r}. Start it in the same "
@@ -254,13 +254,13 @@ class _JobStarter:
             if due:
                 self._logs_read_at = looked_at
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
-                    for line in self._logs.endings():
+                    for line in self._logs.new_last_lines():
                         self._say(line)
 
     async def _adapt(self) -> bool:
         """Start and forget jobs as the scheduler advises, and return whether jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
-        advice = await ask_of_cluster(self._cluster, look, jobs=jobs)
+        advice = await run_on_cluster_scheduler(self._cluster, advise_jobs, jobs=jobs)
         for name, advice_of_part in advice.items():
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
@@ -292,7 +292,7 @@ class _JobStarter:
         # "in": the same message also stands in the log of this program itself.
         if not any(earlier in text for earlier in self._messages):
             self._messages.add(text)
-            self._tell(line)
+            self._report(line)
 
 
 async def _start(cluster: SpecCluster) -> None:
@@ -324,7 +324,7 @@ class JobLogs:
         files = (path for folder in self._folders for path in folder.glob("*") if path.is_file())
         return {(path, path.stat().st_mtime_ns) for path in files}
 
-    def endings(self) -> Iterator[str]:
+    def new_last_lines(self) -> Iterator[str]:
         """Yield the last lines of new logs that have not changed since the previous call."""
         files = self._files()
         unchanged = (files & self._previous) - self._read
@@ -334,7 +334,7 @@ class JobLogs:
             with path.open("rb") as log:
                 log.seek(max(0, path.stat().st_size - 4000))
                 last_line = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
-            if last_line and INFORMATION not in last_line:
+            if last_line and INFO_MARK not in last_line:
                 yield f"The last line of the log {path} is: {last_line}"
 
 

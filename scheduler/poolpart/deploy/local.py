@@ -12,7 +12,7 @@ from distributed import Scheduler, Security, SpecCluster
 from ..errors import PoolError
 from ..internals.names import CLUSTERS, require
 from ..rules import check_count, check_name
-from .local_processes import FixedCluster, OwnNanny
+from .local_processes import FixedCluster, ScriptlessNanny
 
 LOOPBACK = "127.0.0.1"
 
@@ -123,7 +123,7 @@ def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, An
         "silence_logs": logging.ERROR,
         "preload": [__name__],  # calls `dask_setup`
     }
-    return {"cls": OwnNanny, "options": options}
+    return {"cls": ScriptlessNanny, "options": options}
 
 
 def dask_setup(worker: Any) -> None:

@@ -13,11 +13,11 @@ from typing import Any
 from distributed import Client
 
 from ..errors import PoolError
-from ..extras.background import in_background
-from ..internals.scheduler import number_of_transitions
+from ..extras.background import run_in_background
+from ..internals.scheduler import count_transitions
 from ..pipe_states import names_of_pipes
 from ..stats import statistics_of
-from ..workers import on_scheduler
+from ..workers import run_on_scheduler
 from .local import local_cluster
 
 logger = logging.getLogger(__name__)
@@ -39,12 +39,12 @@ class LocalPool:
         with ExitStack() as stack:
             cluster = stack.enter_context(local_cluster(partitions, **options))
             self.client = stack.enter_context(Client(cluster))
-            on_scheduler(self.client, _begin_to_count)
+            run_on_scheduler(self.client, _begin_to_count)
             self._stack = stack.pop_all()
         self._closing = threading.Lock()
         self._closed = threading.Event()
         if idle_s < math.inf:
-            in_background(lambda: self._close_when_idle(idle_s))
+            run_in_background(lambda: self._close_when_idle(idle_s))
 
     def close(self) -> None:
         """Close the client and the cluster, unless they are closed."""
@@ -57,7 +57,7 @@ class LocalPool:
         last_transitions = -1
         used_at = time.monotonic()
         while not self._closed.wait(min(LOOK_EVERY_S, idle_s)):
-            in_use, transitions = on_scheduler(self.client, _use)
+            in_use, transitions = run_on_scheduler(self.client, _use)
             if in_use or transitions != last_transitions:  # or it was used between two looks
                 last_transitions = transitions
                 used_at = time.monotonic()
@@ -74,4 +74,4 @@ def _begin_to_count(dask_scheduler: Any = None) -> None:
 def _use(dask_scheduler: Any = None) -> tuple[bool, int]:
     """Return whether a cluster has tasks, results or pipes, and a number that tasks change."""
     in_use = bool(dask_scheduler.tasks or names_of_pipes(dask_scheduler))
-    return in_use, number_of_transitions(dask_scheduler)
+    return in_use, count_transitions(dask_scheduler)

@@ -31,7 +31,7 @@ def forked_workers() -> Iterator[None]:
             utils._forkserver_preload_set = preload_set
 
 
-_starting: set[Nanny] = set()  # nannies of `OwnNanny` that are starting a worker
+_starting: set[Nanny] = set()  # nannies of `ScriptlessNanny` that are starting a worker
 
 
 @cache  # once: another library may have wrapped the same since
@@ -48,7 +48,7 @@ def _spare_workers_the_script() -> None:
     spawn.get_preparation_data = without_script
 
 
-class OwnNanny(Nanny):
+class ScriptlessNanny(Nanny):
     """A nanny whose workers do not import the script that starts the nanny.
 
     multiprocessing imports it to find functions by name, and a script without a main guard would

@@ -13,11 +13,11 @@ from typing import Any, Protocol, Self
 
 from distributed import Client
 
-from ..adapting import GroupAdvice, GroupReport, JobKind, begin, look_at_groups
+from ..adapting import GroupAdvice, GroupReport, JobSpec, add_partitions, advise_groups
 from ..errors import PoolError
 from ..rules import check_count, check_name
-from ..workers import on_scheduler
-from .clusters import take_bounds
+from ..workers import run_on_scheduler
+from .clusters import pop_bounds
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ def scale_groups(
     client: Client,
     groups: WorkerGroups,
     partitions: Mapping[str, Mapping[str, Any]],
-    tell: Callable[[str], object] = logger.warning,
+    report: Callable[[str], object] = logger.warning,
 ) -> GroupScaler:
     """Adapt the sizes of worker groups to the work of their partitions.
 
@@ -74,7 +74,7 @@ def scale_groups(
         for example ``[0, 8]``. ``slots`` is the number of tasks that each worker runs at the same
         time (1 by default). ``idle_s`` is the time in seconds without work after which a worker is
         closed (60 by default). `Partition.adapt` changes the range.
-    tell
+    report
         Function that is called with the reason if a group cannot be scaled, once for each message.
 
     Returns
@@ -100,18 +100,18 @@ def scale_groups(
             f"{groups!r}. For dask-kubernetes, pass `KubernetesGroups(cluster)`."
         )
     kinds = {name: _kind(name, options) for name, options in partitions.items()}
-    on_scheduler(client, begin, kinds=kinds)
-    return GroupScaler(client, groups, kinds, tell)
+    run_on_scheduler(client, add_partitions, kinds=kinds)
+    return GroupScaler(client, groups, kinds, report)
 
 
-def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
+def _kind(name: str, options: Mapping[str, Any]) -> JobSpec:
     """Read and check the options of a partition.
 
     Raises PoolError if an option is wrong.
     """
     check_name(name)
     remaining = dict(options)
-    bounds = take_bounds(name, remaining)
+    bounds = pop_bounds(name, remaining)
     slots = remaining.pop("slots", 1)
     check_count(f"the number of slots of partition {name!r}", slots)
     if bounds is None or remaining:
@@ -121,7 +121,7 @@ def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
             f"Invalid options for partition {name!r}. {problem} Expected `adapt`, for example "
             "[0, 8], and optionally `slots` and `idle_s`."
         )
-    return JobKind(slots, bounds=bounds, cancellable=False)
+    return JobSpec(slots, bounds=bounds, cancellable=False)
 
 
 class GroupScaler:
@@ -131,12 +131,12 @@ class GroupScaler:
         self,
         client: Client,
         groups: WorkerGroups,
-        kinds: Mapping[str, JobKind],
-        tell: Callable[[str], object],
+        kinds: Mapping[str, JobSpec],
+        report: Callable[[str], object],
     ) -> None:
         self._client = client
         self._groups = groups
-        self._tell = tell
+        self._report = report
         self._reports = {
             name: GroupReport(kind.bounds.minimum if kind.bounds else 0)
             for name, kind in kinds.items()
@@ -161,7 +161,7 @@ class GroupScaler:
         """Ask the scheduler for sizes, and pass them on, until this or the client is closed."""
         while not self._closed.wait(ADAPT_EVERY_S):
             try:
-                advice = on_scheduler(self._client, look_at_groups, reports=self._reports)
+                advice = run_on_scheduler(self._client, advise_groups, reports=self._reports)
             except (PoolError, OSError):  # the client is closed, or is connecting again
                 if self._client.status in ("closing", "closed"):
                     return
@@ -182,6 +182,6 @@ class GroupScaler:
             message = f"Group {name!r} could not be scaled to {advice.size} workers: {error}"
             if message not in self._messages:
                 self._messages.add(message)
-                self._tell(message)
+                self._report(message)
         else:
             self._reports[name] = GroupReport(advice.size, advice.leaving)

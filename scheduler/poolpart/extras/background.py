@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 
 from distributed import Future
 
-from ..internals.client import when_done
+from ..internals.client import call_when_done
 
 Result = TypeVar("Result")
 
 
-def in_background(
+def run_in_background(
     call: Callable[[], Result], stop: Callable[[], object] = lambda: None
 ) -> concurrent.futures.Future[Result]:
     """Make a call in a thread and return a future of its result or error.
@@ -91,7 +91,7 @@ def after_all(
     ended: SimpleQueue[Any] = SimpleQueue()
     for future in futures:
         if isinstance(future, Future):
-            when_done(future, ended.put)
+            call_when_done(future, ended.put)
         else:
             future.add_done_callback(ended.put)
 
@@ -104,4 +104,4 @@ def after_all(
                 future.result()  # raises the error of the future
         return function([future.result() for future in futures])
 
-    return in_background(wait_and_call, lambda: ended.put(None))
+    return run_in_background(wait_and_call, lambda: ended.put(None))

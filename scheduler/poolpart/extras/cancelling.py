@@ -16,11 +16,19 @@ from typing import Any, NamedTuple, TypeVar
 from distributed import Client, Future, Status
 
 from ..errors import PoolError
-from ..fetch import holds_for_driver
-from ..internals.scheduler import asks_for, call, cancel_keys, holds_nothing, reopen, restart, shut
-from ..internals.worker import running_keys, task_of_thread
-from ..pipe_states import fail_pipes_of_killed
-from ..workers import on_scheduler
+from ..fetch import holds_bytes
+from ..internals.scheduler import (
+    call_worker,
+    cancel_keys,
+    holds_nothing,
+    requires_any,
+    restart_worker,
+    resume_assigning,
+    stop_assigning,
+)
+from ..internals.worker import current_task, running_keys
+from ..pipe_states import fail_pipes_of_killed_task
+from ..workers import run_on_scheduler
 
 T = TypeVar("T")
 Outcomes = dict[Any, str]  # {key of a task: what happened}
@@ -43,18 +51,18 @@ def cancelled() -> bool:
     ...     while not cancelled():
     ...         start = improve(start)
     """
-    running = task_of_thread()
+    running = current_task()
     return running is not None and running[1].state == "cancelled"
 
 
-def ask_to_cancel(
+def cancel_tasks(
     tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
 ) -> Outcomes:
     """Cancel tasks of a partition, by key, on the scheduler.
 
     Returns {key: what happened}, without tasks that had not started, or had ended.
     """
-    outcomes, complaint = on_scheduler(
+    outcomes, complaint = run_on_scheduler(
         client,
         _cancel_tasks,
         keys=list(tasks),
@@ -83,7 +91,7 @@ async def _cancel_tasks(
         await asyncio.sleep(0.01)
     known = {key: scheduler.tasks[key] for key in keys if key in scheduler.tasks}
     for key, task in known.items():
-        if not asks_for(task, [name]):
+        if not requires_any(task, [name]):
             return {}, f"Task {key!r} does not belong to partition {name!r}. No task was canceled."
     workers = {key: task.processing_on for key, task in known.items()}
     annotations = {key: task.annotations for key, task in known.items()}
@@ -104,7 +112,7 @@ async def _cancel_tasks(
         outcomes |= dict.fromkeys(running, outcome)
         if outcome.startswith("restarted"):
             for key in running:
-                fail_pipes_of_killed(scheduler, key, annotations.get(key))
+                fail_pipes_of_killed_task(scheduler, key, annotations.get(key))
     return outcomes, ""
 
 
@@ -117,13 +125,13 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
         return f"{still_running} has no nanny to restart it"
     if worker.status is not Status.running:
         return f"{still_running} is {worker.status.name}"
-    shut(scheduler, worker)  # one step of the event loop: no task can arrive before
+    stop_assigning(scheduler, worker)  # one step of the event loop: no task can arrive before
     load = await _load(scheduler, worker)
     alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
     if not alone or not holds_nothing(scheduler, worker):
-        reopen(scheduler, worker)
+        resume_assigning(scheduler, worker)
         return f"{still_running} holds other tasks or results"
-    if await _within(restart(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
+    if await _within(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
 
@@ -138,7 +146,7 @@ class _Load(NamedTuple):
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
     """Ask a worker for its load, or return None if it does not answer."""
     try:
-        return await _within(call(scheduler, worker.address, _load_here), ANSWER_S)
+        return await _within(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
     except OSError:
         return None
 
@@ -158,4 +166,4 @@ async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
 
 
 def _load_here(dask_worker: Any = None) -> _Load:
-    return _Load(running_keys(dask_worker), holds_for_driver())
+    return _Load(running_keys(dask_worker), holds_bytes())

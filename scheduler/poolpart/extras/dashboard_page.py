@@ -19,10 +19,10 @@ from tornado.template import Template
 
 from ..errors import PoolError
 from ..features import FEATURES, Feature
-from ..fence import fences_of
-from ..html_table import WORDS, shown_seconds
+from ..fence import fence_names
+from ..html_table import TEXT_COLUMNS, format_seconds
 from ..internals.names import PAGE, require
-from ..internals.scheduler import serve, serve_no_longer
+from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
 from ..partition_stats import COUNTS, NO_PARTITION, StageStats
 from ..pipe_states import pipes_of
@@ -34,7 +34,7 @@ from ..stats import (
     stats_of,
 )
 from ..steward import NAME as STEWARD
-from ..workers import check_client, on_scheduler
+from ..workers import check_client, run_on_scheduler
 from .other_sites import names_of_machine, refusal
 
 NAME = "poolpart-page"
@@ -89,10 +89,10 @@ _FIGURES = (*COUNTS, "seconds")
 _OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "status", "address")
 
 
-def page_of(scheduler: Any) -> bytes:
+def render_page(scheduler: Any) -> bytes:
     """Return the HTML of the current page."""
     workers = list(scheduler.workers.values())
-    names = {*partition_names(scheduler)} | fences_of(scheduler)
+    names = {*partition_names(scheduler)} | fence_names(scheduler)
     names |= {name for name, _ in statistics_of(scheduler).ended if name}
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
@@ -103,7 +103,7 @@ def page_of(scheduler: Any) -> bytes:
         stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
     rows_of_workers = sorted((_worker(worker) for worker in workers), key=_by_partition_and_name)
     for name, pipe in pipes_of(scheduler).items():
-        pipes.append([name, *pipe.figures])
+        pipes.append([name, *pipe.summary])
     tables = [
         ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
         ("Stages", ["stage", "partition", *_FIGURES], stages),
@@ -111,7 +111,9 @@ def page_of(scheduler: Any) -> bytes:
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
     ]
     counts = f"workers {len(workers)}, partitions {len(partitions) - 1}, pipes {len(pipes)}"
-    return _PAGE.generate(tables=tables, counts=counts, words=WORDS, address=scheduler.address)
+    return _PAGE.generate(
+        tables=tables, counts=counts, words=TEXT_COLUMNS, address=scheduler.address
+    )
 
 
 def _shown(partition: str) -> str:
@@ -119,7 +121,7 @@ def _shown(partition: str) -> str:
 
 
 def _counts(stats: StageStats) -> list[object]:
-    return [*(getattr(stats, count) for count in COUNTS), shown_seconds(stats.seconds)]
+    return [*(getattr(stats, count) for count in COUNTS), format_seconds(stats.seconds)]
 
 
 def _worker(worker: Any) -> list[object]:
@@ -163,7 +165,7 @@ class _Handler(web.RequestHandler):
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
         self.set_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
-        self.finish(page_of(self.scheduler))
+        self.finish(render_page(self.scheduler))
 
 
 class PageOwners(SchedulerPlugin):
@@ -180,9 +182,9 @@ class PageOwners(SchedulerPlugin):
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler, "owners": self})]
         self.page = web.Application(handlers)
-        serve(scheduler, self.page)
+        add_pages(scheduler, self.page)
 
-    def add(self, owner: str, link: str | None) -> None:
+    def add_owner(self, owner: str, link: str | None) -> None:
         """Add a client that wants the page, with its link to the dashboard, None if unknown."""
         self.owners.add(owner)
         host = urlsplit(link or "").hostname
@@ -200,10 +202,10 @@ class PageOwners(SchedulerPlugin):
                 release_statistics(scheduler)
 
 
-def partitions_page(client: Client) -> str:
+def open_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster and return its URL."""
     check_client(client)
-    on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
+    run_on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
     link = page_link(client)
     if link is None:
         raise PoolError(
@@ -227,7 +229,7 @@ def _dashboard_link(client: Client) -> str | None:
         return None
 
 
-def is_open(scheduler: Any) -> bool:
+def is_page_open(scheduler: Any) -> bool:
     """Return whether the scheduler serves the page."""
     return NAME in scheduler.plugins
 
@@ -240,7 +242,7 @@ async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> Non
         return
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PageOwners(dask_scheduler, names))
-    dask_scheduler.plugins[NAME].add(owner, link)
+    dask_scheduler.plugins[NAME].add_owner(owner, link)
     statistics_of(dask_scheduler)
 
 
@@ -256,7 +258,7 @@ async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
 def close_page(scheduler: Any) -> None:
     """Stop serving the page."""
     if NAME in scheduler.plugins:
-        serve_no_longer(scheduler, scheduler.plugins[NAME].page)
+        remove_pages(scheduler, scheduler.plugins[NAME].page)
         scheduler.remove_plugin(NAME)
 
 

@@ -25,12 +25,12 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from ..choosing import WorkerChoice
+from ..choosing import WorkerChooser
 from ..errors import PoolError
 from ..features import FEATURES, Feature
-from ..internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
+from ..internals.method_rules import MethodRules, add_graph_rule, add_shuffle_rule
 from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require
-from ..internals.scheduler import Resources, tell_of_plugin
+from ..internals.scheduler import Resources, set_worker_plugin
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
 
@@ -49,8 +49,8 @@ class Inheritance(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.note = ""  # remark for users: what does not work with this version of Dask
-        self._rules = Rules()
-        self._choice: WorkerChoice | None = None
+        self._rules = MethodRules()
+        self._choice: WorkerChooser | None = None
         self._unreadable: UnreadableInputs | None = None
         self.lends = self._begin(
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
@@ -75,13 +75,13 @@ class Inheritance(SchedulerPlugin):
         return True
 
     def _nest(self) -> None:
-        rule_for_graphs(self._rules, self.scheduler, self._bequeath)
+        add_graph_rule(self._rules, self.scheduler, self._bequeath)
 
     def _shuffle(self) -> None:
-        rule_for_shuffles(self._rules, self.scheduler)
+        add_shuffle_rule(self._rules, self.scheduler)
 
     def _choose(self) -> None:
-        self._choice = WorkerChoice(self.scheduler, self.names)
+        self._choice = WorkerChooser(self.scheduler, self.names)
 
     def _read(self) -> None:
         self._unreadable = UnreadableInputs(self.scheduler, self.names)
@@ -93,7 +93,7 @@ class Inheritance(SchedulerPlugin):
 
     def uninstall(self) -> None:
         """Take the rules back."""
-        self._rules.take_back()
+        self._rules.remove_all()
         if self._choice is not None:
             self._choice.uninstall()
         if self._unreadable is not None:
@@ -129,7 +129,7 @@ class _Inheriting(Feature):
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         return frozenset() if rule is None else rule.names
 
-    async def settle(self) -> None:
+    async def wait_for_workers(self) -> None:
         """Wait until the workers have started or stopped lending, at most `ANSWER_S` seconds."""
         loop = asyncio.get_running_loop()
         requests = {request for request in _requests if request.get_loop() is loop}
@@ -147,6 +147,6 @@ _requests: set[asyncio.Future[Any]] = set()  # sent to workers and under way, of
 
 def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
     """Add the plugin of a partition to all workers, or remove the plugin with None."""
-    for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
+    for request in set_worker_plugin(scheduler, f"poolpart-lending-{name}", plugin):
         _requests.add(request)
         request.add_done_callback(_requests.discard)

@@ -44,16 +44,16 @@ from distributed import Status, rejoin, secede
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
-from ..internals.client import let_waits_lend
-from ..internals.scheduler import Resources, Submitter, call
+from ..internals.client import install_wait_hooks
+from ..internals.scheduler import Resources, SubmittingTask, call_worker
 from ..internals.worker import (
-    free_slots,
+    count_slots,
+    current_task,
     is_running,
+    release_slots,
+    reserve_slots,
     resources_of,
-    slots_here,
     submitter_of,
-    take_slots,
-    task_of_thread,
     threads_of,
 )
 
@@ -81,7 +81,7 @@ class _Loan:
 class _NestedTask:
     """A task that waits for slots of this worker, with its submitting task."""
 
-    submitter: Submitter
+    submitter: SubmittingTask
     since: float  # time.monotonic()
 
 
@@ -106,17 +106,17 @@ class Lender:
         """Make the slots of a loan free for further tasks."""
         self._loans[loan.key] += 1
         self._lent.add(loan.key)
-        free_slots(self.worker, loan.slots)
-        self.serve()
+        release_slots(self.worker, loan.slots)
+        self.return_slots()
 
     def take_back(self, loan: _Loan) -> None:
         """Reserve the slots of a loan, and set `returned` of the loan once the slots are free."""
         self._loans[loan.key] -= 1
         if not self._loans[loan.key]:
             del self._loans[loan.key]
-        take_slots(self.worker, loan.slots)
+        reserve_slots(self.worker, loan.slots)
         self._returning.append(loan)
-        self.serve()
+        self.return_slots()
 
     def begin_rejoin(self, key: Any) -> None:
         """Note a task that has its slots back, and waits for a thread."""
@@ -127,7 +127,7 @@ class Lender:
         """Note a task that has a thread again."""
         self._rejoining.discard(key)
 
-    def serve(self) -> None:
+    def return_slots(self) -> None:
         """Give slots back to returning tasks in order, as far as the slots are free.
 
         After the last partition has ended, all returning tasks go on at once.
@@ -143,7 +143,7 @@ class Lender:
         be below 0: the sum of both is what further tasks leave.
         """
         for name, number in slots.items():
-            available, total = slots_here(self.worker, name)
+            available, total = count_slots(self.worker, name)
             free = available + sum(loan.slots.get(name, 0) for loan in self._returning)
             # The total may be smaller than the loan: the partition has changed.
             if free < min(number, total):
@@ -164,7 +164,7 @@ class Lender:
         threads: a nested task may have started in a free slot, and wait for this task's thread. The
         nested task does not wait for slots, so that `slots_wanted` does not see it.
         """
-        slots = sum(slots_here(self.worker, name)[1] for name in loan.slots)
+        slots = sum(count_slots(self.worker, name)[1] for name in loan.slots)
         return loan.key in self._lent and slots > threads_of(self.worker)
 
     def _notify(self) -> None:
@@ -185,7 +185,7 @@ class Lender:
             self._nested[key] = _NestedTask(submitter, time.monotonic())
             if self._next_look is None:
                 self._look_later()
-        self.serve()
+        self.return_slots()
 
     def stop(self) -> None:
         """End with the last partition: forget waiting tasks, and warn no more."""
@@ -222,10 +222,12 @@ class Lender:
         waits = any(loan.key == key for loan in self._returning)
         return is_running(self.worker, key) and not (self._loans[key] or waits)
 
-    async def _warn(self, key: Any, submitter: Submitter) -> None:
+    async def _warn(self, key: Any, submitter: SubmittingTask) -> None:
         """Warn all clients if the submitter of a waiting task, on whichever worker, holds slots."""
         try:
-            holds = await call(self.worker, submitter.worker, _holds_slots, key=submitter.key)
+            holds = await call_worker(
+                self.worker, submitter.worker, _holds_slots, key=submitter.key
+            )
         except (OSError, ValueError):  # the worker has left, or the submitter's is not known
             holds = False
         if not holds or key not in self._nested:
@@ -257,7 +259,7 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
     """Return the lender and a new loan for the task of this thread, or None without slots."""
-    running = task_of_thread()
+    running = current_task()
     if running is None or getattr(_thread, "in_loan", False):
         return None
     worker, task = running
@@ -275,7 +277,7 @@ class _WaitHooks:
         """Return whether the task of this thread has slots to lend."""
         return _loan_of_thread() is not None
 
-    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+    def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
         """Wait until a call has its answer, or further tasks want the slots."""
         loan_of_task = _loan_of_thread()
         if loan_of_task is None:
@@ -295,7 +297,7 @@ class _WaitHooks:
             lender.waiters.discard(waiter)
 
     @contextmanager
-    def lent(self, waits: bool = True) -> Iterator[None]:
+    def lend(self, waits: bool = True) -> Iterator[None]:
         """Lend the slots and the thread of this thread's task within the block, if `waits`.
 
         At the end of the block the thread waits until the task has them back.
@@ -337,7 +339,7 @@ WAIT_HOOKS = _WaitHooks()
 def begin_lending(worker: Any, name: str) -> Lender:
     """Let the tasks of a partition lend on a worker, in the worker's event loop."""
     with _lock:
-        let_waits_lend(WAIT_HOOKS)
+        install_wait_hooks(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender
@@ -351,7 +353,7 @@ def end_lending(worker: Any, name: str) -> None:
         if not lender.names:
             del _lenders[worker]
             lender.stop()
-        lender.serve()
+        lender.return_slots()
 
 
 def lending_plugin(name: str) -> bytes:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self
 from dask.utils import funcname
 
 from ..errors import PipeClosed, PipeFailed
-from .background import in_background
+from .background import run_in_background
 
 _CHECK_S = 1.0  # interval at which the thread checks whether the listener was closed
 
@@ -28,7 +28,7 @@ class ItemSource(Protocol):
         """Make the pipe fail."""
 
 
-class Listener:
+class PipeListener:
     """Background thread, started by `Pipe.listen`, that calls a function for each item of a pipe.
 
     `join` waits until the pipe has ended, and `close` stops listening. At the end of a ``with``
@@ -57,7 +57,7 @@ class Listener:
         self._closed = threading.Event()
         self._calling = threading.Lock()  # held while the function runs
         self._thread: threading.Thread | None = None  # thread ids are used again, objects are not
-        self._done = in_background(self._listen)
+        self._done = run_in_background(self._listen)
 
     def join(self, timeout_s: float | None = None) -> None:
         """Wait until the pipe has ended and the function has been called for all items.

@@ -15,8 +15,8 @@ from ..membership import has_rule, partition_names
 from ..partition_stats import COUNTS, NO_PARTITION, PartitionStats
 from ..pipe_states import pipes_of
 from ..stats import stats_of
-from ..workers import on_scheduler
-from .dashboard_page import is_open, page_link
+from ..workers import run_on_scheduler
+from .dashboard_page import is_page_open, page_link
 
 _LINK = Template("""\
 {% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Partitions page</a></p>\
@@ -85,7 +85,7 @@ def _link(link: str | None, opener: str) -> str:
 
 def _ask(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
     """Return what a function finds on the scheduler, and the URL of the page if it is open."""
-    found, has_page = on_scheduler(client, look, **arguments)
+    found, has_page = run_on_scheduler(client, look, **arguments)
     return found, page_link(client) if has_page else None
 
 
@@ -100,7 +100,7 @@ def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]],
     Runs on the scheduler.
     """
     names = [*partition_names(dask_scheduler), ""]
-    return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_open(dask_scheduler)
+    return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_page_open(dask_scheduler)
 
 
 def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
@@ -113,7 +113,7 @@ def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[obje
     [stats] = stats_of([name], dask_scheduler)
     is_expected = has_rule(dask_scheduler, name) or name in adaptive_names(dask_scheduler)
     exists = bool(stats.workers) or is_expected
-    return _row(stats) if exists else None, is_open(dask_scheduler)
+    return _row(stats) if exists else None, is_page_open(dask_scheduler)
 
 
 def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
@@ -122,5 +122,5 @@ def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] |
     Runs on the scheduler.
     """
     pipe = pipes_of(dask_scheduler).get(name)
-    row = None if pipe is None else [name, *pipe.figures]
-    return row, is_open(dask_scheduler)
+    row = None if pipe is None else [name, *pipe.summary]
+    return row, is_page_open(dask_scheduler)

@@ -19,8 +19,8 @@ from collections.abc import Set
 from typing import Any
 
 from ..errors import PoolError
-from ..internals.method_rules import Rules, rule_for_failed_fetches
-from ..internals.scheduler import asks_for, call, fail_task, run_again
+from ..internals.method_rules import MethodRules, add_failed_fetch_rule
+from ..internals.scheduler import call_worker, fail_task, requires_any, reschedule_tasks
 from ..internals.worker import why_unreadable
 
 READ_S = 60.0  # seconds for a worker to fetch an input alone
@@ -33,15 +33,15 @@ class UnreadableInputs:
     def __init__(self, scheduler: Any, names: Set[str]) -> None:
         self.scheduler = scheduler
         self._names = names
-        self._rules = Rules()
+        self._rules = MethodRules()
         self._attempts: Counter[tuple[Any, str]] = Counter()  # keys as of `_open`
         # {(key of an input, address of a worker): the question whether the worker can read it}
         self._open: dict[tuple[Any, str], asyncio.Task[None]] = {}
-        rule_for_failed_fetches(self._rules, scheduler, self._examine_soon)
+        add_failed_fetch_rule(self._rules, scheduler, self._examine_soon)
 
     def uninstall(self) -> None:
         """Take the rule back."""
-        self._rules.take_back()
+        self._rules.remove_all()
 
     def _examine_soon(self, task: Any, worker: str) -> None:
         """Ask a worker about an input that it could not fetch, unless it is being asked."""
@@ -57,13 +57,13 @@ class UnreadableInputs:
             for waiting in task.dependents
             if waiting.processing_on is not None
             and waiting.processing_on.address == worker
-            and asks_for(waiting, self._names)
+            and requires_any(waiting, self._names)
         ]
 
     async def _examine(self, task: Any, worker: str) -> None:
         """Let tasks that wait for a result fail if their worker cannot unpickle the result."""
         holder = next(iter(task.who_has)).address
-        request = call(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
+        request = call_worker(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
         try:
             async with asyncio.timeout(READ_S):
                 error = await request
@@ -75,7 +75,7 @@ class UnreadableInputs:
         waiting = self._waiting(task, worker)
         self._attempts[task.key, worker] += 1
         if not error and self._attempts[task.key, worker] < MAX_ATTEMPTS:
-            run_again(self.scheduler, waiting)
+            reschedule_tasks(self.scheduler, waiting)
             return
         del self._attempts[task.key, worker]
         for dependent in waiting:

@@ -23,18 +23,18 @@ class WaitHooks(Protocol):
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""
 
-    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+    def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
         """Wait until a call has its answer, or further tasks want the slots."""
 
-    def lent(self, waits: bool = True) -> AbstractContextManager[None]:
+    def lend(self, waits: bool = True) -> AbstractContextManager[None]:
         """Lend the slots within the block, if the task waits."""
 
 
-_hooks: list[WaitHooks] = []  # hooks that `let_waits_lend` has set
+_hooks: list[WaitHooks] = []  # hooks that `install_wait_hooks` has set
 
 
 @cache  # once: another library may have wrapped the same since, and goes on calling this
-def let_waits_lend(hooks: WaitHooks) -> None:
+def install_wait_hooks(hooks: WaitHooks) -> None:
     """Wrap the waits of Dask's clients so that waiting tasks of this process lend slots.
 
     `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
@@ -62,7 +62,7 @@ def let_waits_lend(hooks: WaitHooks) -> None:
             pending = [future.status in ("pending", "lost") for future in futures]
             first = kwargs.get("return_when") == "FIRST_COMPLETED"
             waits = all(pending) if first else any(pending)
-            with hooks.lent(waits):
+            with hooks.lend(waits):
                 return sync(caller, function, *args, **kwargs)
         if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):
             return sync(caller, function, *args, **kwargs)
@@ -75,21 +75,21 @@ def let_waits_lend(hooks: WaitHooks) -> None:
         answer = asyncio.run_coroutine_threadsafe(call(), caller.loop.asyncio_loop)
         try:
             concurrent.futures.wait([answer], REQUEST_S)
-            hooks.until_wanted(answer)
+            hooks.wait_until_wanted(answer)
             # One loan to the end of the wait: a task that borrows the slots may wait in turn, and
             # trees of such tasks hang if each looks again and again whether its slots are wanted.
-            with hooks.lent(not answer.done()):
+            with hooks.lend(not answer.done()):
                 return answer.result()
         finally:
             answer.cancel()  # after an error in this thread
 
     def next_lending(completed: Any) -> Any:
         waits = not completed.has_ready() and not completed.is_empty()
-        with hooks.lent(waits):
+        with hooks.lend(waits):
             return next_completed(completed)
 
     def result_of_actor_lending(future: Any, *args: Any, **kwargs: Any) -> Any:
-        with hooks.lent(not future.done()):
+        with hooks.lend(not future.done()):
             return result_of_actor(future, *args, **kwargs)
 
     SyncMethodMixin.sync = sync_lending
@@ -97,12 +97,12 @@ def let_waits_lend(hooks: WaitHooks) -> None:
     as_completed.__next__ = as_completed.next = next_lending
 
 
-def slots_lent(waits: bool) -> AbstractContextManager[None]:
+def lend_slots(waits: bool) -> AbstractContextManager[None]:
     """Lend the slots of this thread's task within the block, if it waits, and tasks lend here."""
-    return _hooks[0].lent(waits) if _hooks else nullcontext()
+    return _hooks[0].lend(waits) if _hooks else nullcontext()
 
 
-def when_done(future: Future, function: Callable[[Future], Any]) -> None:
+def call_when_done(future: Future, function: Callable[[Future], Any]) -> None:
     """Call `function(future)` once the task has succeeded, failed or been cancelled.
 
     It is called in the client's event loop and must not block. `Future.add_done_callback` uses a
@@ -118,7 +118,7 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
     future.client.loop.add_callback(wait)
 
 
-async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
+async def fetch_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
     """Fetch results directly from a worker, without involving the scheduler."""
     from distributed.utils_comm import gather_from_workers
 
@@ -126,18 +126,18 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
     return dict(data)
 
 
-async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
+async def send_request(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
     """Call a handler of a worker, or of the scheduler if the address is None.
 
     Returns None if the scheduler lacks the handler, in which case the scheduler logs an error. The
-    caller sets a time limit for a worker; `answer_of_scheduler` sets the limit for the scheduler.
+    caller sets a time limit for a worker; `await_scheduler` sets the limit for the scheduler.
     """
     if address is None:
-        return await answer_of_scheduler(client, getattr(client.scheduler, question)(**arguments))
+        return await await_scheduler(client, getattr(client.scheduler, question)(**arguments))
     return await getattr(client.rpc(address), question)(**arguments)
 
 
-async def answer_of_scheduler(
+async def await_scheduler(
     client: Client, request: Awaitable[Any], seconds: float | None = None
 ) -> Any:
     """Await a request to the scheduler, for `ANSWER_S` seconds by default.
@@ -166,7 +166,7 @@ async def answer_of_scheduler(
 def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
     """Return the results of finished tasks, as `Client.gather` does.
 
-    Raises OSError, as `answer_of_scheduler` does, where `Client.gather` would wait forever.
+    Raises OSError, as `await_scheduler` does, where `Client.gather` would wait forever.
     """
 
     async def watch() -> list[Any]:
@@ -174,7 +174,7 @@ def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
         try:
             # Large results may take longer than an answer of the scheduler.
             while not (await asyncio.wait([results], timeout=ANSWER_S))[0]:
-                await ask(client, None, "identity", n_workers=0)
+                await send_request(client, None, "identity", n_workers=0)
             return list(results.result())
         finally:
             results.cancel()
@@ -182,7 +182,7 @@ def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
     return list(client.sync(watch))
 
 
-def as_bytes(data: Any) -> Any:
+def wrap_bytes(data: Any) -> Any:
     """Wrap bytes so that they are sent without copying."""
     from distributed.protocol import to_serialize
 

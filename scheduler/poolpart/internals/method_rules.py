@@ -10,7 +10,7 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
-from .scheduler import SUBMITTER, Resources, Submitter, actor_of_method
+from .scheduler import SUBMITTER, Resources, SubmittingTask, actor_of_method
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class _Method:
             )
 
 
-class Rules:
+class MethodRules:
     """Rules for methods of a running scheduler.
 
     Several objects may have rules for a method.
@@ -108,7 +108,7 @@ class Rules:
     def _stand_in(self, owner: Any, name: str, parameters: set[str]) -> _Method:
         method = getattr(type(owner), name, None)
         if method is None or not parameters <= inspect.signature(method).parameters.keys():
-            self.take_back()
+            self.remove_all()
             raise PoolError(
                 f"{type(owner).__name__} in distributed {distributed.__version__} has no method "
                 f"{name}({', '.join(sorted(parameters))}), which poolpart requires. Install a "
@@ -120,7 +120,7 @@ class Rules:
             setattr(owner, name, stand_in)
         return stand_in
 
-    def take_back(self) -> None:
+    def remove_all(self) -> None:
         """Remove these rules."""
         while self._added:
             owner, name, rule = self._added.pop()
@@ -132,7 +132,9 @@ class Rules:
                 delattr(owner, name)
 
 
-def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
+def add_graph_rule(
+    rules: MethodRules, scheduler: Any, bequeath: Callable[[Any], Resources]
+) -> None:
     """Give the tasks of a graph that a task submits the resources that the graph leaves open.
 
     `bequeath` returns these resources for the state of the submitting task. Each task is annotated
@@ -146,7 +148,7 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
         if not inherited:
             return graph
         address = task.processing_on.address if task.processing_on else ""  # not of an actor
-        submitter = Submitter(task.key, address)
+        submitter = SubmittingTask(task.key, address)
         global_annotations = graph["global_annotations"] or {}
         by_type = graph["annotations_by_type"]  # {"workers": {key: …}, "resources": …}
         by_type = {**by_type, SUBMITTER: dict.fromkeys(graph["dsk"], submitter)}
@@ -165,7 +167,7 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
     )
 
 
-def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> None:
+def add_arrival_rule(rules: MethodRules, scheduler: Any, check: Before) -> None:
     """Call `check` with the arguments of each graph that arrives, so that its PoolError refuses it.
 
     The client then gets the error from each of the graph's futures.
@@ -178,7 +180,7 @@ def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> Non
     )
 
 
-def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
+def add_shuffle_rule(rules: MethodRules, scheduler: Any) -> None:
     """Let shuffles and rechunks choose permitted workers for their output.
 
     Dask pins each output to any worker of the cluster, even if the tasks ask for a resource that
@@ -203,8 +205,8 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
     rules.call_after(shuffle, "_calculate_worker_for", move_outputs, "spec")
 
 
-def rule_for_fences(
-    rules: Rules, scheduler: Any, closed: set[Any], stop: Callable[[Any], bool]
+def add_fence_rules(
+    rules: MethodRules, scheduler: Any, closed: set[Any], stop: Callable[[Any], bool]
 ) -> None:
     """Keep tasks away from workers behind a fence.
 
@@ -238,7 +240,7 @@ def rule_for_fences(
     scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
 
 
-def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
+def add_choice_rule(rules: MethodRules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
     """Let `choose` choose the workers of tasks, unless `choose` returns NotImplemented.
 
     PoolError if this version of Dask places tasks in another way.
@@ -246,8 +248,8 @@ def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) 
     rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
-def rule_for_failed_fetches(
-    rules: Rules, scheduler: Any, report: Callable[[Any, str], None]
+def add_failed_fetch_rule(
+    rules: MethodRules, scheduler: Any, report: Callable[[Any, str], None]
 ) -> None:
     """Call `report(task, address)` if a worker could not fetch a result that another worker has."""
 
@@ -261,9 +263,9 @@ def rule_for_failed_fetches(
     rules.call_instead(scheduler, "stimulus_task_erred", look, "key")
 
 
-def take_back_fences(rules: Rules, scheduler: Any) -> None:
+def remove_fence_rules(rules: MethodRules, scheduler: Any) -> None:
     """Remove the rule for fences from the scheduler."""
-    rules.take_back()
+    rules.remove_all()
     scheduler.idle_task_count = set(scheduler.idle_task_count)
 
 

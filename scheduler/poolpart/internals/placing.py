@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 
-def group_of(task: Any) -> tuple[str, float] | None:
+def only_resource_of(task: Any) -> tuple[str, float] | None:
     """Return the only resource that a task asks for, with its quantity, or ("", 1) for none.
 
     None for a task that is bound to workers or hosts, asks for several resources, or is an actor.
@@ -30,7 +30,7 @@ def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
     return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
 
 
-def number_declaring(scheduler: Any, name: str) -> int:
+def count_declaring(scheduler: Any, name: str) -> int:
     """Return the number of workers that declare a resource."""
     return len(scheduler.resources.get(name, ()))
 
@@ -42,7 +42,7 @@ def free_slots_of(worker: Any, name: str) -> float:
     return float(worker.resources.get(name, 0) - worker.used_resources.get(name, 0))
 
 
-def may_take(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
+def can_run(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
     """Return whether a worker runs and declares enough slots of a resource, "" for none."""
     enough = not name or worker.resources.get(name, 0) >= slots
     return bool(enough and worker in scheduler.running)
@@ -53,6 +53,6 @@ def holders_of_inputs(task: Any) -> list[Any]:
     return [worker for task_input in task.dependencies for worker in task_input.who_has or ()]
 
 
-def start_first(scheduler: Any, task: Any, workers: list[Any]) -> Any:
+def earliest_worker(scheduler: Any, task: Any, workers: list[Any]) -> Any:
     """Return the worker on which a task is expected to start first, by Dask's own estimate."""
     return min(workers, key=partial(scheduler.worker_objective, task))

@@ -32,7 +32,7 @@ VARIABLE_SET = "variable_set"  # the request of `Variable.set`
 LOOK_S = 1.0  # a wait looks so often whether it has ended, even if nothing has changed
 
 Record = dict[str, Any]  # an item's record, as Dask's queue extension keeps it
-Packed = bytes | Record  # an item on its way to a client (`unpack`)
+Packed = bytes | Record  # an item on its way to a client (`unpack_item`)
 # Type of the items that pipes put. Their value is serialized: the scheduler passes it on, and
 # `Queue.get` of a client returns the object. Clients themselves put types "msgpack" and "Future".
 _PICKLED = "pickled"
@@ -125,13 +125,15 @@ class BoundedQueue:
         return not self._queue
 
     @property
-    def room(self) -> int:
+    def free_capacity(self) -> int:
         """Items that may be put now."""
         return max(0, self.capacity - len(self._queue))
 
     async def put(self, record: Record) -> None:
         """Wait until the queue has room, then add an item."""
-        await wait_until(lambda: self.room > 0 or self._why_no_put() is not None, [self.waiters])
+        await wait_until(
+            lambda: self.free_capacity > 0 or self._why_no_put() is not None, [self.waiters]
+        )
         if (error := self._why_no_put()) is not None:
             raise error
         self.extend([record])
@@ -144,18 +146,20 @@ class BoundedQueue:
         error = self._why_no_get() if self._queue else self._why_no_put()
         if error is not None:
             raise error
-        return self.take(1)[0]
+        return self.pop_items(1)[0]
 
     def extend(self, records: Iterable[Record]) -> None:
         """Add items, also beyond the capacity."""
         was_empty = not self._queue
         self._queue.extend(records)
-        if was_empty or not self.room:  # takers wait for the first item, or linger until it is full
+        if (
+            was_empty or not self.free_capacity
+        ):  # takers wait for the first item, or linger until it is full
             self.waiters.notify()
 
-    def take(self, number: int) -> list[Record]:
+    def pop_items(self, number: int) -> list[Record]:
         """Remove and return the first items, `number` at most."""
-        had_room = self.room > 0
+        had_room = self.free_capacity > 0
         records = [self._queue.popleft() for _ in range(min(number, len(self._queue)))]
         if records and not had_room:  # producers wait only while the queue is full
             self.waiters.notify()
@@ -208,9 +212,9 @@ class QueueAndVariable:
         """Add pickled items to the queue, also beyond its capacity."""
         self.queue.extend([_record_of(item) for item in items])
 
-    def take(self, limit: int) -> list[Packed]:
+    def pop_items(self, limit: int) -> list[Packed]:
         """Remove the first items, at most `limit`, from the queue, and return them packed."""
-        records = self.queue.take(limit)
+        records = self.queue.pop_items(limit)
         return [_packed(self.name, record) for record in records]
 
     def delete(self) -> None:
@@ -238,7 +242,7 @@ def _packed(name: str, record: Record) -> Packed:
     return {**record, "queue": name}
 
 
-def unpack(client: Client, packed: Packed) -> Any:
+def unpack_item(client: Client, packed: Packed) -> Any:
     """Return an item that a client has got from `QueueAndVariable.take`, as `Queue.get` would."""
     from distributed.protocol.pickle import loads
 

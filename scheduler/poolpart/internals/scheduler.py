@@ -19,7 +19,7 @@ Resources = dict[str, float]
 SUBMITTER = "poolpart-submitter"  # annotation of tasks that a task of a partition submits
 
 
-class Submitter(NamedTuple):
+class SubmittingTask(NamedTuple):
     """A task of a partition that has submitted another: value of the annotation."""
 
     key: Any
@@ -29,7 +29,7 @@ class Submitter(NamedTuple):
 # -- where the scheduler places tasks ----------------------------------------------------
 
 
-def show(scheduler: Any, worker: Any, resources: Resources) -> None:
+def set_visible_resources(scheduler: Any, worker: Any, resources: Resources) -> None:
     """Make the scheduler use only the given resources when it places tasks on a worker."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
@@ -39,10 +39,10 @@ def show(scheduler: Any, worker: Any, resources: Resources) -> None:
         elif not declaring:
             del scheduler.resources[name]
     worker.resources = dict(resources)
-    recount(worker)
+    recount_used_resources(worker)
 
 
-def recount(worker: Any) -> None:
+def recount_used_resources(worker: Any) -> None:
     """Recount the resources in use.
 
     Dask forgets them when a worker declares something while it is busy, and counts a task
@@ -55,7 +55,7 @@ def recount(worker: Any) -> None:
             worker.used_resources[name] += quantity
 
 
-def wake(scheduler: Any, worker: Any) -> None:
+def send_waiting_tasks(scheduler: Any, worker: Any) -> None:
     """Send a worker the tasks that wait for its resources, as when a worker joins.
 
     The scheduler does not when a running worker gets a resource: the tasks would wait for ever.
@@ -67,11 +67,11 @@ def wake(scheduler: Any, worker: Any) -> None:
         )
 
 
-def open_to_all(scheduler: Any, worker: Any) -> None:
+def admit_other_tasks(scheduler: Any, worker: Any) -> None:
     """Send tasks to a worker that has been behind a fence."""
     scheduler.check_idle_saturated(worker)
     if worker.status is Status.running:
-        wake(scheduler, worker)
+        send_waiting_tasks(scheduler, worker)
         scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=f"poolpart-opened-{time.time()}")
 
 
@@ -99,7 +99,7 @@ def actor_of_method(scheduler: Any, name: Any) -> Any:
     )
 
 
-def asks_for(task: Any, names: Collection[str]) -> bool:
+def requires_any(task: Any, names: Collection[str]) -> bool:
     """Return whether a task takes a slot of any of the named partitions."""
     return not (task.resource_restrictions or {}).keys().isdisjoint(names)
 
@@ -110,7 +110,7 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
     No worker has the task's resource any more: the task would wait for ever.
     """
     for task in scheduler.tasks.values():
-        if asks_for(task, names):
+        if requires_any(task, names):
             restrictions = task.resource_restrictions.items()
             remaining = {name: slots for name, slots in restrictions if name not in names}
             task.resource_restrictions = remaining or None
@@ -121,16 +121,20 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 # A worker gives up a task on request unless the task runs; then another worker gets it.
 
 
-def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
+def keys_held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
     """Return the keys of tasks with these resources that a worker has or is about to get."""
-    tasks = {task for task in worker.processing if asks_for(task, names)}
+    tasks = {task for task in worker.processing if requires_any(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()
-        tasks |= {task for task, move in moves if move["thief"] is worker and asks_for(task, names)}
+        tasks |= {
+            task for task, move in moves if move["thief"] is worker and requires_any(task, names)
+        }
     return [task.key for task in tasks]
 
 
-def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]) -> None:
+def hand_off_tasks(
+    scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]
+) -> None:
     """Move the tasks of a worker that have not started to further members of their partition.
 
     A task that no other worker may take stays, and ends on this worker.
@@ -150,7 +154,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set
     # {worker: tasks on their way to it}. The scheduler counts a task when the old worker agrees.
     moving = Counter[Any]()
     for task in list(worker.processing - worker.long_running):
-        if task in requested or task.actor or not asks_for(task, names):
+        if task in requested or task.actor or not requires_any(task, names):
             continue
         requested.add(task)
         if candidates := (scheduler.valid_workers(task) or set()) - {worker}:
@@ -184,19 +188,19 @@ def holds_nothing(scheduler: Any, worker: Any) -> bool:
     return all(len(task.who_has) > 1 for task in worker.has_what)
 
 
-def takes_tasks(worker: Any) -> bool:
+def accepts_tasks(worker: Any) -> bool:
     """Return whether a worker gets tasks now, or after joining."""
     return worker.status in (Status.running, Status.init)
 
 
-def shut(scheduler: Any, worker: Any) -> None:
+def stop_assigning(scheduler: Any, worker: Any) -> None:
     """Let a worker get no further tasks."""
     stimulus = f"poolpart-shut-{time.time()}"
     scheduler.handle_worker_status_change(Status.closing_gracefully, worker, stimulus)
 
 
-def reopen(scheduler: Any, worker: Any) -> None:
-    """Let a worker get tasks again after `shut`, or after a retirement that failed."""
+def resume_assigning(scheduler: Any, worker: Any) -> None:
+    """Let a worker get tasks again after `stop_assigning`, or after a retirement that failed."""
     if scheduler.workers.get(worker.address) is worker:
         stimulus = f"poolpart-reopened-{time.time()}"
         message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
@@ -204,22 +208,22 @@ def reopen(scheduler: Any, worker: Any) -> None:
         scheduler.handle_worker_status_change(Status.running, worker, stimulus)
 
 
-async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
+async def retire_workers(scheduler: Any, workers: Collection[Any]) -> bool:
     """Close workers. Return False if one stays because no other worker can take its results."""
     addresses = [worker.address for worker in workers]
     retired = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
     return len(retired) == len(addresses)
 
 
-def turn_away(scheduler: Any, worker: Any) -> None:
+def reject_worker(scheduler: Any, worker: Any) -> None:
     """Close a joining worker before the worker gets tasks of a partition."""
-    shut(scheduler, worker)
+    stop_assigning(scheduler, worker)
     # A worker that joins says that it is running before it reads that it has to close.
-    show(scheduler, worker, {})
+    set_visible_resources(scheduler, worker, {})
     scheduler.close_worker(worker.address)
 
 
-def number_of_transitions(scheduler: Any) -> int:
+def count_transitions(scheduler: Any) -> int:
     """Return how often tasks have changed their state: equal numbers mean that nothing happened."""
     return int(scheduler.transition_counter)
 
@@ -231,7 +235,7 @@ def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
     )
 
 
-async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
+async def restart_worker(scheduler: Any, worker: Any, seconds: float) -> bool:
     """Restart a worker through its nanny, or return False if it does not rejoin in time."""
     try:
         await scheduler.restart_workers(
@@ -256,7 +260,7 @@ def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
         scheduler.stream_comms[worker].send(free)
 
 
-def run_again(scheduler: Any, tasks: Collection[Any]) -> None:
+def reschedule_tasks(scheduler: Any, tasks: Collection[Any]) -> None:
     """Take tasks from their workers, and place them anew."""
     stimulus = f"poolpart-again-{time.time()}"
     scheduler.transitions({task.key: "waiting" for task in tasks}, stimulus)
@@ -267,13 +271,15 @@ def is_bound(task: Any) -> bool:
     return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
 
 
-def waiting_for_workers(scheduler: Any) -> Collection[Any]:
+def unrunnable_tasks(scheduler: Any) -> Collection[Any]:
     """Return the tasks that could run but have no worker."""
     tasks: Collection[Any] = scheduler.unrunnable
     return tasks
 
 
-async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments: Any) -> Any:
+async def run_on_cluster_scheduler(
+    cluster: Any, function: Callable[..., Any], **arguments: Any
+) -> Any:
     """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler, without a client."""
     from distributed.core import clean_exception
 
@@ -284,7 +290,9 @@ async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments
     return _unpacked(answer["result"])
 
 
-async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
+async def call_worker(
+    scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any
+) -> Any:
     """Call a function in the event loop of a worker, passed as `dask_worker`.
 
     Raises OSError if the worker does not respond or the function raises an exception.
@@ -304,7 +312,7 @@ def _unpacked(result: Any) -> Any:
     return result.data if isinstance(result, Serialize) else result
 
 
-def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
+def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
     """Add a plugin to all workers, present and future, or remove the plugin if None.
 
     Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
@@ -320,7 +328,7 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
     async def tell(address: str) -> None:
         with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print it
             if plugin is None:
-                await call(scheduler, address, remove)
+                await call_worker(scheduler, address, remove)
             else:
                 await getattr(scheduler.rpc(address), "plugin-add")(name=name, plugin=plugin)
 
@@ -346,11 +354,11 @@ def handlers_of(scheduler: Any) -> dict[str, Any]:
 # -- the scheduler's HTTP server ---------------------------------------------------------
 
 
-def serve(scheduler: Any, application: web.Application) -> None:
+def add_pages(scheduler: Any, application: web.Application) -> None:
     """Add pages to the scheduler's HTTP server."""
     scheduler.http_application.add_application(application)
 
 
-def serve_no_longer(scheduler: Any, application: web.Application) -> None:
+def remove_pages(scheduler: Any, application: web.Application) -> None:
     """Remove pages from the scheduler's HTTP server."""
     scheduler.http_application.applications.remove(application)

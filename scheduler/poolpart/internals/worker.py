@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from .scheduler import SUBMITTER, Resources, Submitter
+from .scheduler import SUBMITTER, Resources, SubmittingTask
 
 
 def has_running_tasks(dask_worker: Any = None) -> bool:
@@ -61,7 +61,7 @@ def resources_of(task: Any) -> Resources:
     return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
 
 
-def resources_here(worker: Any) -> tuple[str, ...]:
+def declared_resources(worker: Any) -> tuple[str, ...]:
     """Names of the resources that a worker has.
 
     Runs on the worker.
@@ -76,7 +76,7 @@ def resources_here(worker: Any) -> tuple[str, ...]:
 # wait for a thread; its resources stay taken throughout.
 
 
-def task_of_thread() -> tuple[Any, Any] | None:
+def current_task() -> tuple[Any, Any] | None:
     """Return the worker and the state of the task of this thread, or None outside tasks."""
     from distributed.worker import thread_state
 
@@ -87,11 +87,11 @@ def task_of_thread() -> tuple[Any, Any] | None:
     return None if task is None else (worker, task)
 
 
-def submitter_of(worker: Any, key: Any) -> Submitter | None:
+def submitter_of(worker: Any, key: Any) -> SubmittingTask | None:
     """Return the task that has submitted a task of this worker from inside a partition."""
     task = worker.state.tasks.get(key)
     submitter = (task.annotations or {}).get(SUBMITTER) if task is not None else None
-    return None if submitter is None else Submitter(*submitter)
+    return None if submitter is None else SubmittingTask(*submitter)
 
 
 def threads_of(worker: Any) -> int:
@@ -104,7 +104,7 @@ def is_running(worker: Any, key: Any) -> bool:
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
-def free_slots(worker: Any, slots: Resources) -> None:
+def release_slots(worker: Any, slots: Resources) -> None:
     """Give slots of a worker to its waiting tasks, in its event loop."""
     from distributed.worker_state_machine import UnpauseEvent
 
@@ -114,18 +114,18 @@ def free_slots(worker: Any, slots: Resources) -> None:
         worker.handle_stimulus(UnpauseEvent(stimulus_id=f"poolpart-lent-{time.time()}"))
 
 
-def take_slots(worker: Any, slots: Resources) -> None:
+def reserve_slots(worker: Any, slots: Resources) -> None:
     """Keep these slots from waiting tasks, even if there are fewer now, in its event loop."""
     for name, number in slots.items():
         worker.state.available_resources[name] -= number
 
 
-def slots_here(worker: Any, name: str) -> tuple[float, float]:
+def count_slots(worker: Any, name: str) -> tuple[float, float]:
     """Return the available slots of a worker, below 0 if reserved, and all its slots."""
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
-def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
+def add_handler(worker: Any, question: str, answer: Callable[..., Any]) -> None:
     """Add a handler to a worker that lacks the handler."""
     worker.handlers.setdefault(question, answer)
 

@@ -195,7 +195,7 @@ class Cluster:
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
         for name, slots in required_slots.items():
-            self.partitions[name].want(max(slots, scan_count) if name == GPU else slots)
+            self.partitions[name].request_slots(max(slots, scan_count) if name == GPU else slots)
 
     def _check_jobs(self, first: Job, store: RunStore) -> None:
         """Check formats and memory for a single job, and store the software of the run."""
@@ -210,7 +210,7 @@ class Cluster:
         if self.client.status == "running":
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
-                    partition.want(0)
+                    partition.request_slots(0)
 
     def _lost_error(self) -> LidarError:
         return LidarError(

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Protocol
 
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 from ...columns.parts import part_name
 from . import policies
@@ -217,7 +217,7 @@ class Dispatcher:
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
         return moved
 
-    def leave_workers(self, locations: TaskLocations) -> None:
+    def leave_workers(self, locations: PartitionSnapshot) -> None:
         """Offer batches again whose workers died, are silent or late, or take no tasks."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
