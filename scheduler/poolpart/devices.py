@@ -1,8 +1,9 @@
-"""The CUDA device of each worker, kept on the scheduler for the worker's life.
+"""Assignment of a CUDA device to each worker, stored on the scheduler.
 
-It is stored in the scheduler's state of the worker, which ends with the worker. So everybody
-gets the same answer; a restarted worker, which is a new one to Dask and may have a new name,
-finds the device of its predecessor free; and nothing has to be cleaned up.
+The assignment is part of the scheduler's state of the worker and is removed with the worker.
+Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A restarted
+worker is a new worker for Dask and may have a new name, but it finds the device of its predecessor
+free.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from . import probe
 from .task_context import WorkerLeavingError, own_client, translate_leaving_errors
 from .workers import run_on_scheduler
 
-_HELD = "poolpart-gpu"  # key in the scheduler's state of a worker: UUID of its device
+_HELD = "poolpart-gpu"  # key in the scheduler's state of a worker, whose value is a device UUID
 
-_own: dict[str, int | None] = {}  # {address of a worker of this process: its device}
+_own: dict[str, int | None] = {}  # {worker address in this process: device index}
 
 
 @translate_leaving_errors()
@@ -94,7 +95,10 @@ def own_device_share() -> float:
 
 
 def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
-    """Return the device of a worker for its list of UUIDs, or None if the worker has left."""
+    """Return the index of a worker's device in its list of UUIDs, or None if the worker has left.
+
+    The first call for a worker selects its device.
+    """
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return None
@@ -104,7 +108,7 @@ def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int:
-    """Return the number of workers that use a worker's device, or are about to, at least 1."""
+    """Return the number of workers that use a worker's device or are expected to, at least 1."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return 1
@@ -120,7 +124,10 @@ def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def _least_used(scheduler: Any, worker: Any, gpus: Sequence[str]) -> str:
-    """Return the device that the fewest workers use, in the partition first, then in all."""
+    """Return the UUID of the device with the fewest workers in the partition.
+
+    Ties are resolved in favor of the device with the fewest workers in the cluster.
+    """
     users_in_partition = Counter[str]()  # {UUID: workers}
     users = Counter[str]()  # {UUID: workers}
     partitions = _partitions(worker)

@@ -1,7 +1,7 @@
-"""Requests of clients to the steward: make partitions, move workers, dissolve partitions.
+"""Requests of clients that create partitions, move workers, and dissolve partitions.
 
-Each is one request to the scheduler. The scheduler completes or refuses the request, even if the
-client dies meanwhile. Simultaneous requests run one after the other.
+Each of them is a single request to the scheduler, which completes or rejects it even if the client
+dies in the meantime. Concurrent requests are processed one after the other.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from .stats import statistics_of
 from .steward import Steward, WorkerRecord, names_of, steward_of
 from .workers import WorkerInfo, run_on_scheduler
 
-PATIENCE_S = 60.0  # seconds that a worker has to answer
+PATIENCE_S = 60.0  # time for new members to declare their resources
 _RETURN_S = 10.0  # minimum time for workers to declare their former resources
-_STAY_S = 1.0  # time until workers that could not be moved are members again
-_LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
+_STAY_S = 1.0  # time for workers that could not be moved to become members again
+_LOOK_EVERY_S = 0.05  # interval between checks for unfinished tasks
 _MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
@@ -45,10 +45,10 @@ _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 def call_steward(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
     """Call `question(steward, **arguments)` on the scheduler, and return its result.
 
-    `question` is a coroutine function of this module, such as `grow`. If it raises a PoolError on
-    the scheduler, a PoolError with the same message is raised here.
+    `question` is a coroutine function of this module, for example `grow_partition`. If it raises a
+    PoolError on the scheduler, this function raises a PoolError with the same message.
     """
-    # The steward waits for tasks, and then for workers, for `timeout_s` each.
+    # The steward waits up to `timeout_s` for tasks and then up to `timeout_s` for workers.
     answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
     result, complaint = run_on_scheduler(
         client, _answer, question=question, arguments=arguments, answer_s=answer_s
@@ -61,8 +61,11 @@ def call_steward(client: Client, question: Callable[..., Any], **arguments: Any)
 async def _answer(
     question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
-    """Return a request's result and "", or None and the message of a PoolError."""
-    # Raised here, the error would be in the scheduler's log with a traceback.
+    """Call a function with the steward.
+
+    Returns the result of the function and "", or None and the message of a PoolError.
+    """
+    # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
             return await question(steward, **arguments), ""
@@ -70,7 +73,7 @@ async def _answer(
             return None, str(error)
 
 
-# -- making partitions -----------------------------------------------------------------
+# -- creating partitions ---------------------------------------------------------------
 
 
 async def create_partitions(
@@ -89,7 +92,7 @@ async def create_partitions(
     rules
         Rules by partition name.
     pool
-        Workers to choose from by name, as the client saw them, including their GPUs.
+        Workers to select from, by name, as the client saw them, including their GPUs.
     known_partitions
         Partitions that the client knew when it sent the request. It may create them again.
     own_partitions
@@ -99,17 +102,17 @@ async def create_partitions(
     -------
     notes
         Notes for users by partition name, possibly empty, about the selected workers and about
-        features that this version of Dask lacks.
+        features that this version of Dask does not support.
     remainder
         Workers of the pool that no rule has selected.
 
     Raises
     ------
     PoolError
-        If there are too few workers, another client has a partition of the same name, or a worker
-        leaves meanwhile.
+        If there are too few workers, if another client has a partition of the same name, or if a
+        worker leaves in the meantime.
     """
-    # Up to the first await nothing else happens on the scheduler.
+    # Nothing else runs on the scheduler until the first await.
     records = {
         record.info.address: record for record in steward.records.values() if not record.is_absent
     }
@@ -117,7 +120,7 @@ async def create_partitions(
         replace(record.info, resources=steward.target_resources(record))
         for record in records.values()
     ]
-    # By name: a restarted worker has another address.
+    # Workers are identified by name, because the address changes when a worker is restarted.
     candidates = [w.with_gpus(pool[w.name].gpus) for w in present if w.name in pool]
     chosen, notes = divide_workers(rules, candidates)
     as_seen = [
@@ -136,7 +139,7 @@ async def create_partitions(
             )
             notes[name] = " ".join(filter(None, (notes.get(name), note)))
     for name in rules:
-        # Workers that may be in the partition already: it is made again.
+        # If the client knows the partition, it may create it again from the same workers.
         permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
         foreign = [
             worker.address
@@ -153,7 +156,7 @@ async def create_partitions(
         steward.set_rule(name, rule)
         for worker in chosen[name]:
             steward.set_home(records[worker.address], name, rule.slots_of(worker))
-    await wait_for_features()  # before the members get tasks, which lend slots
+    await wait_for_features()  # so that the tasks of the members can lend their slots
     members = [records[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: " ".join(filter(None, (notes.get(name), common_note))) for name in rules}
@@ -161,7 +164,7 @@ async def create_partitions(
 
 
 def _exists(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
-    """Return the message for workers that have a partition and are not chosen by its rule."""
+    """Return the error message if a rule does not select all workers of an existing partition."""
     if name in steward.rules:
         return (
             f"Partition {name!r} already exists, and this call does not select all of its workers. "
@@ -190,23 +193,31 @@ def _exists(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str
 async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> None:
     """Wait until new members of partitions declare their resources.
 
-    Raises PoolError if a member does not.
+    Raises
+    ------
+    PoolError
+        If a member leaves or does not respond in time.
     """
     late = await steward.wait_until_settled(members, PATIENCE_S)
     if absent := [record for record in members if record in late or record.is_removed]:
         raise PoolError(
             "Some workers left or did not respond while they were assigned to "
-            f"{_in_words(sorted({str(record.partition) for record in absent}))}: {names_of(absent)}. "
+            f"{_in_words(sorted({str(r.partition) for r in absent}))}: {names_of(absent)}. "
             "The other workers were assigned. Create a new pool to divide it again."
         )
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Prepare the scheduler for tasks of new partitions and return a remark for users, or "".
+    """Prepare the scheduler for tasks of new partitions, and return a note for users or "".
 
-    From now on, features such as inheritance are on (`features.py`), fences keep other tasks off
-    exclusive partitions (`fence.py`), and tasks are counted (`stats.py`). The remark names features
-    that this version of Dask lacks. PoolError if it lacks fences, and a rule is exclusive.
+    This enables features such as inheritance (see `features.py`), raises fences around exclusive
+    partitions (see `fence.py`), and starts counting tasks (see `stats.py`). The note lists features
+    that this version of Dask does not support.
+
+    Raises
+    ------
+    PoolError
+        If a rule is exclusive and this version of Dask does not support fences.
     """
     scheduler = steward.scheduler
     try:
@@ -216,7 +227,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
                 raise_fence(scheduler, name)
             elif name in steward.rules and steward.rules[name].exclusive:
                 lower_fence(scheduler, name)
-    except PoolError:  # this version of Dask lacks what fences need
+    except PoolError:  # this version of Dask does not support fences
         added = rules.keys() - steward.rules.keys()
         for name in added:
             lower_fence(scheduler, name)
@@ -228,9 +239,9 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
 
 # -- moving workers --------------------------------------------------------------------
 #
-# A worker that leaves gets no new tasks of its partition; waiting tasks go to other members,
-# running tasks end there; then it declares its new resources. Borrowed workers, whose home is
-# another partition, leave first.
+# A worker that leaves its partition receives no new tasks of the partition. Its waiting tasks are
+# moved to other members, and its running tasks finish before it declares its new resources.
+# Borrowed workers, whose home is another partition, leave first.
 
 
 async def grow_partition(
@@ -253,7 +264,7 @@ async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: f
 async def resize_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Resize a partition to a number of workers, and return the names of the moved workers."""
+    """Set the number of workers in a partition, and return the names of the workers moved."""
     check_count(f"the number of workers of partition {name!r}", count, minimum=0)
     steward.adopt_partition(name)
     rule = steward.rules[name]
@@ -268,7 +279,8 @@ async def resize_partition(
         targets = dict.fromkeys(_joining(steward, name, count - size, source), name)
     elif count < size:
         targets = _leaving(steward, name, size - count)
-    # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
+    # If a worker was lost, the rule requests more workers than there are. The target is set to the
+    # present size first, because moving workers changes it by the number of workers moved.
     steward.change_target(name, size - _asked(rule, size))
     try:
         return await _move(steward, targets, timeout_s)
@@ -279,14 +291,17 @@ async def resize_partition(
 
 
 def _asked(rule: Rule, default: int) -> int:
-    """Return the number of workers that a rule asks for, or a default if it has no such number."""
+    """Return the number of workers that a rule requests, or the default if there is none."""
     return rule.workers if isinstance(rule, n_workers) else default
 
 
 def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[WorkerRecord]:
-    """Return the records of workers that can move into a partition.
+    """Select the workers to move into a partition.
 
-    Raises PoolError if there are fewer than `count`.
+    Raises
+    ------
+    PoolError
+        If fewer than `count` workers can be moved.
     """
     if source == name:
         raise PoolError(
@@ -321,9 +336,12 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
 
 
 def _leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
-    """Return the records of workers that can leave a partition, with their destinations.
+    """Select the workers to move out of a partition, and return the destination of each.
 
-    Raises PoolError if fewer than its minimum would be left.
+    Raises
+    ------
+    PoolError
+        If fewer workers than the minimum of the partition would remain.
     """
     members = _settled_members(steward, name)
     minimum = steward.rules[name].minimum
@@ -337,10 +355,10 @@ def _leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str 
 
 
 def _destination(steward: Steward, record: WorkerRecord) -> str | None:
-    """Return the partition of a worker that leaves its partition, or None for no partition.
+    """Return the partition that a worker moves to when it leaves its partition, or None.
 
     A borrowed worker returns to its home, and other workers go to the partition with the rule
-    `rest`. Workers that leave this partition are in none.
+    `rest`. A worker that leaves the latter partition has no partition afterwards.
     """
     if record.partition == (remainder := steward.remainder_name()):
         return None
@@ -351,10 +369,15 @@ def _destination(steward: Steward, record: WorkerRecord) -> str | None:
 async def _move(
     steward: Steward, targets: Mapping[WorkerRecord, str | None], timeout_s: float
 ) -> list[str]:
-    """Move workers to partitions, or out of all partitions if the target is None.
+    """Move workers to the given partitions, or out of all partitions if the target is None.
 
-    Returns the names of the workers. Raises PoolError if tasks of a worker do not end in time. Such
-    a worker stays where it is.
+    Returns the names of the workers. A worker whose tasks do not finish in time stays in its
+    partition.
+
+    Raises
+    ------
+    PoolError
+        If a worker could not be moved in time.
     """
     origins = {record: (record.partition, record.slots) for record in targets}
     for record, target in targets.items():
@@ -366,12 +389,12 @@ async def _move(
         origin, slots = origins[record]
         target = targets[record]
         if record.partition != target or (origin and origin not in steward.rules):
-            continue  # another client has moved it, or dissolved its partition
+            continue  # another client has moved the worker or dissolved its partition
         steward.change_target(target, -1)
         steward.change_target(origin, 1)
         steward.set_partition(record, origin, slots)
     if late:
-        await steward.wait_until_settled(late, _STAY_S)  # so that they can be moved again at once
+        await steward.wait_until_settled(late, _STAY_S)  # so that they can be moved again soon
         raise PoolError(
             f"{len(late)} of {format_workers(len(targets))} could not be moved within "
             f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
@@ -382,9 +405,10 @@ async def _move(
 
 
 def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
-    """Return the members that may be moved.
+    """Return the members that can be moved.
 
-    Members that are just arriving do not count: they may return to their former partition.
+    Members that are about to arrive are excluded, because they may still return to their former
+    partition.
     """
     return [record for record in steward.members(name) if steward.is_settled(record)]
 
@@ -392,10 +416,11 @@ def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
 def _in_order(
     steward: Steward, records: Sequence[WorkerRecord], destination: str | None = None
 ) -> list[WorkerRecord]:
-    """Sort records by the order in which their workers are moved to a destination.
+    """Sort workers by the order in which they are moved to a destination.
 
-    Workers whose home is the destination come first, then workers without a partition and borrowed
-    workers. Among these, the least busy workers come first, and those with long-running tasks last.
+    Workers whose home is the destination come first, followed by workers without a partition and
+    borrowed workers, and then by all others. Within each of these groups, workers without
+    long-running tasks come first, and then those with the fewest tasks.
     """
 
     def order(record: WorkerRecord) -> tuple[bool, bool, int, int]:
@@ -413,7 +438,7 @@ def _in_order(
 def request_dissolution(
     client: Client, names: Collection[str] | None, timeout_s: float
 ) -> list[str]:
-    """Ask the steward to undo partitions, or every partition if `names` is None."""
+    """Dissolve partitions, or all partitions if `names` is None, and return their names."""
     arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
     try:
         dissolved: list[str] = call_steward(client, dissolve_partitions, **arguments)
@@ -425,25 +450,26 @@ def request_dissolution(
 async def dissolve_partitions(
     steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
 ) -> list[str]:
-    """Undo partitions, or every partition if `names` is None, and return their names.
+    """Dissolve partitions, or all partitions if `names` is None, and return their names.
 
-    `client_id` names the client that asks. That client has to register again.
+    `client_id` is the ID of the client that sends the request. The client has to register again
+    afterwards.
     """
     scheduler = steward.scheduler
     await _wait_for_tasks(steward, names, timeout_s)
-    # Until the next await nothing else happens on the scheduler; before, another client may have
-    # dissolved the same partitions, or made some.
+    # During the wait, another client may have created or dissolved partitions. From here to the
+    # next await, nothing else runs on the scheduler.
     dissolved = _existing(steward, names)
     records = [record for record in steward.records.values() if _belongs(record, dissolved)]
     for name in dissolved:
         del steward.rules[name]
         for record in steward.records.values():
-            if record.home == name:  # also if another partition has borrowed the worker
+            if record.home == name:  # even if another partition has borrowed the worker
                 record.home = None
-        # At once, even if the client dies or workers do not answer.
+        # The fence is lowered immediately, even if the client dies or workers do not respond.
         lower_fence(scheduler, name)
     release_partitions(scheduler, dissolved, client_id, had_rule=True)
-    if names is None:  # this includes partitions that workers were started with: these have no rule
+    if names is None:  # includes partitions without a rule, which workers were started with
         release_partitions(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
         for feature in FEATURES:
@@ -453,9 +479,9 @@ async def dissolve_partitions(
         home = steward.home_of(record)
         steward.change_target(home, 1)
         steward.set_home(record, home)
-    lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
-    await wait_for_features()  # then tasks lend no more
-    # An absent worker comes back as it was started.
+    lift_restrictions(scheduler, dissolved)  # any worker may recompute lost results
+    await wait_for_features()  # until tasks have stopped lending slots
+    # Absent workers are not awaited, because they rejoin with their original resources.
     present = [record for record in records if not record.is_absent]
     if late := await steward.wait_until_settled(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
@@ -467,20 +493,20 @@ async def dissolve_partitions(
 
 
 def _in_words(partitions: Sequence[str]) -> str:
-    """Return partitions for a message, such as "partitions 'A' and 'B'"."""
+    """Format partition names for a message, for example "partitions 'A' and 'B'"."""
     plural = "s" if len(partitions) > 1 else ""
     return f"partition{plural} {' and '.join(map(repr, partitions))}"
 
 
 def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
-    """Return the partitions of these names that exist, or every partition if `names` is None."""
+    """Return the partitions with one of the names, or all partitions if `names` is None."""
     return [name for name in steward.rules if names is None or name in names]
 
 
 def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
-    """Return whether a worker is in a partition of `names`, or was started in such a partition.
+    """Return whether a worker belongs to one of the partitions.
 
-    Only workers without a partition are judged by their start.
+    A worker without a partition belongs to a partition if it was started with its resource.
     """
     if record.partition is None:
         return not record.original.keys().isdisjoint(names)
@@ -490,12 +516,15 @@ def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
 async def _wait_for_tasks(
     steward: Steward, names: Collection[str] | None, timeout_s: float
 ) -> None:
-    """Wait until the tasks of partitions have ended.
+    """Wait until the tasks of partitions have finished.
 
-    Raises PoolError if they do not end in time.
+    Raises
+    ------
+    PoolError
+        If they do not finish in time.
     """
     deadline = time.monotonic() + timeout_s
-    # Tasks that the client just submitted arrive by another connection, milliseconds later.
+    # Tasks that the client has just submitted arrive on another connection, milliseconds later.
     await asyncio.sleep(_LOOK_EVERY_S)
     while tasks := _unfinished(steward.scheduler, _existing(steward, names)):
         if time.monotonic() >= deadline:
@@ -510,6 +539,6 @@ async def _wait_for_tasks(
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
-    """Return the states of the tasks of partitions that have not ended."""
+    """Return the states of the unfinished tasks of partitions."""
     tasks = scheduler.tasks.values()
     return [task for task in tasks if task.state in _UNFINISHED and requires_any(task, names)]

@@ -1,4 +1,4 @@
-"""Fetching results and held bytes from the workers that have them, past the scheduler."""
+"""Direct transfer of results and other data from workers, without passing through the scheduler."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 _HANDLER = "poolpart_fetch_held_bytes"  # name of the worker's handler for held bytes
 
-_held: dict[str, Any] = {}  # {name: bytes that this process holds}
+_held: dict[str, Any] = {}  # held bytes by name
 
 
 def fetch_available(
@@ -27,13 +27,15 @@ def fetch_available(
 ) -> dict[str, Any]:
     """Fetch the results that are currently available.
 
-    Later calls fetch further results. `Client.gather` is not suitable for a long-running consumer.
-    If a worker dies, it tries to connect to it for half a minute, and does not deliver other
-    results in the meantime. If a key was released, its future lets the scheduler wait forever for a
-    task that nobody submits. This function asks the scheduler which workers hold the results,
-    fetches them, and gives up on a worker that is silent for `patience_s` seconds. The next call
-    asks again, and finds recomputed results on other workers. The submitter must hold references to
-    the keys.
+    Call this function repeatedly to fetch further results. Unlike `Client.gather`, it is suitable
+    for a long-running consumer. If a worker dies, `gather` tries to connect to it for half a minute
+    and does not return other results in the meantime. If a key was released, its future makes the
+    scheduler wait forever for a task that nobody submits.
+
+    This function asks the scheduler which workers hold the results, fetches the results from these
+    workers, and gives up on a worker that does not respond for `patience_s` seconds. The next call
+    asks again and finds results that were recomputed on other workers. The submitter must hold
+    references to the keys.
 
     Parameters
     ----------
@@ -42,8 +44,8 @@ def fetch_available(
     keys
         Keys of finished or unfinished tasks.
     patience_s
-        Maximum time in seconds to wait for a response of the scheduler, and then for a response of
-        each worker. A transfer may take longer.
+        Maximum time in seconds to wait for a response from the scheduler, and then for a response
+        from each worker. A transfer may take longer.
     holder
         Address of a worker that holds all results. If given, the scheduler is not asked.
 
@@ -66,7 +68,7 @@ def fetch_available(
         by_worker: dict[str, list[str]] = defaultdict(list)
         for key, addresses in holders.items():
             if addresses:
-                # Any of the workers: if it does not answer, the next call may ask another.
+                # If the selected worker does not respond, the next call may select another one.
                 by_worker[random.choice(list(addresses))].append(key)
         results = await asyncio.gather(
             *(_take(client, address, held, patience_s) for address, held in by_worker.items())
@@ -84,12 +86,16 @@ async def _take(client: Client, address: str, held: list[str], patience_s: float
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker, or return None if it does not respond in `patience_s`."""
+    """Await a request to a worker, or return None if the worker stops responding.
+
+    The worker counts as unresponsive if it does not answer a ping within `patience_s` seconds.
+    """
     answer_task = asyncio.ensure_future(request)
     try:
-        # Giving up a worker that answers would discard the data so far, and the next call would be
-        # as slow: on a busy machine that never ended. And a worker keeps each message that nobody
-        # reads to its end (the error holds its own stream).
+        # Do not give up on a slow worker that still responds to a ping. Its partial transfer would
+        # be lost, and on a busy machine the next transfers would not finish either. The worker
+        # would also keep every message that was not read to the end, because the error holds a
+        # reference to its own stream.
         while not (await asyncio.wait([answer_task], timeout=patience_s))[0]:
             try:
                 await wait_for(send_request(client, address, "ping"), patience_s)
@@ -101,9 +107,9 @@ async def _unless_silent(
 
 
 def hold_bytes(name: str, data: Any) -> str:
-    """Keep bytes in this worker's memory until `fetch_held_bytes` and return the worker's address.
+    """Keep bytes in this worker's memory until they are fetched, and return the worker's address.
 
-    The caller has to limit the amount: bytes that nobody fetches stay for ever.
+    The caller must limit the amount of data, because bytes that are never fetched are never freed.
     """
     worker = get_worker()
     _held[name] = data
@@ -112,15 +118,16 @@ def hold_bytes(name: str, data: Any) -> str:
 
 
 def holds_bytes() -> bool:
-    """Whether this process holds bytes that no driver has fetched yet."""
+    """Return whether this process holds bytes that have not been fetched yet."""
     return bool(_held)
 
 
 def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch bytes that a worker holds under a name and then forgets.
+    """Fetch the bytes that a worker holds under a name, and free them on the worker.
 
-    The address is the result of `hold_bytes`. Returns None if the bytes were taken before, or
-    if the worker has died or is silent for `patience_s`; a transfer may take longer.
+    `address` is the return value of `hold_bytes`. The result is None if the bytes have already been
+    fetched, if the worker has died, or if it does not respond for `patience_s` seconds. A transfer
+    may take longer.
     """
 
     async def take() -> Any:
@@ -131,10 +138,10 @@ def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float 
     try:
         return client.sync(take)
     except (OSError, ValueError, AttributeError, TypeError, KeyError):
-        return None  # the worker has died; a restarted one has no such handler
+        return None  # the worker has died, or was restarted and has no such handler
 
 
 def _hand_over(name: str) -> dict[str, Any]:
-    """Return and forget held bytes, as a handler of a worker."""
+    """Return held bytes and free them. This is a handler of the worker."""
     data = _held.pop(name, None)
     return {"data": None if data is None else wrap_bytes(data)}

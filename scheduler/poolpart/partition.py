@@ -1,4 +1,4 @@
-"""A partition: the workers that declare one Dask resource, and the tasks for them."""
+"""A partition: the workers that declare a Dask resource, and methods to run tasks on them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from .task_table import TaskTable, to_datetime
 from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, query_for_repr, run_on_scheduler
 
-# Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
+# Cleanup of the active `with partition:` blocks in this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
@@ -102,8 +102,8 @@ class Partition:
 
     @property
     def client(self) -> Client:
-        """The client that the partition uses."""
-        # Not when unpickled: that happens in the event loops of scheduler and worker.
+        """Client that the partition uses."""
+        # The client is not created during unpickling, which may happen in an event loop.
         if self._client is None:
             self._client = own_client()
         return self._client
@@ -112,7 +112,7 @@ class Partition:
     def workers(self) -> tuple[WorkerInfo, ...]:
         """Current members, sorted by name."""
         members = (w for w in all_workers(self.client) if w.resources.get(self.name))
-        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 10 behind 9
+        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 9 before 10
 
     @property
     def slots(self) -> int:
@@ -123,15 +123,15 @@ class Partition:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        size = self._size_in_words()  # without the note, which is logged when it is made
+        size = self._size_in_words()
         return f"<Partition {self.name!r}: {size}>" if size else f"<Partition {self.name!r}>"
 
     def _size_in_words(self) -> str:
-        """Return the number of workers and slots, or "" where the scheduler cannot be asked."""
+        """Describe the size of the partition, or return "" if the scheduler is unavailable."""
         return str(query_for_repr(self._client, size_of, name=self.name) or "")
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
+        """Return the table of the partition's statistics for notebooks."""
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
@@ -234,7 +234,7 @@ class Partition:
         """
         _check_function(self.name, function)
         _refuse_options("submit", kwargs, **_OF_TASKS)
-        asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
+        asks = not self.client.asynchronous  # a request would block the client's event loop
         resources = self._taking(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
@@ -243,7 +243,7 @@ class Partition:
                     f"Invalid value {workers!r} for `workers`. Expected the name or address of a "
                     f"member of partition {self.name!r}, or a list of names and addresses."
                 )
-            # LocalCluster's are numbers.
+            # Names are converted to strings, because LocalCluster uses integers.
             workers = [MemberName(name) if asks else str(name) for name in several]
         pipes = _names_of_pipes([*args, *kwargs.values()])
         with dask.annotate(**{USES_PIPES: pipes}) if pipes else nullcontext():
@@ -260,9 +260,10 @@ class Partition:
             )
 
     def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
-        """Check and return the resources of a task.
+        """Check the number of slots, and return the resources of a task.
 
-        `asks` allows a request to the scheduler.
+        If `asks` is true, the client is registered for the partition, which may send a request to
+        the scheduler.
         """
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(
@@ -605,7 +606,7 @@ class Partition:
             "scatter", options, workers="The data is stored on the members of the partition."
         )
         addresses = [worker.address for worker in self.workers]
-        if not addresses:  # Dask would take any worker
+        if not addresses:  # Dask would interpret an empty list as any worker
             raise PoolError(f"Partition {self.name!r} has no workers to store the data.")
         return self.client.scatter(data, workers=addresses, **options)
 
@@ -627,8 +628,8 @@ class Partition:
         ...     total = dask.array.ones(10**9).sum().compute()
         """
         resources = self._taking(1)
-        # Dataframes ignore annotations when they are created, and Dask warns of it once. It does
-        # apply annotations to all tasks when they are computed, as in this block.
+        # Dask warns that dataframes ignore annotations when they are created. The warning is
+        # suppressed, because annotations are applied when a dataframe is computed in this block.
         annotations = {"resources": resources}
         warnings.filterwarnings("ignore", re.escape(f"Dask annotations {annotations} detected."))
         with ExitStack() as stack:
@@ -752,16 +753,16 @@ class Partition:
         moved: list[str] = call_steward(self.client, shrink_partition, name=self.name, **arguments)
         return moved
 
-    # -- workers that come and go ------------------------------------------------------
+    # -- adaptive size -----------------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
         """Set the minimum and maximum number of jobs for an adaptive partition.
 
         Once per second, jobs are started for tasks that are ready to run but have no slot, and for
-        slots that clients request with `request_slots`. A job that has not been needed for `idle_s` seconds
-        is ended or, if it is still queued, canceled. A worker is kept as long as it has a task
-        (even if the task has seceded), an actor, or the only copy of a result. A lost worker is
-        replaced as long as there is work. For a fixed number of jobs, pass the same number as
+        slots that clients request with `request_slots`. A job that has not been needed for `idle_s`
+        seconds is ended or, if it is still queued, canceled. A worker is kept as long as it has a
+        task (even if the task has seceded), an actor, or the only copy of a result. A lost worker
+        is replaced as long as there is work. For a fixed number of jobs, pass the same number as
         `minimum` and `maximum`.
 
         Parameters
@@ -794,8 +795,8 @@ class Partition:
 
         This method is intended for programs that assign each task to a specific worker, so that
         their tasks never wait for a slot. While slots are requested, jobs are started and kept as
-        if tasks were waiting for the slots. The request ends with ``request_slots(0)`` or when the client
-        closes. Tasks that wait for a slot do not need a request.
+        if tasks were waiting for the slots. The request ends with ``request_slots(0)`` or when the
+        client closes. Tasks that wait for a slot do not need a request.
 
         Raises
         ------
@@ -822,7 +823,7 @@ class Partition:
 
 _SLOTS_INSTEAD = "To request several slots of the partition, pass `slots`."
 _BOUND = " To pass an argument of this name to the function, use `functools.partial`."
-# {option of Dask that the partition sets: what to do instead}
+# {Dask option that the partition sets itself: advice what to use instead}
 _OF_TASKS = {
     "resources": _SLOTS_INSTEAD + _BOUND,
     "pure": "Each call runs separately, unless calls have the same `key`." + _BOUND,
@@ -834,24 +835,28 @@ _OF_MAPS = {
 
 
 def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> None:
-    """Raise PoolError if options of Dask were given that the partition sets itself."""
+    """Raise PoolError if a Dask option is passed that the partition sets itself."""
     for option, advice in instead.items():
         if option in options:
             raise PoolError(f"`Partition.{method}` does not accept `{option}`. {advice}")
 
 
 def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
-    """Return the names of pipes among arguments, or in lists, that fail with their tasks."""
+    """Return the names of the pipes among the arguments that fail with their tasks.
+
+    Pipes in lists and tuples are included.
+    """
     members = (a if isinstance(a, list | tuple) else [a] for a in arguments)
     pipes = (pipe for group in members for pipe in group if isinstance(pipe, Pipe))
     return [pipe.name for pipe in pipes if pipe.fails_with_tasks]
 
 
 def _check_function(name: str, function: Callable[..., Any]) -> None:
-    """Raise if a function would run in the event loop of a worker, or cannot be called.
+    """Raise PoolError if a function cannot be called, or is a coroutine function.
 
-    Nobody knows there which task submits something, so that the tasks which a coroutine submits
-    would leave the partition; and a coroutine cannot lend its slot while it waits for them.
+    A coroutine function runs in the worker's event loop, where it is unknown which task submits
+    further tasks. Therefore, these tasks would not stay in the partition, and the coroutine could
+    not lend its slot while it waits for them.
     """
     if not callable(function):
         raise PoolError(f"Partition {name!r} expects a callable, but got {function!r}.")

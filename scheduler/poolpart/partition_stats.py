@@ -1,4 +1,4 @@
-"""Figures of partitions and their stages, as users and ``/metrics`` get them."""
+"""Statistics of partitions and their stages, for users and for the ``/metrics`` endpoint."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .rules import format_workers
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
-NO_PARTITION = "no partition"  # row of workers without a partition, and of ordinary Dask tasks
+NO_PARTITION = "no partition"  # label for workers without a partition and for plain Dask tasks
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 
 
 def describe_size(workers: int, target: int | None, slots: int) -> str:
-    """Return the size of a partition in words, such as "1 of 2 workers, 4 slots"."""
+    """Return a description of the size of a partition, for example "1 of 2 workers, 4 slots"."""
     counted = format_workers(workers)
     if target is not None and target != workers:
         counted = f"{workers} of {format_workers(target)}"
@@ -66,12 +66,11 @@ class StageStats:
     lost: int = 0
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
         return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])
 
     @property
     def _figures(self) -> list[object]:
-        """Cells of a row of a table: the counts, and the running time in seconds."""
+        """Table cells with the number of tasks in each state and the running time in seconds."""
         return [*(getattr(self, count) for count in COUNTS), format_seconds(self.seconds)]
 
 
@@ -119,7 +118,6 @@ class PartitionStats(StageStats):
         return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 
     def _repr_html_(self) -> str:
-        """Return the tables that notebooks show: the partition, and its stages."""
         name = self.name or NO_PARTITION
         row = [name, self.workers, self.slots, self.busy, *self._figures]
         tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])

@@ -1,4 +1,4 @@
-"""All workers of a cluster, and their division into partitions."""
+"""The pool: all workers of a cluster, which can be divided into partitions."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ class Pool:
 
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
         self.client = client
-        self._workers = tuple(workers)  # at the last look
-        # Workers as this pool saw them first: {name: description}
+        self._workers = tuple(workers)  # workers at the last access
+        # {name: description at the first access}
         self._first_seen = {worker.name: worker for worker in self._workers}
-        # Whether a worker of the cluster belongs to this pool; None if the workers are fixed.
+        # Predicate for the workers that belong to this pool. None if the workers are fixed.
         self._belongs: Callable[[WorkerInfo], bool] | None = None
         self._noted: set[str] = set()  # partitions whose note was logged
-        self._partition_names: list[str] = []  # made by this pool or its remainders
-        self._local: LocalPool | None = None  # the cluster that `local` has started
+        self._partition_names: list[str] = []  # partitions created by this pool or its remainders
+        self._local: LocalPool | None = None  # cluster started by `local`
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
@@ -137,7 +137,7 @@ class Pool:
         ...     pool["GPU"].submit(pow, 2, 10).result()
         1024
         """
-        from .deploy.local_pool import LocalPool  # dividing a cluster needs nothing that starts one
+        from .deploy.local_pool import LocalPool  # not needed to divide a running cluster
 
         started = LocalPool(partitions, idle_s, options)
         try:
@@ -148,7 +148,7 @@ class Pool:
         pool._local = started
         return pool
 
-    # -- looking -----------------------------------------------------------------------
+    # -- workers and partitions --------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self.workers)
@@ -161,7 +161,7 @@ class Pool:
             workers = self.workers
             declared = Counter(dict.fromkeys(run_on_scheduler(self.client, partition_names), 0))
             declared.update(name for w in all_workers(self.client) for name in w.partitions)
-        except (PoolError, OSError):  # its client was closed
+        except (PoolError, OSError):  # the client was closed
             workers = self._workers
             declared = Counter()
         hosts = {worker.host for worker in workers}
@@ -171,7 +171,7 @@ class Pool:
         return f"<Pool: workers {len(workers)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     def _repr_html_(self) -> str:
-        """Return the table of all partitions of the cluster that notebooks show."""
+        """Return the table of all partitions of the cluster for notebooks."""
         return table_of_partitions(self.client, repr(self))
 
     def __getitem__(self, name: str) -> Partition:
@@ -202,7 +202,7 @@ class Pool:
             present = [worker for worker in all_workers(self.client) if self._belongs(worker)]
             gpus = {worker.address: worker.gpus for worker in self._workers}
             gpus |= _ask_for_gpus(self.client, [w for w in present if w.address not in gpus])
-            # Workers that have not answered have left, or are silent.
+            # Workers that did not respond have left or are silent, and are omitted.
             self._workers = tuple(
                 w.with_gpus(gpus[w.address]) for w in present if w.address in gpus
             )
@@ -287,7 +287,7 @@ class Pool:
                     f'--resources "{name}={minimum}"`.'
                 )
 
-    # -- dividing ----------------------------------------------------------------------
+    # -- division ----------------------------------------------------------------------
 
     def __enter__(self) -> Self:
         return self
@@ -297,15 +297,14 @@ class Pool:
             self._local.close()
             return
         try:
-            if self._partition_names:  # `dissolve` may have undone them by now
+            if self._partition_names:  # empty if `dissolve` was called in the block
                 request_dissolution(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
                 raise
-            error.add_note(
-                f"poolpart: The partitions were not dissolved. {failure}"
-            )  # what came first counts
+            # The first error is more important than the failure that follows it.
+            error.add_note(f"poolpart: The partitions were not dissolved. {failure}")
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
         """Divide this pool into partitions according to rules.
@@ -485,7 +484,7 @@ class Pool:
         return names
 
     def _divide(self, rules: Mapping[str, Rule]) -> tuple[dict[str, Partition], Pool]:
-        """Make all partitions or none, and return them by name, with a pool of the remainder."""
+        """Create all partitions or none, and return them by name, with a pool of the remainder."""
         if not isinstance(rules, Mapping):
             raise PoolError(
                 f"Invalid rules {rules!r}. Expected a mapping of partition names to rules, for "
@@ -498,7 +497,7 @@ class Pool:
                     f"Invalid rule {rule!r} for partition {name!r}. Expected a rule such as "
                     "`n_workers(2)`, `per_gpu(1)` or `rest()`."
                 )
-        for worker in self.workers:  # workers that have joined since the pool was made
+        for worker in self.workers:  # adds workers that have joined since the last access
             first_seen = self._first_seen.get(worker.name, worker)
             self._first_seen[worker.name] = first_seen.with_gpus(worker.gpus)
         notes, remaining_workers = call_steward(
@@ -522,7 +521,7 @@ class Pool:
 
 
 def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
-    """Return the names of all partitions, and of partitions with a rule.
+    """Return the names of all partitions and of the partitions with a rule.
 
     Runs on the scheduler.
     """
@@ -530,19 +529,22 @@ def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:
-    """Return whether a worker declares one of these resources, or True if `names` is None."""
+    """Return whether a worker declares one of the resources, or True if `names` is None."""
     return names is None or not names.isdisjoint(worker.resources)
 
 
 def _is_free(worker: WorkerInfo, of: Callable[[WorkerInfo], bool]) -> bool:
-    """Return whether a worker is in no partition, and belongs to a pool."""
+    """Return whether a worker has no partition and satisfies the predicate of a pool."""
     return not worker.partitions and of(worker)
 
 
 def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tuple[str, ...]]:
-    """Return the GPUs of workers by address, without workers that do not answer.
+    """Return the GPUs of workers by address, omitting workers that do not respond.
 
-    Raises PoolError if a worker cannot describe its machine.
+    Raises
+    ------
+    PoolError
+        If a worker cannot report its GPUs.
     """
     answers = run_on_workers(client, worker_gpus, [worker.address for worker in workers])
     for worker in workers:

@@ -1,4 +1,4 @@
-"""Rules that choose the workers of a partition, at its division and when workers join later."""
+"""Rules that select the workers of a partition, when it is created and when workers join later."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Rule:
     def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether to add a worker to the members, given all workers (`everyone`)."""
+        """Return whether to add a worker to the members, given all workers of the cluster."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     @property
@@ -82,12 +82,12 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers that share the GPUs evenly."""
+        """Select workers so that they share the GPUs evenly."""
         if not any(worker.gpus for worker in free):
             return per_host(self.max_workers).choose(free)
         workers_of_gpu: Counter[str] = Counter()
         chosen = []
-        # Workers that see the fewest GPUs come first: the others have more choice.
+        # Workers that see the fewest GPUs come first, because they have the fewest alternatives.
         for worker in sorted(free, key=lambda worker: len(worker.gpus)):
             if worker.gpus:
                 gpu = min(worker.gpus, key=lambda gpu: workers_of_gpu[gpu])
@@ -119,7 +119,7 @@ class per_host(Rule):  # noqa: N801
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers of each host."""
+        """Select the first workers on each host."""
         workers_of_host: Counter[str] = Counter()
         chosen = []
         for worker in free:
@@ -144,7 +144,7 @@ class n_workers(Rule):  # noqa: N801
     workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers."""
+        """Select the first workers of the list."""
         return list(free[: self.workers])
 
     @property
@@ -155,21 +155,21 @@ class n_workers(Rule):  # noqa: N801
 
 @dataclass(frozen=True)
 class NamedWorkers(Rule):
-    """The workers of a list of names or addresses, as `named` makes it."""
+    """Rule that selects workers by name or address, created by `named`."""
 
     names: tuple[str, ...]
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose the named workers that are available."""
+        """Select the named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
     @property
     def target(self) -> int:
-        """Number of names."""
+        """Number of names in the rule."""
         return len(self.names)
 
     def missing_names(self, members: Sequence[WorkerInfo]) -> list[str]:
-        """Return the names that none of the members has."""
+        """Return the names that do not belong to any of the members."""
         present = {name for worker in members for name in (worker.name, worker.address)}
         return [name for name in self.names if name not in present]
 
@@ -219,23 +219,23 @@ def named(*names: str | int, **common: Any) -> NamedWorkers:
 def divide_workers(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
-    """Divide workers by rules, in order: each rule takes workers that earlier rules have left.
+    """Divide workers by rules, each of which selects from the workers that earlier rules have left.
 
-    Workers that a rule names are kept for that rule. Present members of a partition come first, so
-    that repeating the rules gives the same partitions. Workers that declare another resource are
-    not taken.
+    Workers that a rule names are reserved for that rule. Current members of a partition are
+    preferred, so repeating the same rules results in the same partitions. Workers that declare
+    another resource are never selected.
 
     Returns
     -------
     chosen
-        {partition: workers}.
+        Selected workers by partition.
     notes
-        {partition: what a user should know of the choice}.
+        Notes for users about the selection, by partition.
 
     Raises
     ------
     PoolError
-        If a partition would have fewer workers than its minimum, or two rules take the rest.
+        If a partition would have fewer workers than its minimum, or if two rules are `rest`.
     """
     takers_of_rest = [name for name, rule in rules.items() if isinstance(rule, rest)]
     if len(takers_of_rest) > 1:
@@ -274,17 +274,17 @@ def divide_workers(
 
 
 class _Choice(NamedTuple):
-    """What a rule chooses."""
+    """Selection of workers by one rule."""
 
     rule: Rule
-    free: list[WorkerInfo]  # workers that the rule may take
-    workers: list[WorkerInfo]  # those that it takes
+    free: list[WorkerInfo]  # workers that the rule can select from
+    workers: list[WorkerInfo]  # workers that the rule selects
 
 
 def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str, _Choice]:
-    """Return the choice of each rule, by partition, even of fewer workers than its minimum."""
+    """Apply all rules in order, and return their selections without checking the minimum."""
     choices: dict[str, _Choice] = {}
-    chosen_addresses: set[str] = set()  # not names, which may repeat
+    chosen_addresses: set[str] = set()  # addresses are unique, unlike names
     named_by_rules = {
         n for rule in rules.values() if isinstance(rule, NamedWorkers) for n in rule.names
     }
@@ -307,9 +307,10 @@ def find_shortfalls(
     Parameters
     ----------
     rules
-        Rules that choose the workers, by partition.
+        Rules that select the workers, by partition.
     pool, pool_as_seen
-        The workers with the resources that they declare now, and with those that the client saw.
+        Workers with the resources that they declare now, and with the resources that the client
+        saw.
     """
     now = _choices(rules, pool)
     expected = _choices(rules, pool_as_seen)
@@ -323,10 +324,10 @@ def find_shortfalls(
 
 
 def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
-    """Return why the named workers cannot be selected: they are elsewhere, or do not exist."""
+    """Return sentences that explain why the named workers cannot be selected."""
     by_name = {name: worker for worker in pool for name in (worker.name, worker.address)}
     absent = [name for name in missing if name not in by_name]
-    # {names of partitions, or "" for a worker that an earlier rule has selected: workers}
+    # {partition names of a worker, or "" if an earlier rule has selected it: names of workers}
     elsewhere: dict[str, list[str]] = {}
     for name in missing:
         if name in by_name:
@@ -350,20 +351,24 @@ def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
 
 
 def _largest_partition(workers: Iterable[WorkerInfo]) -> str:
-    """Return the partition that most of the workers belong to, or "" if they belong to none."""
+    """Return the partition to which most of the workers belong, or "" if they belong to none."""
     sizes = Counter(name for worker in workers for name in sorted(worker.partitions))
     return max(sizes, key=sizes.__getitem__, default="")
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return up to nine names for a message."""
+    """Format up to nine names for a message."""
     return ", ".join(map(repr, names[:9])) + (", …" if len(names) > 9 else "")
 
 
 def _advice(
     rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo], earlier_rules: int
 ) -> str:
-    """Return advice about a rule that has too few workers, with the number of rules before it."""
+    """Return advice about a rule that selects too few workers.
+
+    `free` contains the workers that the rule can select from, and `earlier_rules` is the number of
+    rules before it.
+    """
     if isinstance(rule, n_workers) and rule.workers < rule.minimum:
         return (
             f"The rule allows at most {format_workers(rule.workers)}. Increase this number, or "
@@ -404,10 +409,10 @@ def partition_for(
     rules: Mapping[str, Rule],
     members: Mapping[str, Sequence[WorkerInfo]],
 ) -> str | None:
-    """Return the partition of a worker that joins, or None.
+    """Return the partition that a joining worker is assigned to, or None.
 
-    A rule that names the worker comes first, then partitions with fewer workers than their
-    minimum or with none, then the order of the rules.
+    Rules that name the worker have priority, followed by partitions without workers or with fewer
+    workers than their minimum, and then by the order of the rules.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
     willing = [
@@ -423,18 +428,18 @@ def partition_for(
 
 
 def format_workers(count: int) -> str:
-    """Return a number of workers for a message, such as "1 worker"."""
+    """Format a number of workers for a message, for example "1 worker"."""
     return f"{count} {'worker' if count == 1 else 'workers'}"
 
 
 def check_name(partition: object) -> None:
-    """Raise a PoolError unless a value can be the name of a partition."""
+    """Raise PoolError unless the value is a valid partition name."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"Invalid partition name {partition!r}. Expected a string such as 'GPU'.")
 
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
-    """Raise a PoolError unless a count is a whole number of at least `minimum`."""
+    """Raise PoolError unless the value is an integer of at least `minimum`."""
     if not isinstance(count, Integral) or count < minimum:
         raise PoolError(
             f"Invalid value {count!r} for {name}. Expected an integer of at least {minimum}."

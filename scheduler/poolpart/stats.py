@@ -1,9 +1,9 @@
-"""Load and finished tasks of a partition.
+"""Statistics of the tasks of partitions.
 
-A plugin of the scheduler counts tasks that have ended, by partition and stage. A task's partition
-is the resource that it asks for, or ""; its stage is the prefix of its key, for most tasks the
-function's name; there are as many stages as Dask itself keeps. Tasks under way are counted on
-request.
+A scheduler plugin counts finished tasks by partition and stage. The partition of a task is the
+resource that it requests, or "". Its stage is the prefix of its key, which is the name of the
+function for most tasks. There are as many stages as prefixes that Dask keeps. Unfinished tasks are
+counted on request.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from .steward import target_of
 from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
 NAME = "poolpart-stats"
-_ERROR_LETTERS = 200  # letters kept of the error of a task
-_LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
-_RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
-# {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
+_ERROR_LETTERS = 200  # maximum length of the error of a task
+_LOOK_AT_MOST = 1000  # number of tasks per worker that are searched for running tasks
+_RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are available
+# Our state of a task by Dask's state. "assigned" tasks are either running or queued.
 _WAITING = {
     "waiting": "waiting",
     "queued": "queued",
@@ -36,28 +36,28 @@ _WAITING = {
 
 
 class TaskStatistics(SchedulerPlugin):
-    """Counts the scheduler's tasks that end, from its creation on."""
+    """Scheduler plugin that counts finished tasks, beginning with its creation."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.since = time.time()  # when counting began
-        # Whether the counts outlive the clients that submit to partitions.
+        self.since = time.time()  # time when counting began
+        # Whether the counts are kept after the last client of a partition has closed.
         self.is_kept = False
-        # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
+        # {(partition, stage): totals of finished tasks, by field of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-        # {partition: its tasks that have ended, newest first}
+        # {partition: finished tasks, newest first}
         self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=MAX_ENDED_TASKS))
-        self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
-        self._deaths: dict[Any, int] = {}  # {key of a task: workers that died while they ran it}
+        self._runnable: dict[Any, float] = {}  # {task key: time when its inputs were available}
+        self._deaths: dict[Any, int] = {}  # {task key: workers that died while it was assigned}
         for feature in FEATURES:
             feature.begin_counting(self)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
     ) -> None:
-        """Count a task that has ended, and note when a task could run."""
+        """Count a finished task, or record when a task became ready to run."""
         if start == "waiting" and finish in _RUNNABLE:
             self._runnable[key] = time.time()
         if finish in _RUNNABLE:
@@ -68,7 +68,7 @@ class TaskStatistics(SchedulerPlugin):
         if start != "processing" or finish not in ("memory", "erred", "released"):
             return
         task = self.scheduler.tasks[key]
-        if finish == "released":  # its worker has died, or it was cancelled or rescheduled
+        if finish == "released":  # its worker has died, or it was canceled or rescheduled
             if task.suspicious > self._deaths.get(key, 0):
                 self._deaths[key] = task.suspicious
                 self.ended[partition_of(task), task.prefix.name]["lost"] += 1
@@ -78,11 +78,11 @@ class TaskStatistics(SchedulerPlugin):
         computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
         counts["seconds"] += sum(span["stop"] - span["start"] for span in computing)
         self._keep(task, finish, runnable, computing, kwargs)
-        if computing and runnable is not None:  # both by the scheduler's clock: Dask corrects them
+        if computing and runnable is not None:  # Dask converts both to the scheduler's clock
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
     def queued_since(self, key: Any) -> float | None:
-        """Return the time since when a task could run, seconds since 1970, or None if unknown."""
+        """Return when a task became ready to run in seconds since 1970, or None if unknown."""
         return self._runnable.get(key)
 
     def _keep(
@@ -93,7 +93,7 @@ class TaskStatistics(SchedulerPlugin):
         computing: list[Any],
         report: Mapping[str, Any],
     ) -> None:
-        """Keep a task that has ended: `report` is what its worker told of it."""
+        """Add a row for a finished task, where `report` is the message of its worker."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
         started = to_datetime(computing[0]["start"] if computing else None)
@@ -115,30 +115,30 @@ class TaskStatistics(SchedulerPlugin):
         )
 
     def all_stats(self) -> list[PartitionStats]:
-        """Return the statistics of each partition, and of tasks without a partition."""
+        """Return the statistics of all partitions, and of the tasks without a partition."""
         names = {name for name, _ in self.ended}
         for worker in self.scheduler.workers.values():
             names.update(name for name, slots in worker.resources.items() if slots)
         return stats_of(sorted(names | {""}), self.scheduler)
 
     def stop(self) -> None:
-        """End what features do with the counts."""
+        """Notify all features that counting stops."""
         for feature in FEATURES:
             feature.end_counting(self)
 
     async def close(self) -> None:
-        """Stop with the scheduler."""
+        """Stop when the scheduler closes."""
         self.stop()
 
 
 def partition_of(task: Any) -> str:
-    """Return the resource that a task asks for, or ""."""
+    """Return the first resource that a task requests, or ""."""
     resources = task.resource_restrictions
     return next(iter(resources)) if resources else ""
 
 
 def workers_of(scheduler: Any, partition: str) -> list[Any]:
-    """Return the states of the workers of a partition or, for "", of workers without resources."""
+    """Return the states of the workers of a partition, or of workers without resources for ""."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -146,15 +146,16 @@ def workers_of(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Return the slots of a worker for a partition or, for "", the threads of the worker."""
+    """Return the number of slots of a worker in a partition, or its number of threads for ""."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
 def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
-    """Return the tasks of a partition that a worker runs, by stage, and their slots.
+    """Return the running tasks of a partition on a worker, counted by stage, and their slots.
 
-    The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
-    has slots. So of a task that waits and the nested tasks in its slots, some do not count.
+    The scheduler does not know which assigned tasks are running, so it assumes that as many of them
+    run as the worker has slots. Therefore, if nested tasks run in the slots of a waiting task, some
+    of these tasks are not counted as running.
     """
     held = 0
     stages: Counter[str] = Counter()
@@ -165,7 +166,6 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 
 def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
-    """Yield the tasks of a partition that a worker runs."""
     free = slots_of(worker, partition)
     for task in islice(worker.processing, _LOOK_AT_MOST):
         if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
@@ -174,14 +174,13 @@ def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
 
 
 def _slots_taken(task: Any, partition: str) -> int:
-    """Return the slots of a partition that a task holds while it runs."""
     return int(task.resource_restrictions[partition]) if partition else 1
 
 
 def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], float]:
-    """Return the unfinished tasks of a partition, and the ended tasks that are kept.
+    """Return the rows of all unfinished tasks and the last finished tasks of a partition.
 
-    Also returns when counting began, in seconds since 1970. Runs on the scheduler.
+    The second value is the time when counting began, in seconds since 1970. Runs on the scheduler.
     """
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
@@ -213,10 +212,10 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
 
 
 def _times_of_running(task: Any) -> tuple[float | None, float | None]:
-    """Return when a running task started, in seconds since 1970, and for how long it has run.
+    """Return when a running task started and how long it has been running, in seconds.
 
-    A worker reports the running time of its tasks with each heartbeat. Both are None before the
-    first heartbeat after the start.
+    The start is in seconds since 1970. Both values are None until the first heartbeat after the
+    start, because workers report running times with their heartbeats.
     """
     worker = task.processing_on
     reported_s = worker.executing.get(task)
@@ -227,7 +226,7 @@ def _times_of_running(task: Any) -> tuple[float | None, float | None]:
 
 
 def size_of(name: str, dask_scheduler: Any = None) -> str:
-    """Return the number of workers and slots of a partition in words, without counting its tasks.
+    """Describe the number of workers and slots of a partition, without counting its tasks.
 
     Runs on the scheduler.
     """
@@ -237,9 +236,9 @@ def size_of(name: str, dask_scheduler: Any = None) -> str:
 
 
 def statistics_of(scheduler: Any, keep: bool = True) -> TaskStatistics:
-    """Find the scheduler's statistics, or start counting.
+    """Return the scheduler's statistics, and start counting if necessary.
 
-    With `keep`, the counts outlive the clients that submit to partitions.
+    If `keep` is true, the counts are kept after the last client of a partition has closed.
     """
     statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is None:
@@ -250,7 +249,7 @@ def statistics_of(scheduler: Any, keep: bool = True) -> TaskStatistics:
 
 
 def forget_statistics(scheduler: Any) -> None:
-    """Stop counting, and delete the counts."""
+    """Stop counting and delete the counts."""
     statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is not None:
         statistics.stop()
@@ -258,10 +257,7 @@ def forget_statistics(scheduler: Any) -> None:
 
 
 def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
-    """Return the statistics of partitions.
-
-    Runs on the scheduler.
-    """
+    """Return the statistics of the named partitions. Runs on the scheduler."""
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)

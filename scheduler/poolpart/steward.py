@@ -1,17 +1,19 @@
-"""Membership of workers in partitions: the only record of it, a plugin of the scheduler.
+"""Membership of workers in partitions, stored in a scheduler plugin.
 
-The steward has the rules by partition, and a record for each worker with the worker's partition.
-Requests of clients (`division.py`) and workers that join and leave change it. After any change,
-one loop for each worker (`Steward._settle`) synchronizes three things with the record:
+The steward stores the rule of each partition and a record of each worker with its partition.
+Requests of clients (see `division.py`) and workers that join or leave change the records. After any
+change, a reconciliation loop for each affected worker (`Steward._reconcile`) brings the following
+in line with its record:
 
-1. the resources that the worker declares, which its tasks must find there;
-2. the resources that the scheduler places tasks by: removed before a worker leaves a partition,
-   so that it gets no more of its tasks, and added only when the worker has declared them;
-3. the workers behind a fence, from the moment of the change. A fence keeps all tasks that do not
-   ask for an exclusive partition off the partition's workers (`fence.py`).
+1. The resources that the worker declares, which its tasks must find there.
+2. The resources that the scheduler uses to place tasks. They are removed before a worker leaves a
+   partition, so that it receives no more tasks of it, and added once the worker has declared them.
+3. The workers behind a fence, immediately after the change. A fence keeps all tasks that do not
+   request an exclusive partition off its workers (see `fence.py`).
 
-Nannies are not modified: a restarted worker declares its original resources, joins, and is settled
-again. So the loop may be interrupted anywhere, and dissolving leaves nothing behind.
+Nannies are not modified. A restarted worker declares its original resources, joins, and is
+reconciled again. Therefore, the loop can be interrupted at any point, and dissolving a partition
+leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -48,49 +50,48 @@ from .workers import WorkerInfo
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-steward"
-HOLD_S = 30.0  # time in seconds for which the record of a worker that its nanny restarts is kept
-LOOK_EVERY_S = 0.01
-_ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
+HOLD_S = 30.0  # time for which the record of a worker is kept while its nanny restarts it
+LOOK_EVERY_S = 0.01  # interval between attempts to reconcile a worker
+_ASSIGN_EVERY_S = 0.1  # about the time that applying all rules to a thousand workers takes
 
 
 @dataclass(eq=False)
 class WorkerRecord:
-    """Partition and state of a worker, also while the worker's nanny restarts the process."""
+    """Partition and state of a worker, kept while a nanny restarts the worker process."""
 
     key: Hashable  # identifies the worker (`worker_key`)
     info: WorkerInfo
-    nanny: str | None = None  # its address
+    nanny: str | None = None  # address of the nanny
     original: Resources = field(default_factory=dict)  # resources that the worker was started with
     declared: Resources = field(default_factory=dict)  # resources at the worker's last reply
-    is_declaring: bool = False  # a request to declare resources is under way
+    is_declaring: bool = False  # whether a request to declare resources is in flight
     partition: str | None = None
-    # Partition that the worker was started in or that a rule chose for it. Moving a worker does not
-    # change its home: another partition has only borrowed it.
+    # Partition that the worker was started in, or that a rule has selected for it. The home does
+    # not change when the worker is moved, because the other partition only borrows the worker.
     home: str | None = None
-    slots: float = 0  # slots for the partition
-    # It joined after the division, and the rules are to choose its partition: for the first time,
-    # or again if it is in the remainder.
+    slots: float = 0  # number of slots in the partition
+    # Whether the rules still have to select a partition for the worker, which has joined after the
+    # division. Members of the remainder can be selected again by another rule.
     is_unassigned: bool = False
-    assigned_by_rule: bool = (
-        False  # it joined after the division, and the rules chose its partition
-    )
-    is_absent: bool = False  # it has left, and its nanny may be restarting it
-    is_removed: bool = False  # it is no longer expected
-    reconciliation: asyncio.Task[None] | None = None  # loop `Steward._settle` of this worker
-    removal_timer: asyncio.TimerHandle | None = None  # removes the record, while the worker is away
+    # Whether the worker has joined after the division and was assigned to its partition by a rule.
+    assigned_by_rule: bool = False
+    is_absent: bool = False  # whether the worker has left, possibly because its nanny restarts it
+    is_removed: bool = False  # whether the worker is no longer expected to return
+    reconciliation: asyncio.Task[None] | None = None  # running `Steward._reconcile` loop
+    removal_timer: asyncio.TimerHandle | None = None  # removes the record of an absent worker
 
 
 class Steward(SchedulerPlugin):
-    """Keeps workers in their partitions, also when the client has gone."""
+    """Scheduler plugin that assigns workers to partitions, even after the client has closed."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.rules: dict[str, Rule] = {}  # {partition: its rule}, in the order of choosing
-        self.records: dict[Hashable, WorkerRecord] = {}  # {key: its record}
-        self.open_requests = 0  # requests of clients that are under way
-        self._names: set[str] = set()  # all partitions so far, dissolved ones included
+        self.rules: dict[str, Rule] = {}  # {partition: rule}, in the order in which they apply
+        self.records: dict[Hashable, WorkerRecord] = {}  # {worker key: record}
+        self.open_requests = 0  # number of client requests in progress
+        self._names: set[str] = set()  # names of all partitions so far, including dissolved ones
         self._assigning: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._add_record(worker)
@@ -98,7 +99,10 @@ class Steward(SchedulerPlugin):
     # -- membership --------------------------------------------------------------------
 
     def members(self, name: str, present: bool = False) -> list[WorkerRecord]:
-        """Return the records of a partition, or only the records of present workers if `present`."""
+        """Return the records of the members of a partition.
+
+        If `present` is true, members that are absent are omitted.
+        """
         members = (record for record in self.records.values() if record.partition == name)
         return [record for record in members if not (present and record.is_absent)]
 
@@ -113,16 +117,16 @@ class Steward(SchedulerPlugin):
         ]
 
     def remainder_name(self) -> str | None:
-        """Return the partition with the rule `rest`, or None."""
+        """Return the name of the partition with the rule `rest`, or None."""
         return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
     def target_resources(self, record: WorkerRecord) -> Resources:
         """Return the resources that a worker should declare.
 
-        A worker without a partition declares what it was started with, except the resources of the
-        present partitions: it is in none of these. A member of a partition declares the slots of
-        this partition, and what it was started with, except the resource of any partition that
-        there is or was: it is in a single partition.
+        A worker without a partition declares the resources that it was started with, except those
+        of existing partitions, because it does not belong to them. A member of a partition declares
+        its slots in this partition and the resources that it was started with, except those of any
+        other existing or dissolved partition, because a worker belongs to only one partition.
         """
         if record.partition is None:
             return {r: slots for r, slots in record.original.items() if r not in self.rules}
@@ -130,23 +134,23 @@ class Steward(SchedulerPlugin):
         return {**original, record.partition: record.slots}
 
     def home_of(self, record: WorkerRecord) -> str | None:
-        """Return the existing partition that a worker goes back to, or None."""
+        """Return the existing partition that a worker returns to, or None."""
         started_in = (name for name, slots in record.original.items() if slots)
         return next((name for name in (record.home, *started_in) if name in self.rules), None)
 
     def set_home(self, record: WorkerRecord, name: str | None, slots: float | None = None) -> None:
-        """Put a worker into the partition that is its home from now on."""
+        """Assign a worker to a partition and make this partition its home."""
         record.home = name
         self.set_partition(record, name, slots)
 
     def set_partition(
         self, record: WorkerRecord, name: str | None, slots: float | None = None
     ) -> None:
-        """Record the partition of a worker or, with None, that the worker is in no partition.
+        """Record the partition of a worker, or that it has no partition if `name` is None.
 
-        The worker is behind the fence of the partition, if any, from now on; `settle` does the
-        rest. The number of slots is the first of these: `slots`, the slots of the rule, the slots
-        of the partition that the worker was started with, the worker's threads.
+        The worker is behind the fence of the partition immediately. `reconcile` makes all other
+        changes. If `slots` is not given, the number of slots is that of the rule, that of the
+        resource which the worker was started with, or the number of threads.
         """
         record.partition = name
         record.slots = 0
@@ -162,13 +166,13 @@ class Steward(SchedulerPlugin):
         self._assign_soon()
 
     def set_rule(self, name: str, rule: Rule) -> None:
-        """Add a partition or change its rule, and keep the partition with the rule `rest` last."""
+        """Add a partition or change its rule, keeping the partition with the rule `rest` last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
 
     def adopt_partition(self, name: str) -> None:
-        """Add a partition whose workers declared its resource before this division.
+        """Add a partition whose workers were started with its resource, if it is not known yet.
 
         Raises
         ------
@@ -188,9 +192,9 @@ class Steward(SchedulerPlugin):
             self.set_home(record, name, record.original[name])
 
     def change_target(self, name: str | None, change: int) -> None:
-        """Change the number of workers that the rule `n_workers` of a partition asks for.
+        """Change the number of workers that an `n_workers` rule requests.
 
-        Partitions with another rule have no such number, and nothing is done.
+        Other rules are not changed.
         """
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
@@ -199,10 +203,7 @@ class Steward(SchedulerPlugin):
     # -- joining and leaving -----------------------------------------------------------
 
     def _add_record(self, worker: Any) -> WorkerRecord:
-        """Return the record of a worker that has joined or returned, with the worker's new address.
-
-        A new worker gets a new record, without a partition.
-        """
+        """Create or update the record of a worker that has joined or returned."""
         key = worker_key(worker.name, worker.address, worker.nanny)
         info = WorkerInfo.from_identity(worker.address, worker.identity())
         record = self.records.setdefault(key, WorkerRecord(key, info))
@@ -216,7 +217,7 @@ class Steward(SchedulerPlugin):
         return record
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Assign a joining worker: to its former partition, a declared partition, or by rule."""
+        """Assign a joining worker to its former partition, to a declared partition, or by rule."""
         former_keys = set(self.records)
         record = self._add_record(scheduler.workers[worker])
         declared = [name for name in self.rules if record.original.get(name)]
@@ -229,7 +230,11 @@ class Steward(SchedulerPlugin):
         self.reconcile([record])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Record that a worker has left, and keep the record of a worker with a nanny for a while."""
+        """Mark a worker as absent, and schedule the removal of its record.
+
+        The record of a worker with a nanny is kept for a while, because the nanny may restart the
+        worker.
+        """
         for record in list(self.records.values()):
             if record.info.address == worker and not record.is_absent:
                 record.is_absent = True
@@ -242,14 +247,14 @@ class Steward(SchedulerPlugin):
                 )
 
     def _remove_record(self, record: WorkerRecord) -> None:
-        """Remove the record of a worker that has not returned in time, and fill its place by rule.
+        """Remove the record of a worker, and fill its place according to the rules.
 
-        Also of a present worker that cannot declare resources. Members of the remainder that joined
-        by rule are assigned again.
+        The worker has not returned in time, or cannot declare resources. Members of the remainder
+        that have joined after the division can be assigned again to fill the place.
         """
         record.is_removed = True
         del self.records[record.key]
-        # A worker that was started as a replacement has joined before, and went to the rest.
+        # A worker that was started as a replacement may already have joined the remainder.
         if remainder := self.remainder_name():
             for member in self.members(remainder):
                 member.is_unassigned = member.assigned_by_rule
@@ -257,12 +262,12 @@ class Steward(SchedulerPlugin):
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
-        """Choose workers that an adaptive cluster may stop: each partition keeps its minimum."""
+        """Select the workers that an adaptive cluster may stop without violating a minimum."""
         may_stop = {worker.address: worker for worker in workers}
         for name, rule in self.rules.items():
             members = self.members(name, present=True)
             offered = [m.info.address for m in members if m.info.address in may_stop]
-            # The busiest stay.
+            # The busiest workers are kept.
             offered.sort(key=lambda address: -len(may_stop[address].processing))
             for address in offered[: max(0, rule.minimum - (len(members) - len(offered)))]:
                 del may_stop[address]
@@ -271,21 +276,21 @@ class Steward(SchedulerPlugin):
     # -- assigning workers that join ---------------------------------------------------
 
     def _assign_soon(self) -> None:
-        """Assign unplaced workers in `_ASSIGN_EVERY_S`: rules or members have changed."""
+        """Schedule the assignment of unassigned workers after rules or members have changed."""
         if self._assigning is None:
             loop = asyncio.get_running_loop()
             self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
     def _assign_waiting(self) -> None:
-        """Assign all present unplaced workers that have listed their GPUs."""
+        """Assign all present unassigned workers that have reported their GPUs."""
         self._assigning = None
         waiting = [s for s in self.records.values() if s.is_unassigned and not s.is_absent]
-        # Other workers are still asked for their GPUs, and are assigned after their answer.
+        # Workers that have not reported their GPUs yet are assigned by their reconciliation loop.
         ready = [s for s in waiting if s.reconciliation and s.reconciliation.done()]
         self.reconcile([record for record in ready if self._assign(record)])
 
     def _assign(self, record: WorkerRecord) -> bool:
-        """Assign an unplaced worker by the rules, and return whether its partition changes."""
+        """Assign an unassigned worker by the rules, and return whether its partition changed."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(record.info, self.rules, groups)
         if moves := name not in (None, record.partition):
@@ -295,7 +300,7 @@ class Steward(SchedulerPlugin):
         return moves
 
     async def _ask_for_gpus(self, record: WorkerRecord) -> None:
-        """Record the GPUs of a worker, if a rule depends on GPUs."""
+        """Request the GPUs of a worker if a rule depends on them."""
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
@@ -308,14 +313,14 @@ class Steward(SchedulerPlugin):
     # -- reconciling workers --------------------------------------------------------------
 
     def is_settled(self, record: WorkerRecord) -> bool:
-        """Return whether a worker declares its target resources and the scheduler knows."""
+        """Return whether a worker declares its target resources and the scheduler knows them."""
         worker = self.scheduler.workers.get(record.info.address)
         if worker is None or record.is_declaring:
             return False
         return bool(worker.resources == record.declared == self.target_resources(record))
 
     def reconcile(self, records: Iterable[WorkerRecord]) -> None:
-        """Have workers declare their target resources, until `settled` is True for them."""
+        """Start the loops that make workers declare their target resources."""
         for record in records:
             # A running loop checks the record again before it ends.
             if not record.is_absent and (
@@ -327,17 +332,19 @@ class Steward(SchedulerPlugin):
                 record.reconciliation.add_done_callback(partial(self._ended, record))
 
     def _ended(self, record: WorkerRecord, task: asyncio.Task[None]) -> None:
-        """Remove the record of a worker that cannot declare resources, and leave if all is done."""
+        """Remove the record of a worker that cannot declare resources.
+
+        This is the callback at the end of a reconciliation loop. The steward is removed if nothing
+        is left to do.
+        """
         if not (task.cancelled() or record.is_absent) and (error := task.exception()):
             logger.error("Worker %s cannot be assigned to a partition: %r", record.info.name, error)
             self.set_partition(record, None)
-            self._remove_record(
-                record
-            )  # the worker may lack this package; absent workers keep their record
+            self._remove_record(record)  # for example, poolpart is not installed on the worker
         self.remove_if_done()
 
     async def _reconcile(self, record: WorkerRecord, address: str) -> None:
-        """Have a worker declare its target resources, in as many steps as its tasks require."""
+        """Make a worker declare its target resources, in as many steps as its tasks require."""
         if record.is_unassigned:
             await self._ask_for_gpus(record)
             if record.is_unassigned:
@@ -350,15 +357,15 @@ class Steward(SchedulerPlugin):
             except OSError as error:  # the worker is leaving, or the connection was bad
                 logger.info("The worker at %s does not respond: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
-        # `set_visible_resources` does not start the tasks that have waited for a worker with these resources.
+        # `set_visible_resources` does not start the tasks that wait for these resources.
         if worker:
             send_waiting_tasks(self.scheduler, worker)
 
     async def _step(self, record: WorkerRecord, worker: Any, requested_moves: set[Any]) -> bool:
-        """Let a worker declare its target resources, or return False if its tasks must end first.
+        """Request a worker to declare its target resources, and return whether it did.
 
-        The worker refuses while it runs a task that holds a resource to be removed, also a task
-        that the scheduler has forgotten.
+        The worker refuses while it runs a task that holds a resource to be removed, even if the
+        scheduler has already forgotten the task.
         """
         target = self.target_resources(record)
         leaving = {name for name, slots in record.declared.items() if slots and name not in target}
@@ -377,7 +384,7 @@ class Steward(SchedulerPlugin):
             record.declared = target
             if self.target_resources(record) == target:
                 self._show(record, worker, target)
-                # Other members may have taken over tasks, whose slots Dask counts wrongly.
+                # Dask miscounts the slots of tasks that were moved to other members.
                 for name in leaving:
                     for address in self.scheduler.resources.get(name, ()):
                         recount_used_resources(self.scheduler.workers[address])
@@ -386,10 +393,10 @@ class Steward(SchedulerPlugin):
     def _has_released(
         self, record: WorkerRecord, worker: Any, leaving: Collection[str], requested_moves: set[Any]
     ) -> bool:
-        """Move the tasks of partitions that a worker leaves, and return whether none is left.
+        """Move away the tasks of partitions that a worker leaves, and return whether none is left.
 
-        The worker gets no new tasks of these partitions. Tasks that run end on the worker, which
-        keeps the resource until then.
+        The worker receives no new tasks of these partitions. Tasks that are already running finish
+        on the worker, which keeps the resource until then.
         """
         remaining = {name: slots for name, slots in record.declared.items() if name not in leaving}
         self._show(record, worker, remaining)
@@ -397,9 +404,10 @@ class Steward(SchedulerPlugin):
         return not keys_held_by(self.scheduler, worker, leaving)
 
     def _show(self, record: WorkerRecord, worker: Any, resources: Resources) -> None:
-        """Let the scheduler place tasks by the given resources of a worker only.
+        """Make the scheduler place tasks on a worker only according to the given resources.
 
-        Also renew the group of workers that `choosing.py` compares, and the worker's fence.
+        This also invalidates the worker groups of `choosing.py` and updates the fence of the
+        worker.
         """
         set_visible_resources(self.scheduler, worker, resources)
         invalidate_groups(self.scheduler)
@@ -410,7 +418,7 @@ class Steward(SchedulerPlugin):
     ) -> list[WorkerRecord]:
         """Wait until workers declare their target resources, and return the late workers.
 
-        Restarting workers are waited for; workers that have left for good are not.
+        This includes workers that are being restarted, but not workers that were removed.
         """
         self.reconcile(records)
         deadline = time.monotonic() + timeout_s
@@ -422,14 +430,14 @@ class Steward(SchedulerPlugin):
             await asyncio.sleep(LOOK_EVERY_S)
         return late
 
-    # -- the end -----------------------------------------------------------------------
+    # -- stopping ----------------------------------------------------------------------
 
     async def close(self) -> None:
-        """Stop with the scheduler."""
+        """Stop when the scheduler closes."""
         self._stop()
 
     def _stop(self) -> None:
-        """Cancel all timers and loops."""
+        """Cancel all timers and reconciliation loops."""
         scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assigning]
         for record in self.records.values():
             scheduled += [record.reconciliation, record.removal_timer]
@@ -438,7 +446,7 @@ class Steward(SchedulerPlugin):
                 task.cancel()
 
     def remove_if_done(self) -> None:
-        """Leave the scheduler after the last partition, once all workers are restored."""
+        """Remove the plugin if there are no partitions and all workers are restored."""
         present = [record for record in self.records.values() if not record.is_absent]
         if not self.rules and not self.open_requests and all(map(self.is_settled, present)):
             self._stop()
@@ -447,29 +455,30 @@ class Steward(SchedulerPlugin):
 
 
 def worker_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
-    """Return a key of a worker that outlives restarts: its name or else its nanny's address.
+    """Return a key that identifies a worker across restarts: its name, or its nanny's address.
 
-    The default name is the address, which changes with a restart. Names are not converted: to
-    Dask 0, from `LocalCluster`, and "0", from a command line, are two workers.
+    The nanny's address is used for default names, which are derived from the worker's address and
+    change with a restart. Names are not converted to strings, because for Dask, the name 0 from
+    `LocalCluster` and the name "0" from a command line belong to different workers.
     """
     return name if name != address else nanny or address
 
 
 def names_of(records: Iterable[WorkerRecord]) -> str:
-    """Return the names of workers, for messages."""
+    """Format the names of workers for a message."""
     return ", ".join(sorted(record.info.name for record in records))
 
 
 def names_with_rule(scheduler: Any) -> frozenset[str]:
-    """Return the names of the partitions that a division has made."""
+    """Return the names of the partitions that were created by a division of the pool."""
     steward: Steward | None = scheduler.plugins.get(NAME)
     return frozenset() if steward is None else frozenset(steward.rules)
 
 
 def target_of(scheduler: Any, name: str) -> int | None:
-    """Return the number of workers that the rule of a partition asks for.
+    """Return the number of workers that the rule of a partition requests.
 
-    None if it has no rule, or its rule has no such number.
+    The result is None if the partition has no rule, or if its rule does not request a number.
     """
     steward: Steward | None = scheduler.plugins.get(NAME)
     rule = steward.rules.get(name) if steward is not None else None
@@ -478,7 +487,10 @@ def target_of(scheduler: Any, name: str) -> int | None:
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Yield the scheduler's steward, which leaves after the block if it has no partitions."""
+    """Yield the scheduler's steward, which is created for the block if necessary.
+
+    After the block, the steward is removed if it has no partitions.
+    """
     require(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:

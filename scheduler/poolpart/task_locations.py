@@ -1,4 +1,4 @@
-"""Current state of a partition on the scheduler: free slots, tasks and silent workers."""
+"""Snapshot of the slots, unresponsive workers and selected tasks of a partition."""
 
 from __future__ import annotations
 
@@ -14,51 +14,52 @@ from .workers import run_on_scheduler, silent_workers
 
 @dataclass(frozen=True)
 class TaskLocation:
-    """One task on the scheduler."""
+    """State and workers of one task, as the scheduler knows them."""
 
-    state: str  # Dask's name of its state: waiting, no-worker, queued, processing, memory, erred, …
-    workers: tuple[str, ...]  # addresses of workers that run it, or have its result
-    deaths: int  # workers that died, unexpectedly, while the task was assigned to them
-    long_running: bool = False  # it runs and has seceded
-    started: bool = False  # a worker runs it, as of the worker's last heartbeat
+    state: str  # Dask's name, for example waiting, no-worker, queued, processing, memory or erred
+    workers: tuple[str, ...]  # addresses of the workers that run the task or hold its result
+    deaths: int  # number of workers that died unexpectedly while the task was assigned to them
+    long_running: bool = False  # whether the task is running and has seceded
+    started: bool = False  # whether the worker's last heartbeat listed the task as running
 
 
 @dataclass(frozen=True)
 class PartitionSnapshot:
-    """Members of a partition, their slots, and tasks, at a moment.
+    """Members, slots and requested tasks of a partition at one point in time.
 
-    Workers that take no tasks at the moment, because Dask has paused them for their memory or they
-    are leaving, and silent ones have neither `free` nor `slots`.
+    `free` and `slots` do not include workers that currently accept no tasks: workers that Dask has
+    paused because of their memory, workers that are leaving, and silent workers.
     """
 
     members: frozenset[str] = frozenset()  # addresses of all workers of the partition
-    # Members without a recent heartbeat: stopped, cut off or stuck. The scheduler itself considers
-    # a worker dead after its ``worker-ttl``, five minutes.
+    # Members without a recent heartbeat, because they are stopped, disconnected or stuck. The
+    # scheduler itself only considers a worker dead after ``worker-ttl``, which is five minutes.
     silent: frozenset[str] = frozenset()
-    # {address: slots that no task holds or waits for}; below 0 with more tasks than slots.
+    # {address: number of free slots}. The number is negative if there are more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
-    slots: int = 0  # free or not
+    slots: int = 0  # total number of slots
     max_slots: int = 0  # slots, with the workers that `Partition.adapt` may start
     queued_jobs: int = 0  # jobs of such workers that wait in a queue, or start
     tasks: dict[str, TaskLocation] = field(default_factory=dict)  # {requested key: its known task}
 
     def is_unreachable(self, key: str) -> bool:
-        """Return whether a task or its result is on silent workers only."""
+        """Return whether a task is assigned to, or has its result on, silent workers only."""
         task = self.tasks.get(key)
         return task is not None and bool(task.workers) and self.silent.issuperset(task.workers)
 
     def is_long_running(self, key: str) -> bool:
-        """Return whether a task runs and has seceded."""
+        """Return whether a task is running and has seceded."""
         return key in self.tasks and self.tasks[key].long_running
 
 
 def take_snapshot(client: Client, partition: str, keys: Collection[str] = ()) -> PartitionSnapshot:
-    """Ask the scheduler about the slots of a partition and about tasks.
+    """Request the current slots of a partition, and the locations of the given tasks.
 
-    Dask places a task by a worker's total resources, not by the free ones, and prefers the
-    worker with the least work ahead; a worker whose only slot is held by a seceded task looks
-    idle. A second long-running task there waits as long as the first runs. So choose the
-    workers of long-running tasks yourself.
+    Programs that run several long-running tasks need this to select workers themselves. Dask places
+    a task according to the total resources of the workers, not the free ones, and prefers the
+    worker with the least pending work. A worker whose only slot is occupied by a seceded task
+    appears to be idle, and a second long-running task that is placed on it waits until the first
+    one has finished.
     """
     locations: PartitionSnapshot = run_on_scheduler(
         client, _look, partition=partition, keys=list(keys)
@@ -95,6 +96,6 @@ def _task_place(task: Any) -> TaskLocation:
 
 
 def _in_use(worker: Any, resource: str) -> float:
-    """Count the resources held on a worker: Dask's own count is wrong after stealing."""
+    """Return how much of a resource is in use, which Dask itself miscounts after work stealing."""
     held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
     return float(sum(held))

@@ -1,4 +1,4 @@
-"""Tasks of a partition one by one, as `Partition.tasks` returns them."""
+"""Table of the individual tasks of a partition, as returned by `Partition.tasks`."""
 
 from __future__ import annotations
 
@@ -103,13 +103,12 @@ class TaskTable(tuple[TaskRow, ...]):
         return "\n".join(filter(None, (table, self._omission)))
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
         table = html_table("Tasks", _HEAD, [_cells(row) for row in self[:_SHOWN]])
         return table + (html_paragraph(self._omission) if self._omission else "")
 
     @property
     def _omission(self) -> str:
-        """What follows a table of the first tasks, or "" if these are all."""
+        """Note below a truncated table that counts all tasks by state, otherwise ""."""
         if len(self) <= _SHOWN:
             return ""
         counts = Counter(row.state for row in self)
@@ -136,7 +135,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
 
 def _cells(row: TaskRow) -> tuple[str, ...]:
-    """Return the cells of a row, with times of the day in UTC."""
+    """Return the cells of a row, with times of day in UTC."""
     seconds = "" if row.seconds is None else format_seconds(row.seconds)
     times = [_time(row.queued), _time(row.started)]
     return (
@@ -156,5 +155,5 @@ def _time(moment: datetime | None) -> str:
 
 
 def to_datetime(seconds: float | None) -> datetime | None:
-    """Return a time in seconds since 1970 as a date in UTC."""
+    """Convert seconds since 1970 to a datetime in UTC."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

@@ -1,7 +1,7 @@
-"""Partitions whose workers are a group of a deployment that scales groups, such as Kubernetes.
+"""Partitions whose workers are scaled as groups by another system, for example Kubernetes.
 
-The scheduler decides (`adapting.py`), as for jobs of a queue. Each second a thread of this process
-asks for the size that each group shall have, and passes changes on.
+As for jobs of a queue, `adapting.py` decides on the scheduler. Once per second, a thread of this
+process requests the target size of each group and passes changes on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .clusters import pop_bounds
 
 logger = logging.getLogger(__name__)
 
-ADAPT_EVERY_S = 1.0  # seconds between two questions to the scheduler
+ADAPT_EVERY_S = 1.0  # interval between requests to the scheduler
 
 
 class WorkerGroups(Protocol):
@@ -99,15 +99,18 @@ def scale_groups(
             "`scale_groups` expects an object with a method `scale(group, n, leaving)`, but got "
             f"{groups!r}. For dask-kubernetes, pass `KubernetesGroups(cluster)`."
         )
-    kinds = {name: _kind(name, options) for name, options in partitions.items()}
-    run_on_scheduler(client, add_partitions, kinds=kinds)
-    return GroupScaler(client, groups, kinds, report)
+    specs = {name: _job_spec(name, options) for name, options in partitions.items()}
+    run_on_scheduler(client, add_partitions, specs=specs)
+    return GroupScaler(client, groups, specs, report)
 
 
-def _kind(name: str, options: Mapping[str, Any]) -> JobSpec:
+def _job_spec(name: str, options: Mapping[str, Any]) -> JobSpec:
     """Read and check the options of a partition.
 
-    Raises PoolError if an option is wrong.
+    Raises
+    ------
+    PoolError
+        If an option is invalid.
     """
     check_name(name)
     remaining = dict(options)
@@ -125,29 +128,29 @@ def _kind(name: str, options: Mapping[str, Any]) -> JobSpec:
 
 
 class GroupScaler:
-    """The thread of `scale_groups`."""
+    """Thread that scales worker groups, started by `scale_groups`."""
 
     def __init__(
         self,
         client: Client,
         groups: WorkerGroups,
-        kinds: Mapping[str, JobSpec],
+        specs: Mapping[str, JobSpec],
         report: Callable[[str], object],
     ) -> None:
         self._client = client
         self._groups = groups
         self._report = report
         self._reports = {
-            name: GroupReport(kind.bounds.minimum if kind.bounds else 0)
-            for name, kind in kinds.items()
+            name: GroupReport(spec.bounds.minimum if spec.bounds else 0)
+            for name, spec in specs.items()
         }
-        self._messages: set[str] = set()  # passed on so far
+        self._messages: set[str] = set()  # reported messages
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="poolpart-groups", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop scaling, and wait for a call of `scale` that is under way."""
+        """Stop scaling, after waiting for a call to `scale` that is in progress."""
         self._closed.set()
         self._thread.join()
 
@@ -158,7 +161,7 @@ class GroupScaler:
         self.close()
 
     def _follow(self) -> None:
-        """Ask the scheduler for sizes, and pass them on, until this or the client is closed."""
+        """Request target sizes and scale the groups until the scaler or the client is closed."""
         while not self._closed.wait(ADAPT_EVERY_S):
             try:
                 advice = run_on_scheduler(self._client, advise_groups, reports=self._reports)
@@ -170,10 +173,7 @@ class GroupScaler:
                 self._scale(name, advice_of_group)
 
     def _scale(self, name: str, advice: GroupAdvice) -> None:
-        """Scale a group.
-
-        If that fails, the next advice is the same.
-        """
+        """Scale a group. If this fails, the next advice is the same, so the call is repeated."""
         if advice == GroupAdvice(self._reports[name].size):
             return
         try:

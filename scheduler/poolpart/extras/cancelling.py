@@ -1,9 +1,9 @@
-"""Cancelling tasks, also while they run.
+"""Cancellation of tasks, including running ones.
 
-Dask does not stop a function that runs: its thread goes on, and keeps the task's slot. The function
-can look (`cancelled`), or the worker process can be restarted, if nothing else would be lost. The
-scheduler decides that in two steps, as for idle workers of `adapting.py`: it gives the worker no
-further tasks, and then asks the worker what it runs.
+Dask does not stop a running function. Its thread continues and keeps the task's slot. The function
+can check `cancelled`, or the worker process can be restarted if nothing else would be lost. The
+scheduler decides this in two steps, as for idle workers in `adapting.py`: it stops assigning tasks
+to the worker, and then asks the worker which tasks it runs.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from ..pipe_states import fail_pipes_of_killed_task
 from ..workers import run_on_scheduler
 
 T = TypeVar("T")
-Outcomes = dict[Any, str]  # {key of a task: what happened}
+Outcomes = dict[Any, str]  # {task key: outcome}
 
-ARRIVAL_S = 1.0  # a task has to arrive at the scheduler, on another connection than the request
-ANSWER_S = 5.0  # seconds for a worker to say what it runs: a function may hold its interpreter
-RESTART_S = 60.0  # seconds for a worker to come back
+ARRIVAL_S = 1.0  # time for submitted tasks to arrive, which use another connection
+ANSWER_S = 5.0  # time for a worker to respond, which a function that holds the GIL can delay
+RESTART_S = 60.0  # time for a restarted worker to rejoin
 
 
 def cancelled() -> bool:
@@ -58,9 +58,15 @@ def cancelled() -> bool:
 def cancel_tasks(
     tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
 ) -> Outcomes:
-    """Cancel tasks of a partition, by key, on the scheduler.
+    """Cancel tasks of a partition on the scheduler, and return the outcomes by key.
 
-    Returns {key: what happened}, without tasks that had not started, or had ended.
+    Tasks that had not started or had already finished are omitted from the result. If `restarts` is
+    true, workers that only run these tasks are restarted.
+
+    Raises
+    ------
+    PoolError
+        If a task belongs to another partition.
     """
     outcomes, complaint = run_on_scheduler(
         client,
@@ -84,7 +90,7 @@ async def _cancel_tasks(
     restarts: bool,
     dask_scheduler: Any = None,
 ) -> tuple[Outcomes, str]:
-    """Return the outcomes and "", or no outcomes and the message of a PoolError."""
+    """Cancel tasks, and return their outcomes and "", or no outcomes and an error message."""
     scheduler = dask_scheduler
     deadline = time.monotonic() + ARRIVAL_S
     while not scheduler.tasks.keys() >= {*pending_keys} and time.monotonic() < deadline:
@@ -100,9 +106,9 @@ async def _cancel_tasks(
     outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
     members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
     loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
-    affected: dict[Any, list[Any]] = {}  # {worker: keys of cancelled tasks that it runs}
+    affected: dict[Any, list[Any]] = {}  # {worker: keys of canceled tasks that it runs}
     for worker, load in zip(members, loads, strict=True):
-        if load is None:  # such a task may keep it from answering
+        if load is None:  # a canceled task may prevent the worker from responding
             silent = [key for key, at in workers.items() if at is worker and key not in outcomes]
             outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not respond")
         elif running := [key for key in load.running if key in keys and key not in outcomes]:
@@ -125,7 +131,8 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
         return f"{still_running} has no nanny to restart it"
     if worker.status is not Status.running:
         return f"{still_running} is {worker.status.name}"
-    stop_assigning(scheduler, worker)  # one step of the event loop: no task can arrive before
+    # No task can arrive in between, because the event loop has not run since the checks above.
+    stop_assigning(scheduler, worker)
     load = await _load(scheduler, worker)
     alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
     if not alone or not holds_nothing(scheduler, worker):
@@ -137,14 +144,14 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
 
 
 class _Load(NamedTuple):
-    """What a worker itself knows that it has."""
+    """Tasks and results of a worker, as reported by the worker itself."""
 
-    running: list[Any]  # keys of tasks, even of cancelled tasks that the scheduler has forgotten
-    holds_results: bool  # whether a driver still has to fetch results from it
+    running: list[Any]  # keys of running tasks, including those that the scheduler has forgotten
+    holds_results: bool  # whether the worker holds bytes that a client has not fetched yet
 
 
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
-    """Ask a worker for its load, or return None if it does not answer."""
+    """Request the load of a worker, or return None if it does not respond."""
     try:
         return await _within(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
     except OSError:
@@ -152,11 +159,9 @@ async def _load(scheduler: Any, worker: Any) -> _Load | None:
 
 
 async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
-    """Await a request, or return None if it takes longer than the given number of seconds."""
-    # `asyncio.wait_for` of Python 3.11 also waits until the cancelled request has ended, which may
-    # involve closing a connection to a worker that reads nothing. Tried on one to four workers, of
-    # which one held the interpreter's lock for 40 s, from 1 s before to 1 s after the request:
-    # 20 tasks were answered within 10 s in 17 of 17 runs.
+    """Await a request, or return None if it takes longer than the given time."""
+    # `asyncio.wait_for` of Python 3.11 is not used, because it also waits until the canceled
+    # request has ended, which may involve closing a connection to a worker that does not read.
     task = asyncio.ensure_future(request)
     await asyncio.wait([task], timeout=seconds)
     if task.done():

@@ -1,4 +1,4 @@
-"""A function of this process that gets the items of a pipe."""
+"""Listeners, which call a function of this process for each item of a pipe."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class PipeListener:
         self._function = function
         self._closed = threading.Event()
         self._calling = threading.Lock()  # held while the function runs
-        self._thread: threading.Thread | None = None  # thread ids are used again, objects are not
+        self._thread: threading.Thread | None = None  # not the ID, because IDs are reused
         self._done = run_in_background(self._listen)
 
     def join(self, timeout_s: float | None = None) -> None:
@@ -102,7 +102,7 @@ class PipeListener:
             return
         with self._calling:
             pass
-        # The thread ends at its next check, unless it waits for a scheduler that does not answer.
+        # The thread ends at its next check unless the scheduler does not respond.
         concurrent.futures.wait([self._done], 2 * _CHECK_S)
 
     def __enter__(self) -> Self:
@@ -115,7 +115,7 @@ class PipeListener:
             self.close()
 
     def _listen(self) -> None:
-        """Call the function until the pipe ends or the listener is closed."""
+        """Call the function for each item until the pipe ends or the listener is closed."""
         self._thread = threading.current_thread()
         try:
             while not self._closed.is_set():
