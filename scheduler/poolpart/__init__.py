@@ -1,6 +1,6 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from . import extras as extras  # adds its features
+from . import extras as extras  # registers the features
 from ._version import __version__
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError

@@ -140,7 +140,7 @@ class AdaptivePartitions(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.records: dict[str, _Record] = {}  # {partition: its record}
+        self.records: dict[str, _Record] = {}  # records by partition
         self.requested: dict[tuple[str, str], int] = {}  # {(partition, client): slots}
         self._busy_at: dict[str, float] = {}  # {worker address: time when it last ran a task}
         self._cancelled: set[str] = set()  # names of the workers of canceled jobs, never reused
@@ -225,9 +225,8 @@ class AdaptivePartitions(SchedulerPlugin):
         for worker in members:
             held = 0.0
             for task in worker.processing:
-                if (
-                    movable >= limit + total
-                ):  # stop early, since a worker may have thousands of tasks
+                # Stop early, since a worker may have thousands of tasks.
+                if movable >= limit + total:
                     return limit
                 slots = (task.resource_restrictions or {}).get(name, 0)
                 if is_bound(task) or task in worker.long_running:

@@ -48,7 +48,7 @@ class _Group:
         self.version = version  # identifies the state of the cluster for which the group is valid
         self.workers = workers
         self.members = set(workers)
-        self.free = dict.fromkeys(workers)  # ordered set: workers that may have free slots
+        self.free = dict.fromkeys(workers)  # ordered set of workers that may have free slots
         self._next_index = 0  # index of the first worker in the next result of `in_turn`
 
     def with_free_slots(self, slots: float) -> list[Any]:

@@ -273,7 +273,7 @@ async def resize_partition(
             f"Partition {name!r} cannot be resized to {format_workers(count)}, because its "
             f"minimum is {rule.minimum}."
         )
-    size = len(steward.members(name))  # includes members that are starting again
+    size = len(steward.members(name))  # includes members that are being restarted
     targets: dict[WorkerRecord, str | None] = {}
     if count > size:
         targets = dict.fromkeys(_joining(steward, name, count - size, source), name)

@@ -17,7 +17,7 @@ from .internals.worker import add_handler
 
 T = TypeVar("T")
 
-_HANDLER = "poolpart_fetch_held_bytes"  # name of the worker's handler for held bytes
+_HANDLER = "poolpart_take_held"  # name of the worker's handler for held bytes
 
 _held: dict[str, Any] = {}  # held bytes by name
 

@@ -196,7 +196,7 @@ class Registrations(SchedulerPlugin):
         for resources in graph["annotations_by_type"].get("resources", {}).values():
             self._refuse(client, resources)
         resources = annotations.get("resources")
-        if not isinstance(resources, dict):  # none, or a function
+        if not isinstance(resources, dict):  # None or a callable
             return graph
         self._refuse(client, resources)
         workers = annotations.get("workers")

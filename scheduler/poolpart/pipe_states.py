@@ -305,7 +305,8 @@ class PipeRegistry(SchedulerPlugin):
     def fail_for_killed(self, key: Any, names: Sequence[str]) -> None:
         """Make the open pipes of a canceled task fail after the task's worker was restarted."""
         for state in self._existing(names).values():
-            if not state.has_ended and str(key) not in state.takers:  # other consumers can go on
+            # If a consumer is lost, other consumers can continue, so the pipe does not fail.
+            if not state.has_ended and str(key) not in state.takers:
                 state.fail(
                     f"Task {key!r}, which uses the pipe, was canceled, and its worker "
                     "was restarted."

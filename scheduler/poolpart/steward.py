@@ -354,7 +354,7 @@ class Steward(SchedulerPlugin):
             try:
                 if not await self._step(record, worker, requested_moves):
                     await asyncio.sleep(LOOK_EVERY_S)
-            except OSError as error:  # the worker is leaving, or the connection was bad
+            except OSError as error:  # the worker is leaving, or the connection failed
                 logger.info("The worker at %s does not respond: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
         # `set_visible_resources` does not start the tasks that wait for these resources.

@@ -38,9 +38,9 @@ class PartitionSnapshot:
     # {address: number of free slots}. The number is negative if there are more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
     slots: int = 0  # total number of slots
-    max_slots: int = 0  # slots, with the workers that `Partition.adapt` may start
-    queued_jobs: int = 0  # jobs of such workers that wait in a queue, or start
-    tasks: dict[str, TaskLocation] = field(default_factory=dict)  # {requested key: its known task}
+    max_slots: int = 0  # total number of slots once all adaptive jobs have started
+    queued_jobs: int = 0  # number of adaptive jobs that are queued or starting
+    tasks: dict[str, TaskLocation] = field(default_factory=dict)  # requested tasks that exist
 
     def is_unreachable(self, key: str) -> bool:
         """Return whether a task is assigned to, or has its result on, silent workers only."""

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, SupportsIndex, overload
 from .errors import PoolError
 from .html_table import format_seconds, html_paragraph, html_table, text_table
 
-MAX_ENDED_TASKS = 1_000  # tasks of a partition that have ended
-_SHOWN = 20  # rows of a table that is printed
+MAX_ENDED_TASKS = 1_000  # number of finished tasks that are kept per partition
+_SHOWN = 20  # number of rows that a printed table shows
 STATES = ("waiting", "queued", "running", "done", "failed")
 _ENDED = STATES.index("done")  # this and later states have ended
 _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "seconds", "error")

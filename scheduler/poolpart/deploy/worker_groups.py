@@ -165,7 +165,7 @@ class GroupScaler:
         while not self._closed.wait(ADAPT_EVERY_S):
             try:
                 advice = run_on_scheduler(self._client, advise_groups, reports=self._reports)
-            except (PoolError, OSError):  # the client is closed, or is connecting again
+            except (PoolError, OSError):  # the client is closed or reconnecting
                 if self._client.status in ("closing", "closed"):
                     return
                 continue

@@ -93,9 +93,7 @@ class Lender:
     def __init__(self, worker: Any) -> None:
         self.worker = worker
         self.names: set[str] = set()  # partitions whose tasks lend their slots
-        self.waiters: set[threading.Event] = (
-            set()
-        )  # events of threads that lend when slots are needed
+        self.waiters: set[threading.Event] = set()  # events of threads that lend on demand
         self._nested: dict[Any, _NestedTask] = {}  # nested tasks that wait for slots, by key
         self._loans: Counter[Any] = Counter()  # {task key: number of current loans}
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait to get their slots back

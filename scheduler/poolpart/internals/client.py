@@ -81,7 +81,7 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
             with hooks.lend(not answer.done()):
                 return answer.result()
         finally:
-            answer.cancel()  # after an error in this thread
+            answer.cancel()  # has no effect unless an error was raised in this thread
 
     def next_lending(completed: Any) -> Any:
         waits = not completed.has_ready() and not completed.is_empty()

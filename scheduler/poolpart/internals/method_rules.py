@@ -83,7 +83,7 @@ class MethodRules:
     """
 
     def __init__(self) -> None:
-        self._added: list[tuple[Any, str, Any]] = []  # (object, name of its method, rule)
+        self._added: list[tuple[Any, str, Any]] = []  # (object, method name, rule)
 
     def call_after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
         """Call `rule(result, …)` after a method, with its result and arguments, for a new result.

@@ -155,9 +155,8 @@ class BoundedQueue:
         """Add items, ignoring the capacity."""
         was_empty = not self._queue
         self._queue.extend(records)
-        if (
-            was_empty or not self.free_capacity
-        ):  # takers wait for the first item, or linger until it is full
+        # Consumers wait for the first item, or linger until the queue is full.
+        if was_empty or not self.free_capacity:
             self.waiters.notify()
 
     def pop_items(self, number: int) -> list[Record]:
