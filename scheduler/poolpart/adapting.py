@@ -1,9 +1,9 @@
 """Adaptive partitions, whose number of jobs follows their work.
 
 A scheduler plugin stores a record of each partition, with the allowed number of jobs, the slots
-that clients request, and the time when its workers last ran a task. Once per second, the process
-that has the cluster object (see `deploy/clusters.py`) reports its jobs, and the scheduler replies
-how many jobs to start and which jobs have ended.
+that clients request, and the time when its workers last ran a task. Jobs are started by the process
+with the cluster object (see `deploy/clusters.py`). Once per second, this process reports its jobs,
+and the scheduler replies with the number of jobs to start and the jobs that have ended.
 
 The scheduler makes these decisions because no task can arrive between the moment when it finds a
 worker idle and the moment when it stops assigning tasks to that worker. Jobs that wait in a queue
@@ -129,12 +129,12 @@ class _Record:
 
     @property
     def is_current(self) -> bool:
-        """Whether the process that starts jobs has sent a report recently."""
+        """Whether the process that starts the jobs has sent a report recently."""
         return time.monotonic() - self.reported_at <= _LOST_S
 
 
 class AdaptivePartitions(SchedulerPlugin):
-    """Scheduler plugin with the records of all partitions whose jobs a process starts."""
+    """Scheduler plugin with the records of all partitions whose workers are started as jobs."""
 
     name = NAME
 
@@ -351,7 +351,10 @@ class AdaptivePartitions(SchedulerPlugin):
 
 
 def _is_busy(dask_worker: Any = None) -> bool:
-    """Return whether a worker runs a task or holds data that its scheduler does not know."""
+    """Return whether a worker runs a task, or holds data that no client has fetched yet.
+
+    The scheduler may not know about either.
+    """
     return has_running_tasks(dask_worker) or holds_bytes()
 
 
@@ -359,7 +362,7 @@ def _is_busy(dask_worker: Any = None) -> bool:
 
 
 def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> None:
-    """Create the records of partitions whose jobs a process starts."""
+    """Create the records of partitions whose workers are started as jobs."""
     record = _adaptation_of(dask_scheduler) or AdaptivePartitions(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
@@ -423,25 +426,25 @@ async def advise_groups(
 
 
 def set_bounds(name: str, bounds: JobBounds, dask_scheduler: Any = None) -> bool:
-    """Change the allowed number of jobs, and return whether a process starts jobs at all."""
+    """Change the allowed number of jobs, and return whether the partition has jobs at all."""
     record = _record(dask_scheduler, name)
     if record is not None:
         record.spec = replace(record.spec, bounds=bounds)
     return record is not None
 
 
-def request_slots(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
-    """Replace the slot request of a client for a partition, where 0 slots end the request.
+def request_slots(name: str, slots: int, client_id: str, dask_scheduler: Any = None) -> bool:
+    """Replace a client's slot request for a partition. A request for 0 slots ends it.
 
-    `asking` is the ID of the client. The result is False if the partition is not adaptive.
+    The result is False if the partition is not adaptive.
     """
     adaptation = _adaptation_of(dask_scheduler)
     # The last request of a client that was killed may arrive after the client was removed.
-    if adaptation is None or asking not in dask_scheduler.clients:
+    if adaptation is None or client_id not in dask_scheduler.clients:
         return False
-    adaptation.requested.pop((name, asking), None)
+    adaptation.requested.pop((name, client_id), None)
     if slots:
-        adaptation.requested[name, asking] = slots
+        adaptation.requested[name, client_id] = slots
     return slots_of_new_worker(dask_scheduler, name) > 0
 
 

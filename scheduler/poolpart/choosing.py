@@ -142,8 +142,8 @@ class WorkerChooser(SchedulerPlugin):
         """Return the states of the workers that currently belong to a group."""
         if name != _OUTSIDE:
             return workers_declaring(self.scheduler, name)
-        closed: set[Any] = self.scheduler.plugins[FENCES].closed
-        return [worker for worker in self.scheduler.workers.values() if worker not in closed]
+        enclosed: set[Any] = self.scheduler.plugins[FENCES].enclosed
+        return [worker for worker in self.scheduler.workers.values() if worker not in enclosed]
 
     # -- the rule ----------------------------------------------------------------------
 

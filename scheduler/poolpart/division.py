@@ -15,7 +15,7 @@ from typing import Any
 from distributed import Client
 
 from .errors import PoolError
-from .features import FEATURES, begin_features, names_with_features, wait_for_features
+from .features import FEATURES, enable_features, names_with_features, wait_for_features
 from .fence import lower_fence, raise_fence
 from .internals.client import ANSWER_S
 from .internals.scheduler import lift_restrictions, requires_any
@@ -42,16 +42,16 @@ _MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
-def call_steward(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `question(steward, **arguments)` on the scheduler, and return its result.
+def call_steward(client: Client, operation: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `operation(steward, **arguments)` on the scheduler, and return its result.
 
-    `question` is a coroutine function of this module, for example `grow_partition`. If it raises a
+    `operation` is a coroutine function of this module, for example `grow_partition`. If it raises a
     PoolError on the scheduler, this function raises a PoolError with the same message.
     """
     # The steward waits up to `timeout_s` for tasks and then up to `timeout_s` for workers.
     answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
     result, complaint = run_on_scheduler(
-        client, _answer, question=question, arguments=arguments, answer_s=answer_s
+        client, _answer, operation=operation, arguments=arguments, answer_s=answer_s
     )
     if complaint:
         raise PoolError(complaint)
@@ -59,7 +59,7 @@ def call_steward(client: Client, question: Callable[..., Any], **arguments: Any)
 
 
 async def _answer(
-    question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
+    operation: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
     """Call a function with the steward.
 
@@ -68,7 +68,7 @@ async def _answer(
     # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
-            return await question(steward, **arguments), ""
+            return await operation(steward, **arguments), ""
         except PoolError as error:
             return None, str(error)
 
@@ -221,7 +221,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
     """
     scheduler = steward.scheduler
     try:
-        note = begin_features(scheduler, rules)
+        note = enable_features(scheduler, rules)
         for name, rule in rules.items():
             if rule.exclusive:
                 raise_fence(scheduler, name)
@@ -473,7 +473,7 @@ async def dissolve_partitions(
         release_partitions(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
         for feature in FEATURES:
-            feature.end_all(scheduler)
+            feature.clean_up(scheduler)
         release_statistics(scheduler)
     for record in records:
         home = steward.home_of(record)

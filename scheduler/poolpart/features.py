@@ -14,7 +14,7 @@ from typing import Any
 class Feature:
     """Base class of features, whose methods run on the scheduler and do nothing by default."""
 
-    def begin(self, scheduler: Any, names: Iterable[str]) -> str:
+    def enable(self, scheduler: Any, names: Iterable[str]) -> str:
         """Enable the feature in partitions.
 
         Returns a note for users if this version of Dask does not support a part of the feature, or
@@ -22,7 +22,7 @@ class Feature:
         """
         return ""
 
-    def end(self, scheduler: Any, name: str) -> None:
+    def disable(self, scheduler: Any, name: str) -> None:
         """Disable the feature in a partition where it is enabled."""
 
     def names(self, scheduler: Any) -> Set[str]:
@@ -32,7 +32,7 @@ class Feature:
     async def wait_for_workers(self) -> None:
         """Wait until the workers have applied recent changes, up to a time limit."""
 
-    def end_all(self, scheduler: Any) -> None:
+    def clean_up(self, scheduler: Any) -> None:
         """Clean up after the last partition with a rule was dissolved."""
 
     def begin_counting(self, statistics: Any) -> None:
@@ -45,16 +45,16 @@ class Feature:
 FEATURES: list[Feature] = []  # filled when `poolpart` is imported
 
 
-def begin_features(scheduler: Any, names: Iterable[str]) -> str:
+def enable_features(scheduler: Any, names: Iterable[str]) -> str:
     """Enable all features in partitions, and return their notes for users, joined by semicolons."""
     names = [*names]
-    return "; ".join(filter(None, (feature.begin(scheduler, names) for feature in FEATURES)))
+    return "; ".join(filter(None, (feature.enable(scheduler, names) for feature in FEATURES)))
 
 
-def end_features(scheduler: Any, name: str) -> None:
+def disable_features(scheduler: Any, name: str) -> None:
     """Disable all features in a partition."""
     for feature in FEATURES:
-        feature.end(scheduler, name)
+        feature.disable(scheduler, name)
 
 
 def names_with_features(scheduler: Any) -> frozenset[str]:

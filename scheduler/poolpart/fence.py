@@ -2,14 +2,15 @@
 
 A Dask resource only works in one direction: tasks that request it run on workers that have it, but
 all other tasks can run there as well. A fence adds the other direction. Only tasks that take a slot
-of the partition run on its workers. All other tasks run on the rest of the cluster, whenever they
-were submitted and by whichever client. This includes tasks without annotations, collections, nested
-tasks, recomputed and stolen tasks, actors, and the outputs of shuffles.
+of the partition run on its workers. All other tasks run on the rest of the cluster, regardless of
+when and by which client they were submitted. This includes tasks without annotations, collections,
+nested tasks, recomputed and stolen tasks, actors, and the outputs of shuffles.
 
-A fence does not affect tasks that are already assigned to a worker, `Client.run`, which reaches all
-workers, or data that is scattered, replicated or rebalanced (pass ``workers=`` to keep it out).
-Dask may place a task with ``allow_other_workers=True`` inside the fence if none of its workers, or
-no worker outside, has capacity.
+A fence does not affect tasks that are already assigned to a worker, and it does not affect
+`Client.run`, which reaches all workers. It does not restrict data that is scattered, replicated or
+rebalanced either (pass ``workers=`` to keep it out). Dask may place a task with
+``allow_other_workers=True`` inside the fence if none of its workers, or no worker outside, has
+capacity.
 
 The fence exists on the scheduler until it is lowered, even if the client has closed. It includes
 workers that join later, are restarted, or move between partitions. Tasks that no worker outside the
@@ -97,11 +98,11 @@ class Fences(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        self.closed: set[Any] = set()  # states of the enclosed workers
-        self.changes = 0  # number of changes of `closed`
+        self.enclosed: set[Any] = set()  # states of the enclosed workers
+        self.changes = 0  # number of changes of `enclosed`
         self._rules = MethodRules()
         self._warned_at = float("-inf")  # time.monotonic()
-        add_fence_rules(self._rules, scheduler, self.closed, self.keeps_out)
+        add_fence_rules(self._rules, scheduler, self.enclosed, self.keeps_out)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
@@ -120,11 +121,11 @@ class Fences(SchedulerPlugin):
         """Enclose or release a worker according to its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
-            self.changes += worker not in self.closed
-            self.closed.add(worker)
+            self.changes += worker not in self.enclosed
+            self.enclosed.add(worker)
             self.scheduler.idle_task_count.discard(worker)
-        elif worker in self.closed:
-            self.closed.discard(worker)
+        elif worker in self.enclosed:
+            self.enclosed.discard(worker)
             self.changes += 1
             admit_other_tasks(self.scheduler, worker)
 
@@ -134,7 +135,7 @@ class Fences(SchedulerPlugin):
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Remove a worker that has left from the enclosed workers."""
-        self.closed.intersection_update(scheduler.workers.values())
+        self.enclosed.intersection_update(scheduler.workers.values())
 
     # -- the rule ----------------------------------------------------------------------
 
@@ -150,7 +151,7 @@ class Fences(SchedulerPlugin):
         if finish not in ("no-worker", "queued"):
             return
         # A queued task may also be waiting for other tasks to finish.
-        if finish == "queued" and not self.scheduler.running <= self.closed:
+        if finish == "queued" and not self.scheduler.running <= self.enclosed:
             return
         task = self.scheduler.tasks[key]
         elapsed_s = time.monotonic() - self._warned_at

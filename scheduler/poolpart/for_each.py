@@ -89,9 +89,9 @@ class ItemTasks:
     """Tasks for the items of a pipe or an iterable, of which at most `window` are in flight.
 
     By default, the window is two tasks per slot, so that the next item is available when a task
-    ends. It doubles if fewer tasks than slots are left of a full window when this process checks,
-    because slots were idle in this case. Items without a task remain in the pipe, so that producers
-    wait if they are faster than the tasks.
+    ends. It doubles if this process finds that a full window has shrunk to fewer tasks than slots,
+    because this means that slots were idle. Items without a task remain in the pipe, so that
+    producers wait if they are faster than the tasks.
     """
 
     def __init__(

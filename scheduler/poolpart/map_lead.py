@@ -52,7 +52,7 @@ class LeadTime:
         self._busy_s.update(busy_s)
 
     def count_wait(self, seconds: float) -> None:
-        """Add to the time in seconds for which the client has waited for tasks."""
+        """Record a time in seconds for which the client has waited for tasks."""
         self._waited_s += seconds
 
     def review(self, window: int) -> None:

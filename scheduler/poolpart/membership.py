@@ -31,7 +31,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .adapting import adaptive_names, expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
-from .features import begin_features, end_features, names_with_features, wait_for_features
+from .features import disable_features, enable_features, names_with_features, wait_for_features
 from .internals.method_rules import MethodRules, add_arrival_rule
 from .internals.names import REFUSING, require
 from .internals.placing import has_worker_for, workers_declaring
@@ -170,7 +170,7 @@ class Registrations(SchedulerPlugin):
         clients.pop(client, None)
         if not has_rule(self.scheduler, name) and not any(clients.values()):
             clients.clear()
-            end_features(self.scheduler, name)
+            disable_features(self.scheduler, name)
         if not clients:
             del self.clients[name]
             self.with_rule.discard(name)
@@ -248,7 +248,7 @@ async def _register(
         registrations.register(name, client_id, keeps, has_or_had_rule)
         statistics_of(dask_scheduler, keep=False)
         if not ruled:  # otherwise, the division of the pool has enabled them
-            begin_features(dask_scheduler, [name])
+            enable_features(dask_scheduler, [name])
         await wait_for_features()
     others = None
     if not expects_any_worker(dask_scheduler, name, slots):
@@ -307,7 +307,7 @@ def release_partitions(
     for name in names:
         registrations: Registrations | None = scheduler.plugins.get(NAME)
         if registrations is None or name not in registrations.clients:
-            end_features(scheduler, name)
+            disable_features(scheduler, name)
             continue
         if had_rule:
             registrations.with_rule.add(name)

@@ -809,8 +809,8 @@ class Partition:
         True
         """
         check_count("the number of requested slots", slots, minimum=0)
-        asking = {"slots": slots, "asking": self.client.id}
-        return bool(run_on_scheduler(self.client, request_slots, name=self.name, **asking))
+        arguments = {"slots": slots, "client_id": self.client.id}
+        return bool(run_on_scheduler(self.client, request_slots, name=self.name, **arguments))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions.

@@ -255,7 +255,7 @@ class Pipe:
         self,
         deadline: float,
         is_settled: Callable[[Reply], Any],
-        question: str,
+        handler: str,
         on_reply: Callable[[Reply], None] = lambda reply: None,
         **arguments: Any,
     ) -> Reply:
@@ -269,7 +269,7 @@ class Pipe:
         is_settled
             Function that returns whether a reply ends the wait. The wait also ends if the pipe was
             closed, has failed or does not exist.
-        question
+        handler
             PUT or TAKE. `arguments` are the arguments of this request of
             `pipe_states.PipeRegistry`.
         on_reply
@@ -287,7 +287,7 @@ class Pipe:
 
         options = {"names": [self.name], "task": _key_of_task(), **arguments}
         return self._reply(
-            _ask_until(self.client, deadline, has_settled_reply, question, pass_on, **options)
+            _ask_until(self.client, deadline, has_settled_reply, handler, pass_on, **options)
         )
 
     # -- both ends ---------------------------------------------------------------------
@@ -723,16 +723,16 @@ def _let_answer(client: Client) -> None:
         check_client(client)
 
 
-def _ask(client: Client, question: str, **arguments: Any) -> Replies:
+def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
     """Send a single request to the scheduler, and return its replies by pipe.
 
-    `question` is CHANGE, PUT or TAKE, the name of a handler that `pipe_states.PipeRegistry` adds to
+    `handler` is CHANGE, PUT or TAKE, the name of a handler that `pipe_states.PipeRegistry` adds to
     the scheduler and that receives `arguments`. Pipes that do not exist are omitted from the
     replies.
     """
     _let_answer(client)
     replies: Replies = client.sync(
-        send_request, client, None, question, asker=client.id, **arguments
+        send_request, client, None, handler, asker=client.id, **arguments
     )
     return replies
 
@@ -741,7 +741,7 @@ def _ask_until(
     client: Client,
     deadline: float,
     is_settled: Callable[[Replies], bool],
-    question: str,
+    handler: str,
     on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
@@ -758,7 +758,7 @@ def _ask_until(
         Value of `time.monotonic` at which the wait ends. The first request is always sent.
     is_settled
         Function that returns whether the replies, by pipe, end the wait.
-    question
+    handler
         PUT or TAKE, with `arguments` for the handler as in `_ask`.
     on_replies
         Function that is called with the replies to each request, in the client's event loop.
@@ -768,7 +768,7 @@ def _ask_until(
     async def request() -> Replies:
         seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
         options = {"asker": client.id, "seconds": seconds, **arguments}
-        replies: Replies = await send_request(client, None, question, **options)
+        replies: Replies = await send_request(client, None, handler, **options)
         on_replies(replies)
         return replies
 

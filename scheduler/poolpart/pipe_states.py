@@ -217,8 +217,8 @@ def install_pipe_handlers(dask_scheduler: Any = None) -> None:
     For a request without a handler, Dask would log a traceback, in addition to the error of the
     client.
     """
-    for question in (CHANGE, PUT, TAKE):
-        handlers_of(dask_scheduler).setdefault(question, reply_without_pipes)
+    for handler in (CHANGE, PUT, TAKE):
+        handlers_of(dask_scheduler).setdefault(handler, reply_without_pipes)
 
 
 def fail_pipes_of_killed_task(
@@ -380,10 +380,11 @@ class PipeRegistry(SchedulerPlugin):
         seconds: float,
         task: str = "",
     ) -> Replies | Awaitable[Replies]:
-        """Put items into a pipe once it has space for at least one, and answer how many were put.
+        """Put items into a pipe once it has space for at least one.
 
-        If there is space, the reply is returned directly, because Dask would create a task for a
-        coroutine, which takes longer than the request itself.
+        The answer is the number of items that were put. If there is space, the reply is returned
+        directly, because Dask would create a task for a coroutine, which takes longer than the
+        request itself.
         """
 
         def put_into(state: PipeState) -> int:

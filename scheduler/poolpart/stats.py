@@ -1,9 +1,8 @@
-"""Statistics of the tasks of partitions.
+"""Statistics of tasks by partition and stage.
 
-A scheduler plugin counts finished tasks by partition and stage. The partition of a task is the
-resource that it requests, or "". Its stage is the prefix of its key, which is the name of the
-function for most tasks. There are as many stages as prefixes that Dask keeps. Unfinished tasks are
-counted on request.
+A scheduler plugin counts finished tasks. The partition of a task is the resource that it requests,
+or "". Its stage is the prefix of its key, which is the name of the function for most tasks.
+Unfinished tasks are counted on request.
 """
 
 from __future__ import annotations

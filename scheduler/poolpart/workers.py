@@ -182,7 +182,7 @@ def all_workers(client: Client) -> list[WorkerInfo]:
 
 
 def run_on_workers(
-    client: Client, question: Callable[..., Any], addresses: Sequence[str]
+    client: Client, function: Callable[..., Any], addresses: Sequence[str]
 ) -> dict[str, Any]:
     """Run a function on workers, outside of tasks, and return the results by address.
 
@@ -194,7 +194,7 @@ def run_on_workers(
         silent: set[str] = set()
         remaining = list(addresses)
         while remaining:  # Client.run would interpret an empty list as all workers
-            request = client.run(question, workers=remaining, on_error="return")
+            request = client.run(function, workers=remaining, on_error="return")
             answers = asyncio.ensure_future(request)
             try:
                 while silent.isdisjoint(remaining):

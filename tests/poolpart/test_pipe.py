@@ -101,9 +101,9 @@ def requests(monkeypatch):
     found = []
     ask = pipe_module.send_request
 
-    def record(client, timeout_s, question, **arguments):
-        found.append((question, arguments.get("seconds")))
-        return ask(client, timeout_s, question, **arguments)
+    def record(client, timeout_s, handler, **arguments):
+        found.append((handler, arguments.get("seconds")))
+        return ask(client, timeout_s, handler, **arguments)
 
     monkeypatch.setattr(pipe_module, "send_request", record)
     return found
@@ -391,7 +391,7 @@ def test_items_are_taken_beside_tasks(client, make_pipe, requests, monkeypatch, 
     assert take_items(pipe, [], 3, LONG_S) == ([3, 4, 5], False, False)
     pipe.close()
     assert take_items(pipe, [], 3, LONG_S) == ([6], False, False)
-    assert [question for question, _ in requests] == [CHANGE]  # items of the buffer need none
+    assert [handler for handler, _ in requests] == [CHANGE]  # items of the buffer need none
     assert take_items(pipe, [], 3, LONG_S) == ([], True, True)
 
     pipe = make_pipe(client)

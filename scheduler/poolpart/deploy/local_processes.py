@@ -71,8 +71,8 @@ class FixedCluster(SpecCluster):
     """Cluster that cannot be scaled and leaves the restart of dead workers to their nannies.
 
     15 seconds after a worker was lost, a plain SpecCluster closes the nanny of this worker unless a
-    worker with the same name is present. If a worker dies twice within this time, it may just be
-    restarting, and would never return.
+    worker with the same name is present. A worker that dies twice within this time may just be
+    restarting at that moment, and would never return.
     """
 
     def _update_worker_status(self, op: str, msg: Any) -> None:

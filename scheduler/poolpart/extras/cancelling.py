@@ -74,7 +74,7 @@ def cancel_tasks(
         keys=list(tasks),
         pending_keys=[key for key, task in tasks.items() if task.status == "pending"],
         name=name,
-        asking=client.id,
+        client_id=client.id,
         restarts=restarts,
     )
     if complaint:
@@ -86,7 +86,7 @@ async def _cancel_tasks(
     keys: Collection[Any],
     pending_keys: Collection[Any],
     name: str,
-    asking: str,
+    client_id: str,
     restarts: bool,
     dask_scheduler: Any = None,
 ) -> tuple[Outcomes, str]:
@@ -101,7 +101,7 @@ async def _cancel_tasks(
             return {}, f"Task {key!r} does not belong to partition {name!r}. No task was canceled."
     workers = {key: task.processing_on for key, task in known.items()}
     annotations = {key: task.annotations for key, task in known.items()}
-    cancel_keys(scheduler, keys, asking)
+    cancel_keys(scheduler, keys, client_id)
     kept = [key for key in known if key in scheduler.tasks]
     outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
     members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]

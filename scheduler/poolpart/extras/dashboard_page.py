@@ -262,7 +262,7 @@ def close_page(scheduler: Any) -> None:
 class _Page(Feature):
     """Feature that closes the page after the last partition was dissolved."""
 
-    def end_all(self, scheduler: Any) -> None:
+    def clean_up(self, scheduler: Any) -> None:
         """Stop serving the page."""
         close_page(scheduler)
 

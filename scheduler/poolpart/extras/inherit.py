@@ -106,7 +106,7 @@ class Inheritance(SchedulerPlugin):
 class _Inheriting(Feature):
     """Feature that enables inheritance in partitions."""
 
-    def begin(self, scheduler: Any, names: Iterable[str]) -> str:
+    def enable(self, scheduler: Any, names: Iterable[str]) -> str:
         """Keep nested tasks and shuffles of partitions in their partition from now on."""
         rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
         for name in names:
@@ -116,7 +116,7 @@ class _Inheriting(Feature):
                     _inform_workers(scheduler, name, lending_plugin(name))
         return rule.note
 
-    def end(self, scheduler: Any, name: str) -> None:
+    def disable(self, scheduler: Any, name: str) -> None:
         """Disable inheritance in a partition."""
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         if rule is None or name not in rule.names:

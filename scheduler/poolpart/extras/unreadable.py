@@ -48,10 +48,10 @@ class UnreadableInputs:
 
     def _examine_soon(self, task: Any, worker: str) -> None:
         """Examine an input that a worker could not fetch, unless this is already in progress."""
-        question = task.key, worker
-        if question not in self._open and self._waiting(task, worker):
-            self._open[question] = asyncio.ensure_future(self._examine(task, worker))
-            self._open[question].add_done_callback(lambda _: self._open.pop(question))
+        request = task.key, worker
+        if request not in self._open and self._waiting(task, worker):
+            self._open[request] = asyncio.ensure_future(self._examine(task, worker))
+            self._open[request].add_done_callback(lambda _: self._open.pop(request))
 
     def _waiting(self, task: Any, worker: str) -> list[Any]:
         """Return the tasks of partitions that wait on a worker for the result of a task."""

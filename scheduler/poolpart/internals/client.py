@@ -130,15 +130,15 @@ async def fetch_from_worker(client: Client, address: str, keys: Collection[str])
     return dict(data)
 
 
-async def send_request(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
+async def send_request(client: Client, address: str | None, handler: str, **arguments: Any) -> Any:
     """Call a handler of a worker, or of the scheduler if the address is None.
 
     If the scheduler lacks the handler, it logs an error and the result is None. For a worker, the
     caller sets a time limit. For the scheduler, the limit is that of `await_scheduler`.
     """
     if address is None:
-        return await await_scheduler(client, getattr(client.scheduler, question)(**arguments))
-    return await getattr(client.rpc(address), question)(**arguments)
+        return await await_scheduler(client, getattr(client.scheduler, handler)(**arguments))
+    return await getattr(client.rpc(address), handler)(**arguments)
 
 
 async def await_scheduler(

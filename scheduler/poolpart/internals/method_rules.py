@@ -146,11 +146,11 @@ class MethodRules:
 def add_graph_rule(
     rules: MethodRules, scheduler: Any, bequeath: Callable[[Any], Resources]
 ) -> None:
-    """Make the tasks of a graph that a task submits inherit resources, unless they specify any.
+    """Make nested tasks inherit resources from the task that submits their graph.
 
-    `bequeath` returns the inherited resources for the state of the submitting task. Each task is
-    also annotated with its submitting task, so that workers can recognize tasks that wait for the
-    slots of their parents.
+    `bequeath` returns the inherited resources for the state of the submitting task. Tasks that
+    specify resources or workers inherit nothing. Each nested task is also annotated with its
+    submitting task, so that workers can recognize tasks that wait for the slots of their parents.
     """
 
     def add_annotations(graph: dict[str, Any]) -> dict[str, Any]:
@@ -218,12 +218,12 @@ def add_shuffle_rule(rules: MethodRules, scheduler: Any) -> None:
 
 
 def add_fence_rules(
-    rules: MethodRules, scheduler: Any, closed: set[Any], stop: Callable[[Any], bool]
+    rules: MethodRules, scheduler: Any, enclosed: set[Any], keeps_out: Callable[[Any], bool]
 ) -> None:
     """Keep tasks off workers behind a fence.
 
-    `closed` contains the states of these workers, and may change later. `stop` returns whether a
-    task has to be kept out.
+    `enclosed` contains the states of these workers, and may change later. `keeps_out` returns
+    whether a task is not allowed on them.
 
     Raises
     ------
@@ -238,23 +238,23 @@ def add_fence_rules(
         )
 
     def valid_workers(valid: Any, task: Any) -> Any:
-        if not stop(task):
+        if not keeps_out(task):
             return valid
-        remainder = scheduler.running - closed
+        remainder = scheduler.running - enclosed
         if valid is None:
             return remainder
-        allowed = valid - closed
+        allowed = valid - enclosed
         # With loose restrictions, Dask would use any worker if this set were empty.
         return allowed or (remainder if task.loose_restrictions else allowed)
 
     def rootish(worker: Any, task: Any) -> Any:
-        return (
-            scheduler.decide_worker_non_rootish(task) if worker in closed and stop(task) else worker
-        )
+        if worker in enclosed and keeps_out(task):
+            return scheduler.decide_worker_non_rootish(task)
+        return worker
 
     rules.call_after(scheduler, "valid_workers", valid_workers, "ts")
     rules.call_after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
-    scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
+    scheduler.idle_task_count = _OpenWorkers(enclosed, scheduler.idle_task_count)
 
 
 def add_choice_rule(rules: MethodRules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
@@ -298,11 +298,11 @@ def workers_without_fences(scheduler: Any, task: Any) -> Any:
 class _OpenWorkers(set[Any]):
     """Replacement of the scheduler's set of idle workers that excludes workers behind fences."""
 
-    def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
+    def __init__(self, enclosed: set[Any], workers: Iterable[Any]) -> None:
         super().__init__(workers)
-        self.difference_update(closed)
-        self._closed = closed
+        self.difference_update(enclosed)
+        self._enclosed = enclosed
 
     def add(self, worker: Any) -> None:
-        if worker not in self._closed:
+        if worker not in self._enclosed:
             super().add(worker)

@@ -123,7 +123,7 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 
 
 def keys_held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
-    """Return the keys of tasks of the partitions that a worker has or is about to receive."""
+    """Return the keys of the tasks on a worker, or on their way to it, that use the partitions."""
     tasks = {task for task in worker.processing if requires_any(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()

@@ -83,7 +83,7 @@ def current_task() -> tuple[Any, Any] | None:
 
 
 def submitter_of(worker: Any, key: Any) -> SubmittingTask | None:
-    """Return the task of a partition that has submitted a task of this worker, or None."""
+    """Return the task that has submitted a nested task of this worker, or None."""
     task = worker.state.tasks.get(key)
     submitter = (task.annotations or {}).get(SUBMITTER) if task is not None else None
     return None if submitter is None else SubmittingTask(*submitter)
@@ -120,9 +120,9 @@ def count_slots(worker: Any, name: str) -> tuple[float, float]:
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
-def add_handler(worker: Any, question: str, answer: Callable[..., Any]) -> None:
+def add_handler(worker: Any, name: str, handler: Callable[..., Any]) -> None:
     """Add a request handler to a worker unless it already exists."""
-    worker.handlers.setdefault(question, answer)
+    worker.handlers.setdefault(name, handler)
 
 
 # -- inputs ------------------------------------------------------------------------------
