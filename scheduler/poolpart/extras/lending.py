@@ -88,7 +88,7 @@ class _NestedTask:
 
 
 class Lender:
-    """Manages the loans on a worker. All methods run in the worker's event loop."""
+    """Manages the loans on a worker. Methods that change its state run in the event loop."""
 
     def __init__(self, worker: Any) -> None:
         self.worker = worker
