@@ -37,7 +37,7 @@ from .workers import WorkerInfo, run_on_scheduler
 PATIENCE_S = 60.0  # time for new members to declare their resources
 _RETURN_S = 10.0  # minimum time for workers to declare their former resources
 _STAY_S = 1.0  # time for workers that could not be moved to become members again
-_LOOK_EVERY_S = 0.05  # interval between checks for unfinished tasks
+_CHECK_EVERY_S = 0.05  # interval between checks for unfinished tasks
 _MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
@@ -51,14 +51,14 @@ def call_steward(client: Client, operation: Callable[..., Any], **arguments: Any
     # The steward waits up to `timeout_s` for tasks and then up to `timeout_s` for workers.
     answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
     result, complaint = run_on_scheduler(
-        client, _answer, operation=operation, arguments=arguments, answer_s=answer_s
+        client, _run_operation, operation=operation, arguments=arguments, answer_s=answer_s
     )
     if complaint:
         raise PoolError(complaint)
     return result
 
 
-async def _answer(
+async def _run_operation(
     operation: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
     """Call a function with the steward.
@@ -147,8 +147,10 @@ async def create_partitions(
             if name in worker.partitions and worker.address not in permitted
         ]
         if foreign:
-            raise PoolError(_exists(steward, name, [records[address] for address in foreign]))
-    common_note = _begin(steward, rules)
+            raise PoolError(
+                _exists_message(steward, name, [records[address] for address in foreign])
+            )
+    common_note = _prepare_scheduler(steward, rules)
     for worker in candidates:
         if worker.gpus:
             records[worker.address].info = records[worker.address].info.with_gpus(worker.gpus)
@@ -163,7 +165,7 @@ async def create_partitions(
     return notes_of_all, [worker for worker in candidates if records[worker.address] not in members]
 
 
-def _exists(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
+def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
     """Return the error message if a rule does not select all workers of an existing partition."""
     if name in steward.rules:
         return (
@@ -200,14 +202,15 @@ async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> 
     """
     late = await steward.wait_until_settled(members, PATIENCE_S)
     if absent := [record for record in members if record in late or record.is_removed]:
+        partitions = _format_partitions(sorted({str(record.partition) for record in absent}))
         raise PoolError(
-            "Some workers left or did not respond while they were assigned to "
-            f"{_in_words(sorted({str(r.partition) for r in absent}))}: {names_of(absent)}. "
-            "The other workers were assigned. Create a new pool to divide it again."
+            f"Some workers left or did not respond while they were assigned to {partitions}: "
+            f"{names_of(absent)}. The other workers were assigned. Create a new pool to divide it "
+            "again."
         )
 
 
-def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
+def _prepare_scheduler(steward: Steward, rules: Mapping[str, Rule]) -> str:
     """Prepare the scheduler for tasks of new partitions, and return a note for users or "".
 
     This enables features such as inheritance (see `features.py`), raises fences around exclusive
@@ -250,7 +253,7 @@ async def grow_partition(
     """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt_partition(name)
-    joining = _joining(steward, name, count, source)
+    joining = _select_joining(steward, name, count, source)
     return await _move(steward, dict.fromkeys(joining, name), timeout_s)
 
 
@@ -258,7 +261,7 @@ async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: f
     """Move workers out of a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt_partition(name)
-    return await _move(steward, _leaving(steward, name, count), timeout_s)
+    return await _move(steward, _select_leaving(steward, name, count), timeout_s)
 
 
 async def resize_partition(
@@ -276,26 +279,28 @@ async def resize_partition(
     size = len(steward.members(name))  # includes members that are being restarted
     targets: dict[WorkerRecord, str | None] = {}
     if count > size:
-        targets = dict.fromkeys(_joining(steward, name, count - size, source), name)
+        targets = dict.fromkeys(_select_joining(steward, name, count - size, source), name)
     elif count < size:
-        targets = _leaving(steward, name, size - count)
+        targets = _select_leaving(steward, name, size - count)
     # If a worker was lost, the rule requests more workers than there are. The target is set to the
     # present size first, because moving workers changes it by the number of workers moved.
-    steward.change_target(name, size - _asked(rule, size))
+    steward.change_target(name, size - _requested_workers(rule, size))
     try:
         return await _move(steward, targets, timeout_s)
     finally:
         if name in steward.rules:
-            minimum = min(rule.minimum, _asked(steward.rules[name], rule.minimum))
+            minimum = min(rule.minimum, _requested_workers(steward.rules[name], rule.minimum))
             steward.rules[name] = replace(steward.rules[name], minimum=minimum)
 
 
-def _asked(rule: Rule, default: int) -> int:
+def _requested_workers(rule: Rule, default: int) -> int:
     """Return the number of workers that a rule requests, or the default if there is none."""
     return rule.workers if isinstance(rule, n_workers) else default
 
 
-def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[WorkerRecord]:
+def _select_joining(
+    steward: Steward, name: str, count: int, source: str | None
+) -> list[WorkerRecord]:
     """Select the workers to move into a partition.
 
     Raises
@@ -335,7 +340,7 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
     return _in_order(steward, spare, name)[:count]
 
 
-def _leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
+def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
     """Select the workers to move out of a partition, and return the destination of each.
 
     Raises
@@ -485,14 +490,14 @@ async def dissolve_partitions(
     present = [record for record in records if not record.is_absent]
     if late := await steward.wait_until_settled(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
-            f"Some workers did not respond while {_in_words(dissolved)} "
+            f"Some workers did not respond while {_format_partitions(dissolved)} "
             f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. Their "
             "original resources are restored as soon as they respond."
         )
     return dissolved
 
 
-def _in_words(partitions: Sequence[str]) -> str:
+def _format_partitions(partitions: Sequence[str]) -> str:
     """Format partition names for a message, for example "partitions 'A' and 'B'"."""
     plural = "s" if len(partitions) > 1 else ""
     return f"partition{plural} {' and '.join(map(repr, partitions))}"
@@ -525,17 +530,17 @@ async def _wait_for_tasks(
     """
     deadline = time.monotonic() + timeout_s
     # Tasks that the client has just submitted arrive on another connection, milliseconds later.
-    await asyncio.sleep(_LOOK_EVERY_S)
+    await asyncio.sleep(_CHECK_EVERY_S)
     while tasks := _unfinished(steward.scheduler, _existing(steward, names)):
         if time.monotonic() >= deadline:
             one = len(tasks) == 1
+            partitions = _format_partitions(_existing(steward, names))
             raise PoolError(
-                f"{len(tasks)} {'task' if one else 'tasks'} of "
-                f"{_in_words(_existing(steward, names))} {'has' if one else 'have'} not finished "
-                f"after {timeout_s:g} s, for example {tasks[0].key!r}. Wait for the tasks or "
-                "cancel them, and dissolve again."
+                f"{len(tasks)} {'task' if one else 'tasks'} of {partitions} "
+                f"{'has' if one else 'have'} not finished after {timeout_s:g} s, for example "
+                f"{tasks[0].key!r}. Wait for the tasks or cancel them, and dissolve again."
             )
-        await asyncio.sleep(_LOOK_EVERY_S)
+        await asyncio.sleep(_CHECK_EVERY_S)
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:

@@ -58,7 +58,7 @@ def fetch_available(
 
     async def fetch() -> dict[str, Any]:
         if holder is not None:
-            return await _take(client, holder, list(keys), patience_s)
+            return await _fetch_from(client, holder, list(keys), patience_s)
         try:
             holders = await wait_for(
                 send_request(client, None, "who_has", keys=list(keys)), patience_s
@@ -71,14 +71,16 @@ def fetch_available(
                 # If the selected worker does not respond, the next call may select another one.
                 by_worker[random.choice(list(addresses))].append(key)
         results = await asyncio.gather(
-            *(_take(client, address, held, patience_s) for address, held in by_worker.items())
+            *(_fetch_from(client, address, held, patience_s) for address, held in by_worker.items())
         )
         return {key: result for part in results for key, result in part.items()}
 
     return client.sync(fetch)
 
 
-async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
+async def _fetch_from(
+    client: Client, address: str, held: list[str], patience_s: float
+) -> dict[str, Any]:
     request = fetch_from_worker(client, address, held)
     return await _unless_silent(client, address, request, patience_s) or {}
 

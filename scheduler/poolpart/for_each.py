@@ -17,7 +17,7 @@ from .membership import request_capacity
 from .pipe import Pipe, take_items
 from .worker_wait import WorkerWait, check_wait_s
 
-LOOK_S = 5.0  # interval between requests for the number of slots
+CHECK_S = 5.0  # interval between requests for the number of slots
 MOST_PER_SLOT = 16  # maximum number of tasks in flight per slot if no window is given
 
 
@@ -119,8 +119,8 @@ class ItemTasks:
         self._window = window or 1
         self._slots = 0  # number of slots in the partition
         self._per_slot = 2  # number of tasks in flight per slot if no window is given
-        self._next_look = 0.0
-        self._until_next_s = LOOK_S
+        self._next_check = 0.0
+        self._until_next_s = CHECK_S
         self._wait = WorkerWait(partition.name, "`for_each`", empty_s)
         self._stopped = False
 
@@ -132,7 +132,7 @@ class ItemTasks:
         """
         try:
             while self._running or not self._items.drained:
-                self._look()
+                self._update_slots()
                 free = max(0, self._window - len(self._running))
                 futures = self._futures()
                 if self._items.drained or (self._items.closed and not free):
@@ -142,7 +142,7 @@ class ItemTasks:
                     items = self._items.take(futures, free, self._until_next_s)
                     self._submit(items)
                 full = len(self._running) >= self._window
-                self._check()
+                self._check_tasks()
                 if full and len(self._running) < self._slots:
                     self._per_slot = min(2 * self._per_slot, MOST_PER_SLOT)
                     self._set_window()
@@ -167,7 +167,7 @@ class ItemTasks:
     def _futures(self) -> list[Future]:
         return [future for future, _, _ in list(self._running.values())]
 
-    def _look(self) -> None:
+    def _update_slots(self) -> None:
         """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
 
         Raises
@@ -175,7 +175,7 @@ class ItemTasks:
         PoolError
             If the tasks could never run, or have waited too long for workers.
         """
-        if time.monotonic() <= self._next_look:
+        if time.monotonic() <= self._next_check:
             return
         partition = self._partition
         of_partition = request_capacity(
@@ -185,8 +185,8 @@ class ItemTasks:
         self._set_window()
         if self._running:
             self._wait.check(of_partition)
-        self._until_next_s = self._wait.seconds_until_check(LOOK_S)
-        self._next_look = time.monotonic() + self._until_next_s
+        self._until_next_s = self._wait.seconds_until_check(CHECK_S)
+        self._next_check = time.monotonic() + self._until_next_s
 
     def _set_window(self) -> None:
         if self._given_window is None:
@@ -201,7 +201,7 @@ class ItemTasks:
             self._running[future.key] = future, self._count, item
             self._count += 1
 
-    def _check(self) -> None:
+    def _check_tasks(self) -> None:
         """Remove ended tasks, and raise the error of a failed task.
 
         Raises

@@ -41,7 +41,7 @@ GROWTH = 4  # maximum number of items in a chunk, relative to the number of item
 MOST_BYTES = 2**20  # maximum size of the items and results of a chunk
 MOST_BYTES_IN_FLIGHT = 64 * 2**20  # maximum size of all chunks, unless two per slot are more
 SEND_S = 0.05  # maximum time to collect items of a slow iterable before they are sent
-LOOK_S = 5.0  # interval between requests for the number of slots
+CHECK_S = 5.0  # interval between requests for the number of slots
 CHUNK_S = 0.1  # target duration of a task
 CHUNK_S_PER_SLOT = 0.005  # minimum target per slot, so that the scheduler keeps up with many slots
 PATIENCE = 4  # a task ends early after this multiple of the target, and its other items are resent
@@ -306,22 +306,24 @@ class Results(Iterator[Any]):
         previous = iterables[maps[0]] if maps else None
         if isinstance(previous, Results):
             other_iterables = [i for i in iterables if i is not previous]
-            self._follow(previous, replace(stage, result_position=maps[0]), other_iterables)
+            self._continue_map(previous, replace(stage, result_position=maps[0]), other_iterables)
         else:
             self._stages: tuple[Stage, ...] = (stage,)
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
-            self._waits = [_wait_of(stage)]
-            self._look()
+            self._waits = [_worker_wait(stage)]
+            self._update_slots()
         self._submit()
 
-    def _follow(self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
+    def _continue_map(
+        self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]
+    ) -> None:
         """Take over the source and the running tasks of an unread map as the previous stages."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*previous._stages, stage)
-        self._waits = [*previous._waits, _wait_of(stage)]
+        self._waits = [*previous._waits, _worker_wait(stage)]
         self._source = ((*row, call) for call, row in zip(calls, previous._source, strict=False))
         self._items_read = previous._items_read
-        self._look()
+        self._update_slots()
         sent: dict[Future, Chunk] = {}
         for future, chunk in previous._running.items():
             if rows := [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]:
@@ -392,14 +394,14 @@ class Results(Iterator[Any]):
         if not self._running:
             self._submit()
         if self._running:
-            self._look_for_idle_slots()
-            self._take_back(self._wait())
+            self._grow_if_idle()
+            self._collect_results(self._wait())
             self._deliver()
             self._submit()
         else:
             self.close()
 
-    def _look_for_idle_slots(self) -> None:
+    def _grow_if_idle(self) -> None:
         """Increase the lead time if the client is about to wait while slots are idle.
 
         This happens in an ordered map if later tasks have finished before a slow one.
@@ -409,7 +411,7 @@ class Results(Iterator[Any]):
             self._lead.grow()
             self._submit()
 
-    def _look(self) -> None:
+    def _update_slots(self) -> None:
         """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
 
         Raises
@@ -421,8 +423,8 @@ class Results(Iterator[Any]):
         self._slots = [of_stage.max_running for of_stage in request_capacity]
         for wait, of_stage in zip(self._waits, request_capacity, strict=True):
             wait.check(of_stage)
-        until_next = min(wait.seconds_until_check(LOOK_S) for wait in self._waits)
-        self._next_look = time.monotonic() + until_next
+        until_next = min(wait.seconds_until_check(CHECK_S) for wait in self._waits)
+        self._next_check = time.monotonic() + until_next
 
     def _submit(self) -> None:
         """Send chunks until the window is full, in as few messages as possible."""
@@ -528,10 +530,10 @@ class Results(Iterator[Any]):
                 f"The client that partition {self._stages[-1].partition!r} uses was closed."
             )
         # If the partition was dissolved, the results of finished tasks are delivered first.
-        if self._ended.empty() and time.monotonic() > self._next_look:
-            self._look()
+        if self._ended.empty() and time.monotonic() > self._next_check:
+            self._update_slots()
 
-    def _take_back(self, ended: list[Future]) -> None:
+    def _collect_results(self, ended: list[Future]) -> None:
         """Fetch the results of ended tasks in a single request."""
         finished = []
         for future in ended:
@@ -566,7 +568,7 @@ class Results(Iterator[Any]):
             chunk, answer = self._undelivered.pop(first)
             if isinstance(answer, Future):
                 error = answer.exception() if self._stages[-1].return_exceptions else None
-                if not _of_item(error):
+                if not _is_item_error(error):
                     self._failed = chunk, answer
                     return
                 answer = ChunkResult([error], (), 0)
@@ -582,7 +584,7 @@ class Results(Iterator[Any]):
         try:
             future.result()
         except Exception as error:
-            if not (_of_item(error) or future.cancelled() or isinstance(error, PoolError)):
+            if not (_is_item_error(error) or future.cancelled() or isinstance(error, PoolError)):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(
                     f"{NOTE}The task processed items {chunk.first} to {last} of a map. Unless "
@@ -592,11 +594,11 @@ class Results(Iterator[Any]):
         raise AssertionError("the task has not failed")
 
 
-def _wait_of(stage: Stage) -> WorkerWait:
+def _worker_wait(stage: Stage) -> WorkerWait:
     return WorkerWait(stage.partition, "The map", stage.empty_s)
 
 
-def _of_item(error: BaseException | None) -> bool:
+def _is_item_error(error: BaseException | None) -> bool:
     """Return whether an error was raised by the function for an item, rather than by Dask."""
     return any(note.startswith(NOTE) for note in getattr(error, "__notes__", ()))
 

@@ -235,7 +235,7 @@ class Partition:
         _check_function(self.name, function)
         _refuse_options("submit", kwargs, **_OF_TASKS)
         asks = not self.client.asynchronous  # a request would block the client's event loop
-        resources = self._taking(slots, asks)
+        resources = self._resources_for(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
             if not isinstance(several, Iterable):
@@ -259,7 +259,7 @@ class Partition:
                 **kwargs,
             )
 
-    def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
+    def _resources_for(self, slots: int, asks: bool = True) -> dict[str, int]:
         """Check the number of slots, and return the resources of a task.
 
         If `asks` is true, the client is registered for the partition, which may send a request to
@@ -361,7 +361,7 @@ class Partition:
         require(MAP)
         _check_function(self.name, function)
         _refuse_options("map", kwargs, **_OF_MAPS)
-        self._taking(slots)
+        self._resources_for(slots)
         stage = Stage(
             self.client,
             self.name,
@@ -478,7 +478,7 @@ class Partition:
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
-        self._taking(slots)
+        self._resources_for(slots)
         tasks = ItemTasks(self, items, function, window, options, empty_s)
         return tasks.run() if wait else run_in_background(tasks.run, tasks.stop)
 
@@ -578,7 +578,7 @@ class Partition:
         1000000000.0
         """
         _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
-        return self.client.compute(collections, resources=self._taking(slots), **options)
+        return self.client.compute(collections, resources=self._resources_for(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
         """Scatter data into the memory of these workers and return futures.
@@ -627,7 +627,7 @@ class Partition:
         >>> with io:                                                     # doctest: +SKIP
         ...     total = dask.array.ones(10**9).sum().compute()
         """
-        resources = self._taking(1)
+        resources = self._resources_for(1)
         # Dask warns that dataframes ignore annotations when they are created. The warning is
         # suppressed, because annotations are applied when a dataframe is computed in this block.
         annotations = {"resources": resources}

@@ -710,7 +710,7 @@ def exchange_items(
 _connections: WeakKeyDictionary[Client, Any] = WeakKeyDictionary()
 
 
-def _let_answer(client: Client) -> None:
+def _install_handlers(client: Client) -> None:
     """Install the scheduler's handlers for pipe requests, once per connection of the client.
 
     The handlers are installed even if the scheduler has no pipes yet.
@@ -730,7 +730,7 @@ def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
     the scheduler and that receives `arguments`. Pipes that do not exist are omitted from the
     replies.
     """
-    _let_answer(client)
+    _install_handlers(client)
     replies: Replies = client.sync(
         send_request, client, None, handler, asker=client.id, **arguments
     )
@@ -785,7 +785,7 @@ def _ask_until(
             # task has ended.
             await asyncio.sleep(_AGAIN_S)
 
-    _let_answer(client)
+    _install_handlers(client)
     try:
         return client.sync(repeat_request)
     except BaseException:

@@ -142,14 +142,14 @@ class PipeState:
         """Raise ValueError unless a client may set the Variable to the value."""
         if not self.exists:
             raise ValueError(f"Variable {self.name!r} belonged to a pipe that was deleted.")
-        if doubt := self._doubt(value):
+        if doubt := self._invalid_reason(value):
             raise ValueError(
                 f"Variable {self.name!r} holds the state of a pipe, and {doubt}. The current state "
                 f"is {self.value}. Get the value with `Variable.get`, and only change `closed`, "
                 "`failure` and `advice`."
             )
 
-    def _doubt(self, value: Any) -> str:
+    def _invalid_reason(self, value: Any) -> str:
         """Return the reason why a client may not set the Variable to the value, or ""."""
         state = self.value
         if not isinstance(value, dict) or value.keys() != state.keys():
@@ -265,9 +265,9 @@ class PipeRegistry(SchedulerPlugin):
             self._awaited[key].notify()
         task = self.scheduler.tasks[key]
         if task.annotations and (names := task.annotations.get(USES_PIPES)):
-            self._follow(task, names, start, finish)
+            self._fail_if_lost(task, names, start, finish)
 
-    def _follow(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
+    def _fail_if_lost(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
         """Make the pipes of a task fail if the task is lost."""
         # Otherwise, the tasks at the other end of the pipe would wait until the pipe is deleted.
         if finish == "erred":
@@ -462,7 +462,7 @@ class PipeRegistry(SchedulerPlugin):
         def take_from(state: PipeState) -> list[Any]:
             return state.pop_items(limit) if asker in self.scheduler.clients else []
 
-        states = self._taken_by(task, names)
+        states = self._states_for_taker(task, names)
         pipe_waiters = [state.queue.waiters for state in states.values()]
         try:
             task_waiters = [self._awaited[key] for key in keys]
@@ -475,7 +475,7 @@ class PipeRegistry(SchedulerPlugin):
             await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
         return self._replies(states, take_from)
 
-    def _taken_by(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
+    def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
         """Return the states of the pipes that exist, and record the task that takes their items."""
         states = self._existing(names)
         for state in states.values():

@@ -268,7 +268,7 @@ def divide_workers(
         if isinstance(rule, NamedWorkers) and (missing := rule.missing_names(workers)):
             notes[name] = (
                 "The partition does not have all workers that its rule names. "
-                f"{_whereabouts(missing, pool)}"
+                f"{_explain_missing(missing, pool)}"
             )
     return chosen, notes
 
@@ -323,7 +323,7 @@ def find_shortfalls(
     }
 
 
-def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
+def _explain_missing(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
     """Return sentences that explain why the named workers cannot be selected."""
     by_name = {name: worker for worker in pool for name in (worker.name, worker.address)}
     absent = [name for name in missing if name not in by_name]
@@ -340,12 +340,12 @@ def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
         place = f"already {verb} to partition {partitions}"
         if not partitions:
             place = f"{'is' if is_one else 'are'} selected by another rule"
-        sentences.append(f"{'Worker' if is_one else 'Workers'} {_listed(names)} {place}.")
+        sentences.append(f"{'Worker' if is_one else 'Workers'} {_format_names(names)} {place}.")
     if absent:
         present = sorted((worker.name for worker in pool), key=lambda name: (len(name), name))
         sentences.append(
-            f"The pool has no worker named {_listed(absent)}. Existing workers: "
-            f"{_listed(present) or 'none'}."
+            f"The pool has no worker named {_format_names(absent)}. Existing workers: "
+            f"{_format_names(present) or 'none'}."
         )
     return " ".join(sentences)
 
@@ -356,7 +356,7 @@ def _largest_partition(workers: Iterable[WorkerInfo]) -> str:
     return max(sizes, key=sizes.__getitem__, default="")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _format_names(names: Sequence[str]) -> str:
     """Format up to nine names for a message."""
     return ", ".join(map(repr, names[:9])) + (", …" if len(names) > 9 else "")
 
@@ -378,7 +378,7 @@ def _advice(
     sentences = []
     if isinstance(rule, NamedWorkers):
         elsewhere = [w for w in elsewhere if {w.name, w.address} & {*rule.names}]
-        sentences.append(_whereabouts(rule.missing_names(rule.choose(free)), pool))
+        sentences.append(_explain_missing(rule.missing_names(rule.choose(free)), pool))
     else:
         verb = "is" if len(free) == 1 else "are"
         reorder = ", or place this partition before the others" if earlier_rules else ""
@@ -393,7 +393,7 @@ def _advice(
             verb = "declares" if len(elsewhere) == 1 else "declare"
             sentences.append(
                 f"{format_workers(len(elsewhere))} already {verb} the "
-                f"resource{'s' if len(names) > 1 else ''} {_listed(names)}."
+                f"resource{'s' if len(names) > 1 else ''} {_format_names(names)}."
             )
         sentences.append(
             "A worker can belong to only one partition. To divide these workers again, dissolve "

@@ -23,7 +23,7 @@ from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
 NAME = "poolpart-stats"
 _ERROR_LETTERS = 200  # maximum length of the error of a task
-_LOOK_AT_MOST = 1000  # number of tasks per worker that are searched for running tasks
+_MAX_EXAMINED = 1000  # number of tasks per worker that are searched for running tasks
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are available
 # Our state of a task by Dask's state. "assigned" tasks are either running or queued.
 _WAITING = {
@@ -166,7 +166,7 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
     free = slots_of(worker, partition)
-    for task in islice(worker.processing, _LOOK_AT_MOST):
+    for task in islice(worker.processing, _MAX_EXAMINED):
         if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
             free -= takes
             yield task

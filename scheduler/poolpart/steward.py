@@ -51,7 +51,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "poolpart-steward"
 HOLD_S = 30.0  # time for which the record of a worker is kept while its nanny restarts it
-LOOK_EVERY_S = 0.01  # interval between attempts to reconcile a worker
+CHECK_EVERY_S = 0.01  # interval between attempts to reconcile a worker
 _ASSIGN_EVERY_S = 0.1  # about the time that applying all rules to a thousand workers takes
 
 
@@ -92,7 +92,7 @@ class Steward(SchedulerPlugin):
         self.records: dict[Hashable, WorkerRecord] = {}  # {worker key: record}
         self.open_requests = 0  # number of client requests in progress
         self._names: set[str] = set()  # names of all partitions so far, including dissolved ones
-        self._assigning: asyncio.TimerHandle | None = None
+        self._assignment_timer: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._add_record(worker)
 
@@ -277,13 +277,13 @@ class Steward(SchedulerPlugin):
 
     def _assign_soon(self) -> None:
         """Schedule the assignment of unassigned workers after rules or members have changed."""
-        if self._assigning is None:
+        if self._assignment_timer is None:
             loop = asyncio.get_running_loop()
-            self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
+            self._assignment_timer = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
     def _assign_waiting(self) -> None:
         """Assign all present unassigned workers that have reported their GPUs."""
-        self._assigning = None
+        self._assignment_timer = None
         waiting = [s for s in self.records.values() if s.is_unassigned and not s.is_absent]
         # Workers that have not reported their GPUs yet are assigned by their reconciliation loop.
         ready = [s for s in waiting if s.reconciliation and s.reconciliation.done()]
@@ -329,9 +329,9 @@ class Steward(SchedulerPlugin):
                 record.reconciliation = asyncio.ensure_future(
                     self._reconcile(record, record.info.address)
                 )
-                record.reconciliation.add_done_callback(partial(self._ended, record))
+                record.reconciliation.add_done_callback(partial(self._on_reconciled, record))
 
-    def _ended(self, record: WorkerRecord, task: asyncio.Task[None]) -> None:
+    def _on_reconciled(self, record: WorkerRecord, task: asyncio.Task[None]) -> None:
         """Remove the record of a worker that cannot declare resources.
 
         This is the callback at the end of a reconciliation loop. The steward is removed if nothing
@@ -353,10 +353,10 @@ class Steward(SchedulerPlugin):
         while (worker := self.scheduler.workers.get(address)) and not self.is_settled(record):
             try:
                 if not await self._step(record, worker, requested_moves):
-                    await asyncio.sleep(LOOK_EVERY_S)
+                    await asyncio.sleep(CHECK_EVERY_S)
             except OSError as error:  # the worker is leaving, or the connection failed
                 logger.info("The worker at %s does not respond: %s", address, error)
-                await asyncio.sleep(10 * LOOK_EVERY_S)
+                await asyncio.sleep(10 * CHECK_EVERY_S)
         # `set_visible_resources` does not start the tasks that wait for these resources.
         if worker:
             send_waiting_tasks(self.scheduler, worker)
@@ -383,7 +383,7 @@ class Steward(SchedulerPlugin):
         if self.scheduler.workers.get(worker.address) is worker:
             record.declared = target
             if self.target_resources(record) == target:
-                self._show(record, worker, target)
+                self._set_visible_resources(record, worker, target)
                 # Dask miscounts the slots of tasks that were moved to other members.
                 for name in leaving:
                     for address in self.scheduler.resources.get(name, ()):
@@ -399,11 +399,13 @@ class Steward(SchedulerPlugin):
         on the worker, which keeps the resource until then.
         """
         remaining = {name: slots for name, slots in record.declared.items() if name not in leaving}
-        self._show(record, worker, remaining)
+        self._set_visible_resources(record, worker, remaining)
         hand_off_tasks(self.scheduler, worker, leaving, requested_moves)
         return not keys_held_by(self.scheduler, worker, leaving)
 
-    def _show(self, record: WorkerRecord, worker: Any, resources: Resources) -> None:
+    def _set_visible_resources(
+        self, record: WorkerRecord, worker: Any, resources: Resources
+    ) -> None:
         """Make the scheduler place tasks on a worker only according to the given resources.
 
         This also invalidates the worker groups of `choosing.py` and updates the fence of the
@@ -427,7 +429,7 @@ class Steward(SchedulerPlugin):
         ]:
             if time.monotonic() >= deadline:
                 break
-            await asyncio.sleep(LOOK_EVERY_S)
+            await asyncio.sleep(CHECK_EVERY_S)
         return late
 
     # -- stopping ----------------------------------------------------------------------
@@ -438,7 +440,7 @@ class Steward(SchedulerPlugin):
 
     def _stop(self) -> None:
         """Cancel all timers and reconciliation loops."""
-        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assigning]
+        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assignment_timer]
         for record in self.records.values():
             scheduled += [record.reconciliation, record.removal_timer]
         for task in scheduled:

@@ -62,12 +62,14 @@ def take_snapshot(client: Client, partition: str, keys: Collection[str] = ()) ->
     one has finished.
     """
     locations: PartitionSnapshot = run_on_scheduler(
-        client, _look, partition=partition, keys=list(keys)
+        client, _take_snapshot, partition=partition, keys=list(keys)
     )
     return locations
 
 
-def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> PartitionSnapshot:
+def _take_snapshot(
+    partition: str, keys: list[str], dask_scheduler: Any = None
+) -> PartitionSnapshot:
     workers = dask_scheduler.workers.values()
     members = [ws for ws in workers if ws.resources.get(partition)]
     addresses = frozenset(ws.address for ws in members)

@@ -18,7 +18,7 @@ from .internals.worker import declared_resources as declared_resources
 SILENT_S = 20.0  # time without a heartbeat after which a worker is considered silent
 MISSED_BEATS = 3  # number of heartbeats that a worker must miss to be considered silent
 _REPR_S = 2.0  # maximum time that a `repr` waits for the scheduler
-_LOOK_S = 2.0  # interval between checks for silent workers
+_CHECK_S = 2.0  # interval between checks for silent workers
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def run_on_workers(
             answers = asyncio.ensure_future(request)
             try:
                 while silent.isdisjoint(remaining):
-                    finished, _ = await asyncio.wait([answers], timeout=_LOOK_S)
+                    finished, _ = await asyncio.wait([answers], timeout=_CHECK_S)
                     if finished:
                         return dict(answers.result())
                     present = (await send_request(client, None, "identity", n_workers=-1))[

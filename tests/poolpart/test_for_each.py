@@ -60,7 +60,7 @@ def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, cou
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
-    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.05)
+    monkeypatch.setattr("poolpart.for_each.CHECK_S", 0.05)
     client = start({"a": {"resources": {"A": 1}}, "b": {}})
     leave(client, "a")
     pipe = Pipe("of-nobody", 3, client).create()
@@ -73,7 +73,7 @@ def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
 
 
 def test_of_a_partition_that_is_empty_for_a_while(start, monkeypatch, pool, wait_until):
-    monkeypatch.setattr("poolpart.for_each.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.for_each.CHECK_S", 0.0)
     looks = []
 
     def look(*args):

@@ -37,7 +37,7 @@ def fork_servers():
 
 
 def test_it_ends_when_it_is_idle_but_not_under_results_and_pipes(wait_until, caplog, monkeypatch):
-    monkeypatch.setattr("poolpart.deploy.local_pool.LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr("poolpart.deploy.local_pool.CHECK_EVERY_S", 0.01)
     looks = []
     begun = threading.Event()  # a busy machine takes longer than the idle time for the beginning
 

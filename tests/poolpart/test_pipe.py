@@ -92,7 +92,7 @@ OPERATIONS = st.lists(
 def patient(monkeypatch):
     """Have all waits last long, so that only a notification ends them in time."""
     monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
-    monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
+    monkeypatch.setattr("poolpart.internals.queues.CHECK_S", LONG_S)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 _NAME = "poolpart"  # name of the cluster's periodic callback that manages the jobs
 ADAPT_EVERY_S = 1.0  # interval at which partitions are adapted to their tasks
-LOOK_EVERY_S = 5.0  # interval between checks for lost workers
+CHECK_EVERY_S = 5.0  # interval between checks for lost workers
 INFO_MARK = " - INFO - "  # identifies lines in Dask's logs that are not warnings or errors
 _DEATH_S = 60  # time without a scheduler after which a worker exits, as in dask-jobqueue
 
@@ -90,9 +90,9 @@ def start_partitions(
     require(CLUSTERS)
     jobqueue = sys.modules.get("dask_jobqueue")
     if jobqueue and isinstance(cluster, jobqueue.JobQueueCluster):
-        describe = _job
+        describe = _describe_job
     elif getattr(cluster, "scheduler_spec", {}).get("cls") is ssh.Scheduler:
-        describe = _process
+        describe = _describe_process
     else:
         raise PoolError(
             f"A {type(cluster).__name__} has only one kind of worker. Start its workers, then "
@@ -109,7 +109,7 @@ def start_partitions(
         name: _PartitionJobs.from_options(cluster, describe, name, options)
         for name, options in partitions.items()
     }
-    cluster.sync(_JobStarter(cluster, parts, report).begin)
+    cluster.sync(_JobStarter(cluster, parts, report).start)
 
 
 Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]]
@@ -229,7 +229,7 @@ class _JobStarter:
         self._messages: set[str] = set()  # reported messages, without their numbers
         self._logs_read_at = time.monotonic()
 
-    async def begin(self) -> None:
+    async def start(self) -> None:
         """Submit the initial jobs, and start managing all jobs until the cluster is closed."""
         specs = {name: part.spec for name, part in self._parts.items()}
         try:
@@ -241,30 +241,30 @@ class _JobStarter:
             ) from error
         for part in self._parts.values():
             part.add(self._cluster, part.initial_count)
-        await _start(self._cluster)
-        callback = PeriodicCallback(self._look, 1000 * ADAPT_EVERY_S)
+        await _start_workers(self._cluster)
+        callback = PeriodicCallback(self._manage_jobs, 1000 * ADAPT_EVERY_S)
         self._cluster.periodic_callbacks[_NAME] = callback  # stops when the cluster is closed
         callback.start()
 
-    async def _look(self) -> None:
+    async def _manage_jobs(self) -> None:
         """Follow the scheduler's advice, restart lost workers, and read the job logs at times."""
         if self._cluster.status != Status.running:
             return
         with suppress(OSError):  # the scheduler is closing
             changed = await self._adapt()
             looked_at = time.monotonic()
-            due = looked_at - self._logs_read_at >= LOOK_EVERY_S
+            due = looked_at - self._logs_read_at >= CHECK_EVERY_S
             if changed or due:
                 # When a SpecCluster is awaited, it starts the workers that it has lost.
                 try:
-                    await _start(self._cluster)
+                    await _start_workers(self._cluster)
                 except Exception as error:
-                    self._say(f"A worker could not be started: {error}")
+                    self._report_once(f"A worker could not be started: {error}")
             if due:
                 self._logs_read_at = looked_at
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
                     for line in self._logs.new_last_lines():
-                        self._say(line)
+                        self._report_once(line)
 
     async def _adapt(self) -> bool:
         """Start and forget jobs as the scheduler advises, and return whether jobs must start."""
@@ -273,16 +273,18 @@ class _JobStarter:
         for name, advice_of_part in advice.items():
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
-            await asyncio.gather(*(self._end(part, job) for job in advice_of_part.jobs_to_forget))
+            await asyncio.gather(
+                *(self._remove_job(part, job) for job in advice_of_part.jobs_to_forget)
+            )
             if self._cluster.status != Status.running:
                 return False
             # Jobs that were lost or could not be submitted are submitted again first.
             lost = [job for job in part.host_indices if job not in self._cluster.workers]
-            await asyncio.gather(*(self._end(part, job) for job in lost[to_start:]))
+            await asyncio.gather(*(self._remove_job(part, job) for job in lost[to_start:]))
             part.add(self._cluster, to_start - len(lost))
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
-    async def _end(self, part: _PartitionJobs, job: str) -> None:
+    async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
         """Remove a job whose workers have been closed, or will be closed if they join."""
         self._cluster.worker_spec.pop(job, None)
         part.host_indices.pop(job, None)
@@ -294,7 +296,7 @@ class _JobStarter:
             worker.status = Status.closed
             self._cluster.workers.pop(job, None)
 
-    def _say(self, message: str) -> None:
+    def _report_once(self, message: str) -> None:
         """Report a message, unless a message that differs only in its numbers was reported."""
         line = " ".join(message.split())[:400]
         text = re.sub(r"\d+", "", line)
@@ -304,7 +306,7 @@ class _JobStarter:
             self._report(line)
 
 
-async def _start(cluster: SpecCluster) -> None:
+async def _start_workers(cluster: SpecCluster) -> None:
     """Start the workers of the cluster's specification that are missing."""
     try:
         await cluster
@@ -347,7 +349,7 @@ class JobLogs:
                 yield f"The last line of the log {path} is: {last_line}"
 
 
-def _job(
+def _describe_job(
     cluster: Any,
     name: str,
     partition: str,
@@ -371,7 +373,7 @@ def _job(
     return {**cluster.new_spec, **group, "options": options}
 
 
-def _process(
+def _describe_process(
     cluster: Any,
     name: str,
     partition: str,

@@ -22,7 +22,7 @@ from .local import local_cluster
 
 logger = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 1.0  # interval between checks whether the cluster is in use
+CHECK_EVERY_S = 1.0  # interval between checks whether the cluster is in use
 
 
 class LocalPool:
@@ -56,8 +56,8 @@ class LocalPool:
         """Close the client and the cluster once they have not been used for `idle_s` seconds."""
         last_transitions = -1
         used_at = time.monotonic()
-        while not self._closed.wait(min(LOOK_EVERY_S, idle_s)):
-            in_use, transitions = run_on_scheduler(self.client, _use)
+        while not self._closed.wait(min(CHECK_EVERY_S, idle_s)):
+            in_use, transitions = run_on_scheduler(self.client, _usage)
             if in_use or transitions != last_transitions:  # used now or since the last check
                 last_transitions = transitions
                 used_at = time.monotonic()
@@ -71,7 +71,7 @@ def _begin_to_count(dask_scheduler: Any = None) -> None:
     statistics_of(dask_scheduler)
 
 
-def _use(dask_scheduler: Any = None) -> tuple[bool, int]:
+def _usage(dask_scheduler: Any = None) -> tuple[bool, int]:
     """Return whether a cluster has tasks, results or pipes, and its number of transitions."""
     in_use = bool(dask_scheduler.tasks or names_of_pipes(dask_scheduler))
     return in_use, count_transitions(dask_scheduler)

@@ -146,7 +146,7 @@ class GroupScaler:
         }
         self._messages: set[str] = set()  # reported messages
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="poolpart-groups", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="poolpart-groups", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -160,7 +160,7 @@ class GroupScaler:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _follow(self) -> None:
+    def _run(self) -> None:
         """Request target sizes and scale the groups until the scaler or the client is closed."""
         while not self._closed.wait(ADAPT_EVERY_S):
             try:

@@ -113,7 +113,10 @@ async def _cancel_tasks(
             outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not respond")
         elif running := [key for key in load.running if key in keys and key not in outcomes]:
             affected[worker] = running
-    ends = (_end(scheduler, worker, running, restarts) for worker, running in affected.items())
+    ends = (
+        _restart_if_idle(scheduler, worker, running, restarts)
+        for worker, running in affected.items()
+    )
     for running, outcome in zip(affected.values(), await asyncio.gather(*ends), strict=True):
         outcomes |= dict.fromkeys(running, outcome)
         if outcome.startswith("restarted"):
@@ -122,7 +125,7 @@ async def _cancel_tasks(
     return outcomes, ""
 
 
-async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
+async def _restart_if_idle(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
     """Restart a worker if all of its tasks are canceled, and return the outcome."""
     still_running = f"running: worker {worker.name}"
     if not restarts:
@@ -138,7 +141,7 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
     if not alone or not holds_nothing(scheduler, worker):
         resume_assigning(scheduler, worker)
         return f"{still_running} holds other tasks or results"
-    if await _within(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
+    if await _await_for(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
 
@@ -153,12 +156,12 @@ class _Load(NamedTuple):
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
     """Request the load of a worker, or return None if it does not respond."""
     try:
-        return await _within(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
+        return await _await_for(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
     except OSError:
         return None
 
 
-async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
+async def _await_for(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
     """Await a request, or return None if it takes longer than the given time."""
     # `asyncio.wait_for` of Python 3.11 is not used, because it also waits until the canceled
     # request has ended, which may involve closing a connection to a worker that does not read.

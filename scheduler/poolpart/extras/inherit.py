@@ -54,15 +54,19 @@ class Inheritance(SchedulerPlugin):
         self._rules = MethodRules()
         self._choice: WorkerChooser | None = None
         self._unreadable: UnreadableInputs | None = None
-        self.lends = self._begin(
+        self.lends = self._enable_part(
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
         )
-        self._begin(SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle)
-        self._begin(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
-        self._begin(READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read)
+        self._enable_part(
+            SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle
+        )
+        self._enable_part(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
+        self._enable_part(
+            READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read
+        )
         scheduler.add_plugin(self)
 
-    def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
+    def _enable_part(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
         """Enable a part of the feature, and return whether this version of Dask supports it.
 
         If not, a note for users that begins with `without` names the missing private API.
@@ -77,7 +81,7 @@ class Inheritance(SchedulerPlugin):
         return True
 
     def _nest(self) -> None:
-        add_graph_rule(self._rules, self.scheduler, self._bequeath)
+        add_graph_rule(self._rules, self.scheduler, self._inherited_resources)
 
     def _shuffle(self) -> None:
         add_shuffle_rule(self._rules, self.scheduler)
@@ -88,7 +92,7 @@ class Inheritance(SchedulerPlugin):
     def _read(self) -> None:
         self._unreadable = UnreadableInputs(self.scheduler, self.names)
 
-    def _bequeath(self, task: Any) -> Resources:
+    def _inherited_resources(self, task: Any) -> Resources:
         """Return the resources that tasks inherit from a task, empty outside of partitions."""
         resources = task.resource_restrictions
         return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}

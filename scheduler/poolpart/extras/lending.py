@@ -100,7 +100,7 @@ class Lender:
         self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
         self._lent: set[Any] = set()  # keys of running tasks that have lent their slots before
         self._warned: set[Any] = set()  # keys of submitting tasks with a warning
-        self._next_look: Any = None  # timer handle of the next check
+        self._next_check: Any = None  # timer handle of the next check
 
     # -- loans -------------------------------------------------------------------------
 
@@ -183,27 +183,27 @@ class Lender:
             self._lent.discard(key)
         if finish == "constrained" and (submitter := submitter_of(self.worker, key)) is not None:
             self._nested[key] = _NestedTask(submitter, time.monotonic())
-            if self._next_look is None:
-                self._look_later()
+            if self._next_check is None:
+                self._schedule_check()
         self.return_slots()
 
     def stop(self) -> None:
         """Forget waiting tasks and stop the checks after lending has ended in all partitions."""
         self._nested.clear()
-        if self._next_look is not None:
-            self._next_look.cancel()
-            self._next_look = None
+        if self._next_check is not None:
+            self._next_check.cancel()
+            self._next_check = None
 
     # -- warnings ----------------------------------------------------------------------
 
-    def _look_later(self) -> None:
+    def _schedule_check(self) -> None:
         """Schedule the next check for tasks that have waited too long."""
         loop = asyncio.get_running_loop()
-        self._next_look = loop.call_later(WARN_AFTER_S / 2, self._look)
+        self._next_check = loop.call_later(WARN_AFTER_S / 2, self._check_nested)
 
-    def _look(self) -> None:
+    def _check_nested(self) -> None:
         """For each task that has waited too long, ask whether its submitter occupies slots."""
-        self._next_look = None
+        self._next_check = None
         looked_at = time.monotonic()
         for key, nested in self._nested.items():
             if (
@@ -213,7 +213,7 @@ class Lender:
                 self._warned.add(nested.submitter.key)
                 self.worker.loop.add_callback(self._warn, key, nested.submitter)
         if self._nested:
-            self._look_later()
+            self._schedule_check()
         else:
             self._warned.clear()
 

@@ -35,7 +35,7 @@ def table_of_partitions(client: Client, title: str) -> str:
     only the title is returned.
     """
     try:
-        rows, link = _ask(client, _all_partitions)
+        rows, link = _request(client, _all_partitions)
     except (PoolError, OSError):  # the client was closed, or the scheduler lacks this package
         return _plain(title)
     return html_table(title, _HEAD, rows) + _link(link, "pool.page()")
@@ -66,7 +66,7 @@ def _table_of_one(
     """
     title, head, gone = words
     try:
-        row, link = _ask(get_client(), look, name=name)
+        row, link = _request(get_client(), look, name=name)
     except (PoolError, OSError, ValueError):  # ValueError: this process has no client
         return _plain(title)
     if row is None:
@@ -83,7 +83,7 @@ def _link(link: str | None, opener: str) -> str:
     return _LINK.generate(link=link, opener=opener).decode()
 
 
-def _ask(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
+def _request(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
     """Call a function on the scheduler, and return its result and the URL of the page if open."""
     found, has_page = run_on_scheduler(client, look, **arguments)
     return found, page_link(client) if has_page else None

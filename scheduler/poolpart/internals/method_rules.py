@@ -144,11 +144,11 @@ class MethodRules:
 
 
 def add_graph_rule(
-    rules: MethodRules, scheduler: Any, bequeath: Callable[[Any], Resources]
+    rules: MethodRules, scheduler: Any, inherited_resources: Callable[[Any], Resources]
 ) -> None:
     """Make nested tasks inherit resources from the task that submits their graph.
 
-    `bequeath` returns the inherited resources for the state of the submitting task. Tasks that
+    `inherited_resources` returns these resources for the state of the submitting task. Tasks that
     specify resources or workers inherit nothing. Each nested task is also annotated with its
     submitting task, so that workers can recognize tasks that wait for the slots of their parents.
     """
@@ -156,7 +156,7 @@ def add_graph_rule(
     def add_annotations(graph: dict[str, Any]) -> dict[str, Any]:
         name = graph["submitting_task"]
         task = scheduler.tasks.get(name) or actor_of_method(scheduler, name)
-        inherited = bequeath(task) if task is not None else {}
+        inherited = inherited_resources(task) if task is not None else {}
         if not inherited:
             return graph
         address = task.processing_on.address if task.processing_on else ""  # "" for actors

@@ -29,7 +29,7 @@ PRIVATE_NAMES = (
 )
 
 VARIABLE_SET = "variable_set"  # name of the request that `Variable.set` sends
-LOOK_S = 1.0  # interval at which a wait checks its condition without a notification
+CHECK_S = 1.0  # interval at which a wait checks its condition without a notification
 
 Record = dict[str, Any]  # record of an item in Dask's queue extension
 Packed = bytes | Record  # item that is sent to a client, which calls `unpack_item`
@@ -82,7 +82,7 @@ async def wait_until(
         while not condition() and (remaining := deadline - time.monotonic()) > 0:
             event.clear()
             with suppress(TimeoutError):
-                async with asyncio.timeout(min(remaining, LOOK_S)):
+                async with asyncio.timeout(min(remaining, CHECK_S)):
                     await event.wait()
     finally:
         for group in waiters:
