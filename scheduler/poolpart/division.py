@@ -31,7 +31,7 @@ from .rules import (
     rest,
 )
 from .stats import statistics_of
-from .steward import Steward, WorkerRecord, names_of, steward_of
+from .steward import Steward, WorkerRecord, join_names, steward_of
 from .workers import WorkerInfo, run_on_scheduler
 
 PATIENCE_S = 60.0  # time for new members to declare their resources
@@ -170,7 +170,7 @@ def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]
     if name in steward.rules:
         return (
             f"Partition {name!r} already exists, and this call does not select all of its workers. "
-            f"Its workers are {names_of(members)}. To use the existing partition, call "
+            f"Its workers are {join_names(members)}. To use the existing partition, call "
             f"`Pool.from_client(client)[{name!r}]`. To create another partition, choose a "
             "different name."
         )
@@ -185,7 +185,7 @@ def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]
             )
     return (
         f"The rule does not select all workers that were started with the resource {name!r}. "
-        f"Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
+        f"Workers that are not selected: {join_names(members)}. {use}, pass a rule that "
         "selects all of these workers, such as `rest()`, or choose another name. A partition with "
         f"another name and the rule `n_workers(1, minimum=0)` can take workers from {name!r} with "
         f"`partition.resize(1, source={name!r})`."
@@ -205,8 +205,8 @@ async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> 
         partitions = _format_partitions(sorted({str(record.partition) for record in absent}))
         raise PoolError(
             f"Some workers left or did not respond while they were assigned to {partitions}: "
-            f"{names_of(absent)}. The other workers were assigned. Create a new pool to divide it "
-            "again."
+            f"{join_names(absent)}. The other workers were assigned. Create a new pool to divide "
+            "it again."
         )
 
 
@@ -403,7 +403,7 @@ async def _move(
         raise PoolError(
             f"{len(late)} of {format_workers(len(targets))} could not be moved within "
             f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
-            f"These workers stay in their partition: {names_of(late)}. Wait for their tasks, or "
+            f"These workers stay in their partition: {join_names(late)}. Wait for their tasks, or "
             "pass a longer `timeout_s`."
         )
     return [record.info.name for record in targets if not record.is_removed]
@@ -491,7 +491,7 @@ async def dissolve_partitions(
     if late := await steward.wait_until_settled(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
             f"Some workers did not respond while {_format_partitions(dissolved)} "
-            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. Their "
+            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {join_names(late)}. Their "
             "original resources are restored as soon as they respond."
         )
     return dissolved

@@ -40,7 +40,7 @@ from .internals.method_rules import (
     remove_fence_rules,
     workers_without_fences,
 )
-from .internals.names import FENCES, require
+from .internals.names import FENCES, require_feature
 from .internals.scheduler import admit_other_tasks
 
 logger = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def raise_fence(scheduler: Any, name: str) -> None:
     PoolError
         If this version of Dask lacks the private API that fences require.
     """
-    require(FENCES)
+    require_feature(FENCES)
     fences: Fences = scheduler.plugins.get(NAME) or Fences(scheduler)
     fences.names.add(name)
     fences.update_workers()

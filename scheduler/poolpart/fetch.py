@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from distributed import Client, get_worker
 
 from .internals.client import fetch_from_worker, send_request, wrap_bytes
-from .internals.names import FETCHING, require
+from .internals.names import FETCHING, require_feature
 from .internals.worker import add_handler
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ def fetch_available(
     dict
         Results by key, possibly empty.
     """
-    require(FETCHING)
+    require_feature(FETCHING)
 
     async def fetch() -> dict[str, Any]:
         if holder is not None:

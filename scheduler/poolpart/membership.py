@@ -33,7 +33,7 @@ from .adapting import adaptive_names, expects_workers, max_running_tasks, slots_
 from .errors import PoolError
 from .features import disable_features, enable_features, names_with_features, wait_for_features
 from .internals.method_rules import MethodRules, add_arrival_rule
-from .internals.names import REFUSING, require
+from .internals.names import REFUSING, require_feature
 from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import current_task
 from .registration import is_registered, record_registration
@@ -139,7 +139,7 @@ class Registrations(SchedulerPlugin):
         self.with_rule: set[str] = set()  # partitions that have or had a rule
         self._rules = MethodRules()
         try:
-            require(REFUSING)
+            require_feature(REFUSING)
             add_arrival_rule(self._rules, scheduler, self._check)
         except PoolError as error:  # partitions are useful without this check
             logger.warning(

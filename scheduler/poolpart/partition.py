@@ -28,7 +28,7 @@ from .extras.background import run_in_background
 from .extras.cancelling import cancel_tasks
 from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
-from .internals.names import CANCELLING, MAP, require
+from .internals.names import CANCELLING, MAP, require_feature
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
@@ -358,7 +358,7 @@ class Partition:
         >>> sum(io.map(abs, range(-9, 0)))                               # doctest: +SKIP
         45
         """
-        require(MAP)
+        require_feature(MAP)
         _check_function(self.name, function)
         _refuse_options("map", kwargs, **_OF_MAPS)
         self._resources_for(slots)
@@ -527,7 +527,7 @@ class Partition:
         >>> gpu.cancel(future, running="restart")                        # doctest: +SKIP
         {'sleep-1f3a': 'restarted: worker GPU-0'}
         """
-        require(CANCELLING)
+        require_feature(CANCELLING)
         if running not in ("continue", "restart"):
             raise ValueError(
                 f'Invalid value {running!r} for `running`. Expected "continue" or "restart".'

@@ -36,7 +36,7 @@ from .errors import PipeClosed, PipeFailed
 from .extras.listening import PipeListener
 from .extras.notebook import table_of_pipe
 from .internals.client import send_request
-from .internals.names import PIPES, require
+from .internals.names import PIPES, require_feature
 from .internals.queues import Packed, unpack_item
 from .internals.worker import current_task
 from .pipe_states import (
@@ -205,7 +205,7 @@ class Pipe:
         PoolError
             If the installed version of Dask does not support pipes.
         """
-        require(PIPES)
+        require_feature(PIPES)
         client = self.client
         state = {"owner": client.id, "capacity": self.capacity, "producers": self.producers}
         if not run_on_scheduler(client, create_pipe, name=self.name, **state):

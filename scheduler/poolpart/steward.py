@@ -32,7 +32,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .choosing import invalidate_groups
 from .errors import PoolError
 from .fence import set_expected_partition
-from .internals.names import DIVIDING, require
+from .internals.names import DIVIDING, require_feature
 from .internals.scheduler import (
     Resources,
     call_worker,
@@ -466,7 +466,7 @@ def worker_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
     return name if name != address else nanny or address
 
 
-def names_of(records: Iterable[WorkerRecord]) -> str:
+def join_names(records: Iterable[WorkerRecord]) -> str:
     """Format the names of workers for a message."""
     return ", ".join(sorted(record.info.name for record in records))
 
@@ -493,7 +493,7 @@ def steward_of(scheduler: Any) -> Iterator[Steward]:
 
     After the block, the steward is removed if it has no partitions.
     """
-    require(DIVIDING)
+    require_feature(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:
         steward = Steward(scheduler)

@@ -24,7 +24,7 @@ from tornado.ioloop import PeriodicCallback
 
 from ..adapting import IDLE_S, JobBounds, JobSpec, add_partitions, advise_jobs
 from ..errors import PoolError
-from ..internals.names import ADAPTING, CLUSTERS, require
+from ..internals.names import ADAPTING, CLUSTERS, require_feature
 from ..internals.scheduler import run_on_cluster_scheduler
 from ..rules import check_count, check_name
 
@@ -87,7 +87,7 @@ def start_partitions(
     ...         },
     ...     )
     """
-    require(CLUSTERS)
+    require_feature(CLUSTERS)
     jobqueue = sys.modules.get("dask_jobqueue")
     if jobqueue and isinstance(cluster, jobqueue.JobQueueCluster):
         describe = _describe_job
@@ -198,7 +198,7 @@ def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
                 "example to [0, 8]."
             )
         return None
-    require(ADAPTING)
+    require_feature(ADAPTING)
     if "workers" in options or not isinstance(adapt, Sequence) or len(adapt) != 2:
         raise PoolError(
             f"Invalid value {adapt!r} for `adapt` of partition {name!r}. Expected the minimum and "

@@ -10,7 +10,7 @@ import dask
 from distributed import Scheduler, Security, SpecCluster
 
 from ..errors import PoolError
-from ..internals.names import CLUSTERS, require
+from ..internals.names import CLUSTERS, require_feature
 from ..rules import check_count, check_name
 from .local_processes import FixedCluster, ScriptlessNanny
 
@@ -66,7 +66,7 @@ def local_cluster(
     >>> with local_cluster({"GPU": (2, 1), "IO": (1, 8)}) as cluster:    # doctest: +SKIP
     ...     parts = Pool.from_client(Client(cluster)).partitions()
     """
-    require(CLUSTERS)
+    require_feature(CLUSTERS)
     for name, (count, slots) in partitions.items():
         check_name(name)
         check_count(f"the number of workers of partition {name!r}", count, minimum=0)

@@ -21,7 +21,7 @@ from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..fence import fence_names
 from ..html_table import TEXT_COLUMNS, format_seconds
-from ..internals.names import PAGE, require
+from ..internals.names import PAGE, require_feature
 from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
 from ..partition_stats import COUNTS, NO_PARTITION, StageStats
@@ -98,10 +98,12 @@ def render_page(scheduler: Any) -> bytes:
     stages: list[list[object]] = []
     pipes: list[list[object]] = []
     for p in stats_of([*sorted(names), ""], scheduler):
-        title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
+        title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
-        stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
-    rows_of_workers = sorted((_worker(worker) for worker in workers), key=_by_partition_and_name)
+        stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+    rows_of_workers = sorted(
+        (_worker_row(worker) for worker in workers), key=_by_partition_and_name
+    )
     for name, pipe in pipes_of(scheduler).items():
         pipes.append([name, *pipe.summary])
     tables = [
@@ -116,7 +118,7 @@ def render_page(scheduler: Any) -> bytes:
     )
 
 
-def _shown(partition: str) -> str:
+def _label(partition: str) -> str:
     return partition or NO_PARTITION
 
 
@@ -124,11 +126,11 @@ def _counts(stats: StageStats) -> list[object]:
     return [*(getattr(stats, count) for count in COUNTS), format_seconds(stats.seconds)]
 
 
-def _worker(worker: Any) -> list[object]:
+def _worker_row(worker: Any) -> list[object]:
     partition = next((name for name, slots in worker.resources.items() if slots), "")
     return [
         worker.name,
-        _shown(partition),
+        _label(partition),
         slots_of(worker, partition),
         running_on(worker, partition)[1],
         len(worker.processing),
@@ -141,7 +143,7 @@ def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
     """Return the sort key of a worker's row, which sorts 9 before 10 and no partition last."""
     name = str(row[0])
     partition = str(row[1])
-    return partition == _shown(""), partition, len(name), name
+    return partition == _label(""), partition, len(name), name
 
 
 class _Handler(web.RequestHandler):
@@ -205,7 +207,7 @@ class PageOwners(SchedulerPlugin):
 def open_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster, and return its URL."""
     check_client(client)
-    run_on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
+    run_on_scheduler(client, _open_page, owner=client.id, link=_dashboard_link(client))
     link = page_link(client)
     if link is None:
         raise PoolError(
@@ -234,8 +236,8 @@ def is_page_open(scheduler: Any) -> bool:
     return NAME in scheduler.plugins
 
 
-async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> None:
-    require(PAGE)
+async def _open_page(owner: str, link: str | None, dask_scheduler: Any = None) -> None:
+    require_feature(PAGE)
     # Resolving the domain may take seconds.
     names = await asyncio.to_thread(names_of_machine, _ANY_ADDRESS)
     if owner not in dask_scheduler.clients:  # the client was killed and already removed

@@ -31,7 +31,7 @@ from ..choosing import WorkerChooser
 from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..internals.method_rules import MethodRules, add_graph_rule, add_shuffle_rule
-from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require
+from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require_feature
 from ..internals.scheduler import Resources, set_worker_plugin
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
@@ -72,7 +72,7 @@ class Inheritance(SchedulerPlugin):
         If not, a note for users that begins with `without` names the missing private API.
         """
         try:
-            require(feature)
+            require_feature(feature)
             begin()
         except PoolError as error:  # partitions are useful without this part
             self.note = " ".join(filter(None, (self.note, f"{without} {error}")))

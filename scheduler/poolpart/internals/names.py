@@ -1,8 +1,8 @@
 """List of the private API of Dask that poolpart uses, and checks that it exists.
 
-Private names may change in any release of Dask. Before a feature is used, `require` checks the
-names that it needs. If a name is missing, a `PoolError` reports it, and all other features continue
-to work. docs/pool-partitions.md contains a table of `PRIVATE_NAMES`.
+Private names may change in any release of Dask. Before a feature is used, `require_feature` checks
+the names that it needs. If a name is missing, a `PoolError` reports it, and all other features
+continue to work. docs/pool-partitions.md contains a table of `PRIVATE_NAMES`.
 """
 
 from __future__ import annotations
@@ -329,7 +329,7 @@ PRIVATE_NAMES = (
 )
 
 
-def require(feature: str) -> None:
+def require_feature(feature: str) -> None:
     """Check that this version of Dask has the private names that a feature needs.
 
     The first call in a process also warns if this version of Dask was not tested.
