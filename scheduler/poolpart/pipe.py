@@ -603,7 +603,7 @@ def set_advice(pipe: Pipe, amount: int) -> None:
 
 
 def put_back(pipe: Pipe, item: Any) -> None:
-    """Return an item to a `Pipe` object, whose next `get` returns it again."""
+    """Put an item back into a `Pipe` object, so that its next `get` returns the item."""
     pipe._buffer.appendleft(dumps(item))
 
 

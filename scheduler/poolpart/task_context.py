@@ -21,8 +21,8 @@ def own_client() -> Client:
     This function works around two problems of `distributed.get_client`, which creates the worker's
     client when it is first called. If the scheduler sends a message to all clients while it
     registers the new client, for example because a worker has died, the creation fails with an
-    AssertionError without a message, and later tasks receive the unconnected client. Also, several
-    tasks that call it at the same time may create one client each.
+    AssertionError without a message, and later tasks receive the unconnected client. If several
+    tasks call it at the same time, each of them may create a client.
 
     In an event loop, `get_client` is called directly. A coroutine in the worker's event loop must
     not wait for a thread that creates the client, because the thread needs the event loop, which

@@ -13,9 +13,9 @@ the partition of the actor, unless actors with the same key prefix belong to dif
 Tasks that are submitted by coroutines, or by threads that a task has started, do not inherit a
 partition.
 
-An alternative, running each function under ``dask.annotate``, was rejected. The annotation is a
-context variable and reaches `submit`, `map` and collections, but not the tasks that the submitted
-tasks submit in turn. In addition, every task would be pickled with a wrapper.
+Running each function under ``dask.annotate`` instead was rejected. The annotation is a context
+variable and reaches `submit`, `map` and collections, but not the next level of nested tasks. In
+addition, every task would be pickled with a wrapper.
 """
 
 from __future__ import annotations
