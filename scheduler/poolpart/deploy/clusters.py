@@ -247,7 +247,7 @@ class _JobStarter:
         callback.start()
 
     async def _manage_jobs(self) -> None:
-        """Follow the scheduler's advice, restart lost workers, and read the job logs at times."""
+        """Follow the scheduler's advice, restart lost workers, and report errors in job logs."""
         if self._cluster.status != Status.running:
             return
         with suppress(OSError):  # the scheduler is closing
