@@ -45,7 +45,7 @@ from lidarpool.run.pipeline.task_records import Recorder
 from lidarpool.run.progress import Screen
 from lidarpool.run.run_page import RunPage
 from lidarpool.run.store.run_store import RUN_FOLDER
-from lidarpool.scenario.build import Job
+from lidarpool.scenario.job import Job
 from lidarpool.scenario.sections import TaskOptions
 from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
@@ -225,7 +225,6 @@ class Cluster:
         output = CountedOutput(folder, survey, (), "cloud")
         options = RunOptions(
             client=self._client,
-            out=folder,
             folder=folder / RUN_FOLDER,
             collectors=self._sizes.collectors,
         )

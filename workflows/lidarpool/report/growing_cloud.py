@@ -29,7 +29,7 @@ from ..clouds.ply_rows import RowMaker
 from ..columns.part_blocks import BlockMemory, read_blocks
 from ..columns.parts import StoredCloud
 from ..run.pipeline.stage_messages import Receipt
-from ..run.store.job_under_way import JobUnderWay
+from ..run.store.stored_job import StoredJob
 from .cloud_counts import CloudCounts
 
 _MAX_THREADS = 4  # that write parts; each has a block of rows in memory
@@ -297,10 +297,10 @@ class GrowingCloud:
         The job. Parts of an earlier run are appended first.
     """
 
-    def __init__(self, path: Path, job: JobUnderWay) -> None:
+    def __init__(self, path: Path, job: StoredJob) -> None:
         self._path = path
         self._job = job
-        self._sweeps = Sweeps.from_survey(job.survey, job.scene)
+        self._sweeps = Sweeps.from_survey(job.job.survey, job.job.scene)
         # With the cells of appended parts; only their bounds are used.
         self._points = replace(job.points(), cells=None)
         self._next_scan = job.scans.start  # first scan of the next part
@@ -424,7 +424,7 @@ class GrowingCloud:
             self._path,
             self._points,
             self._sweeps,
-            self._job.scene,
+            self._job.job.scene,
             position_type,
             expected_count,
         )

@@ -33,7 +33,7 @@ from ..plan import Trial
 from ..run.committed import Committed
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
-from ..run.pipeline.committed_job import CommittedJob
+from ..run.pipeline.committed_results import CommittedResults
 from ..run.pipeline.stage_messages import Receipt
 from ..run.progress import Screen
 from ..run.run_result import CampaignRun
@@ -41,8 +41,8 @@ from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
 from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
-from ..scenario.build import build
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
+from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .campaign_output import (
     CAMPAIGN_FILE,
@@ -246,7 +246,7 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
                 shard = Shard.parse(record["identity"].pop("shard"))
                 scan_count = record["made_of"]["scans"]
                 scans = shard.scans(scan_count)
-                job = CommittedJob(0, scans)
+                job = CommittedResults(0, scans)
                 db.read(job)
                 if job.missing_count:
                     raise LookupError("scans are missing")
@@ -546,8 +546,8 @@ def _merge_survey(
             "`--scenario`."
         )
     with screen.status("reading the scene"):
-        built = build(Scenario.load(path, made_of["options"]))
-        job = built.job()
+        prepared = prepare(Scenario.load(path, made_of["options"]))
+        job = prepared.job
         jobs = OneJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
@@ -557,8 +557,8 @@ def _merge_survey(
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
             "with `--scenario`."
         )
-    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], built.scenario)
-    options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
+    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], prepared.scenario)
+    options = RunOptions(folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     with output.lock():
         if not options.continues_run:
             output.check_existing(jobs)
@@ -602,7 +602,7 @@ def _take_points(
         if casting := shard_folder.record["casting"]:
             store.cast_with(shard_folder.record["backend"], casting)
         if shard_folder.trials and not only.trials:
-            store.db.add_trials(only, shard_folder.trials)
+            store.db.add_trials(only.committed, shard_folder.trials)
         source = parts_of(shard_folder.storage.below(RUN_FOLDER), shard_folder.record["parts"])
         missing = (
             receipt
@@ -610,12 +610,10 @@ def _take_points(
             if only.parts.missing(receipt.first, receipt.stop)
         )
         for expected, receipt in read_ahead(partial(take, source), missing):
-            if receipt is None or not store.db.commit([(only, receipt)]):
+            if receipt is None or not store.db.commit([(only.committed, receipt)]):
                 damaged.append(source.path(expected.name))
     if damaged:
         raise LidarError(_missing_or_damaged(damaged))
-    if not only.trials:  # the first shard, which plans, is missing
-        only.job = replace(only.job, planning=None)
-    only.frames = only.scans.stop
-    only.resumed = 0
+    # Without trials, the first shard, which plans, is missing.
+    store.take_over(only.job if only.trials else replace(only.job, planning=None))
     store.notes = [*notes]

@@ -56,24 +56,32 @@ _OF_FORMATS = {row.file: name for name, row in FORMATS.items() if row.file != CL
 
 
 def run_survey(
-    jobs: OneJob, options: RunOptions, output: SurveyOutput, screen: Screen, page: RunPage
+    jobs: OneJob,
+    options: RunOptions,
+    output: SurveyOutput,
+    screen: Screen,
+    page: RunPage,
+    compare: Callable[[RunResult], str] | None = None,
 ) -> tuple[RunResult, dict[str, Any]]:
     """Cast a survey, write its result, remove the run, and return the result and its report.
 
-    `cloud.ply` grows while the survey is cast.
+    `cloud.ply` grows while the survey is cast. `compare` returns a note on the result, or raises an
+    error before the result is written.
     """
     with output.lock():
         if not options.continues_run:
             output.check_existing(jobs, overwrite=options.overwrite)
         with (
             ClusterConnection(jobs, options, screen) as connection,
-            open_store(jobs, options, screen) as store,
+            open_store(jobs, options, screen, output.target) as store,
             output.growing_cloud(store) as cloud,
         ):
             load_open3d()  # writes the cloud in the end; a missing library is reported at the start
             committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
             result = committed.result(screen)
             page.finish(result.seconds, result)
+            if compare is not None and (note := compare(result)):
+                result = replace(result, notes=(*result.notes, note))
             if not output.in_pieces:
                 connection.close()
                 timeline.mark(timeline.STOPPED)
@@ -85,7 +93,7 @@ class SurveyOutput:
     """The result of a survey in a folder or storage.
 
     `formats` are written beside the cloud. `extent` is "cloud"; "page" for the page and the content
-    of pictures, too; or "pictures" for the pictures, too. `judge` returns a note on the result.
+    of pictures, too; or "pictures" for the pictures, too.
     """
 
     target: Path | Storage
@@ -93,7 +101,6 @@ class SurveyOutput:
     formats: Sequence[ExportSpec]
     extent: str = "page"
     scenario: Scenario | None = None
-    judge: Callable[[RunResult], str] = lambda result: ""
 
     def __post_init__(self) -> None:
         self._growing: GrowingCloud | None = None
@@ -180,8 +187,6 @@ class SurveyOutput:
         LIDAR workers of the cluster write formats in pieces.
         """
         workers = LidarWorkers(cluster) if cluster is not None and self.in_pieces else None
-        if note := self.judge(result):
-            result = replace(result, notes=(*result.notes, note))
         is_in_place = False
 
         def on_written() -> None:

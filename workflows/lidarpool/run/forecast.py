@@ -43,8 +43,8 @@ from raybeam import available_backends
 
 from ..clouds.flight_lines import firing_span_s, flight_lines, scanned_lines
 from ..clouds.navigation_files import instrument_bytes
-from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
+from ..scenario.job import Job
 from .cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from .cluster.connection import default_workers
 from .options import RunOptions
@@ -67,6 +67,7 @@ TRAJECTORY_POSES = 1000  # poses that measure the length of a trajectory
 
 def forecast(
     job: Job,
+    folder: Path | Storage,
     options: RunOptions,
     client: Client | None = None,
     *,
@@ -75,7 +76,7 @@ def forecast(
     """Estimate the scans, rays, points, memory and disk of a run, and whether the run is possible.
 
     The run is on the cluster of `client`, on the cluster that `options` describe, or on a cluster
-    of this machine. No cluster is started, and nothing is written into the folder of the result.
+    of this machine. No cluster is started, and nothing is written to `folder`, the output folder.
     `refuse` raises a LidarError if that folder holds another result.
 
     Returns
@@ -84,9 +85,7 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    folder = options.out
     formats = job.outputs
-    assert folder is not None, "commands write"
     mistakes = Mistakes()
     notes: list[str] = []
     warnings: list[str] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -25,7 +25,7 @@ from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
 from ..plan import Planning
-from ..scenario.build import Job
+from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
 
@@ -160,7 +160,7 @@ class OneJob:
     def only_job(self) -> Job:
         """The job as this shard does it: only the first shard plans the path."""
         job = self.survey_job
-        return job if self.shard.number == 1 else replace(job, planning=None)
+        return job if self.shard.number == 1 else job.with_fields(planning=None)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
@@ -264,10 +264,7 @@ class JobMaker:
             return failed_row(self._jobs, number, reason)
 
     def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
-        """Put a job, row or error into the queue.
-
-        Returns False if the maker was stopped before.
-        """
+        """Put an entry into the queue, and return False if the maker was stopped before."""
         while not self._stopped.is_set():
             scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
             self._full = len({id(scene.vertices) for scene in scenes}) > MAX_SCENES

@@ -41,11 +41,8 @@ GATHER_S = 0.25  # time that a job waits for more jobs of its task
 MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
-class JobFiles(NamedTuple):
-    """Input for writing a job.
-
-    `row` lacks the counts of points.
-    """
+class WriteRequest(NamedTuple):
+    """Input for writing a job. `row` lacks the counts of points."""
 
     row: JobRow
     cloud: StoredCloud
@@ -70,7 +67,7 @@ class Probe(NamedTuple):
 
 
 def write_jobs(
-    dataset: DataSet, probes: tuple[Probe, Probe], jobs: Sequence[JobFiles]
+    dataset: DataSet, probes: tuple[Probe, Probe], jobs: Sequence[WriteRequest]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
     """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
 
@@ -85,11 +82,8 @@ def write_jobs(
     return outcomes, recorder.finish(scan_count)
 
 
-def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job.
-
-    Returns its row, or a JobError, or a LidarError if the storage is the cause.
-    """
+def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
+    """Write a job, and return its row, a JobError, or a LidarError due to the storage."""
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
@@ -104,7 +98,7 @@ def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
         return JobError(message)
 
 
-class JobWriter:
+class DataSetWriter:
     """Has LIDAR workers write jobs into a data set.
 
     The driver writes jobs that they cannot see.
@@ -115,7 +109,7 @@ class JobWriter:
 
     def __init__(
         self,
-        tasks: Tasks[list[JobFiles]],
+        tasks: Tasks[list[WriteRequest]],
         dataset: DataSet,
         store: RunStore,
         parts_probe: tuple[str, bytes],
@@ -130,9 +124,9 @@ class JobWriter:
         with explained(f"{storage} cannot be written"):
             storage.prepare()
             storage.write(dataset_probe.name, dataset_probe.content)
-        self._waiting = deque[JobFiles]()
+        self._waiting = deque[WriteRequest]()
         self._due_at = 0.0  # when the waiting jobs are to be written
-        self._driver_writes: dict[Future[JobOutcome], JobFiles] = {}
+        self._driver_writes: dict[Future[JobOutcome], WriteRequest] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
         self.hidden = False  # True if a worker did not see the data set
@@ -143,13 +137,13 @@ class JobWriter:
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
-    def add(self, files: JobFiles) -> None:
+    def add(self, files: WriteRequest) -> None:
         """Queue a job for writing."""
         if not self._waiting:
             self._due_at = time.monotonic() + GATHER_S
         self._waiting.append(files)
 
-    def step(self, slots: int, *, more_to_come: bool) -> list[tuple[JobFiles, JobOutcome]]:
+    def step(self, slots: int, *, more_to_come: bool) -> list[tuple[WriteRequest, JobOutcome]]:
         """Submit waiting jobs to free slots, and return written jobs with their rows or errors.
 
         Jobs wait a moment for others of their task if there are `more_to_come`. Errors of single
@@ -164,7 +158,7 @@ class JobWriter:
             jobs = self._next()
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
-        ended: list[tuple[JobFiles, JobOutcome]] = []
+        ended: list[tuple[WriteRequest, JobOutcome]] = []
         for jobs, outcomes in self.tasks.take_done():
             if outcomes is None:
                 self.hidden = True
@@ -184,7 +178,7 @@ class JobWriter:
         self._relieve(bool(ended))
         return ended
 
-    def _next(self) -> list[JobFiles]:
+    def _next(self) -> list[WriteRequest]:
         """Remove and return the jobs of the next task."""
         jobs = [self._waiting.popleft()]
         points = len(jobs[0].cloud)
@@ -215,7 +209,7 @@ class JobWriter:
             future.cancel()
             self._write_here(jobs)
 
-    def _write_here(self, jobs: Sequence[JobFiles]) -> None:
+    def _write_here(self, jobs: Sequence[WriteRequest]) -> None:
         self._driver_writes |= {
             self._thread.submit(_write_job, self.dataset, job): job for job in jobs
         }

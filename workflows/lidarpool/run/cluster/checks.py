@@ -23,7 +23,7 @@ from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
 from ...clouds.writing import ExportSpec
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT

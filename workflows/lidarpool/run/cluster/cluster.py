@@ -17,7 +17,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
 from ...base import timeline
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ..job_source import Jobs
 from ..options import RunOptions
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
