@@ -407,7 +407,7 @@ def test_items_are_taken_beside_tasks(client, make_pipe, requests, monkeypatch, 
     assert pipe.poll() == ("not taken", True)
 
 
-@pytest.mark.parametrize("take", ["get_all", "take_news"])
+@pytest.mark.parametrize("take", ["get_all", "exchange_items"])
 def test_a_wait_for_more_items_ends_when_the_pipe_is_full_or_ends(
     client, make_pipe, pool, patient, take
 ):

@@ -41,8 +41,8 @@ class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened
 def naming_scans(first: int, stop: int) -> Iterator[None]:
     """Prefix the message of any error with the current scans.
 
-    The error becomes a ScanError, because a ScanError can always be sent through Dask; a WorkerLeavingError
-    passes unchanged, since the scans are not its cause.
+    The error becomes a ScanError, because a ScanError can always be sent through Dask. A
+    WorkerLeavingError passes unchanged, since the scans are not its cause.
     """
     try:
         yield
