@@ -19,7 +19,7 @@ from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
-from poolpart.deploy.clusters import INFORMATION
+from poolpart.deploy.clusters import INFO_MARK
 
 from .pipeline.stage_names import GPU, LIDAR, OTHER
 
@@ -154,7 +154,7 @@ class ClusterFile(BaseModel):
             # The messages of jobqueue go on with all arguments.
             message = str(error).partition(" Very likely")[0]
             message = ": ".join(
-                [message, *[line for line in ssh_lines if INFORMATION not in line][-1:]]
+                [message, *[line for line in ssh_lines if INFO_MARK not in line][-1:]]
             )
             reason = " ".join(f"{type(error).__name__}: {message}".split())[:400]
             raise LidarError(

@@ -190,7 +190,7 @@ class DataSetWriter:
             self._moved_at = now_s
             locations = self.tasks.look()
             if any(
-                location.started and not locations.out_of_reach(key)
+                location.started and not locations.is_unreachable(key)
                 for key, location in locations.tasks.items()
             ):
                 return

@@ -17,8 +17,8 @@ from lidarsim.base.errors import LidarError
 from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 from lidarsim.simulator.memory import MB, cast_bytes
 from poolpart import Pool, PoolError, WorkerInfo
-from poolpart.task_locations import look_for_tasks
-from poolpart.workers import ask_workers, worker_identities
+from poolpart.task_locations import take_snapshot
+from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
@@ -95,7 +95,7 @@ def find_workers(
         except TooFewWorkersError as error:
             coming = 0  # jobs in a queue, which does not say which jobs have died
             if waiting is not None:
-                coming = sum(look_for_tasks(client, name).coming for name in required_slots)
+                coming = sum(take_snapshot(client, name).queued_jobs for name in required_slots)
             # A worker that has just died takes half a minute not to answer, which does not count
             # as waiting: the remaining time is taken at the start of this attempt.
             if waiting is None or not waiting.remaining_s(start_s):
@@ -182,7 +182,7 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
     """Check that the workers at these addresses have the driver's Python and sources."""
     driver_version = platform.python_version()
-    for address, python in ask_workers(client, platform.python_version, workers).items():
+    for address, python in run_on_workers(client, platform.python_version, workers).items():
         # Code is sent to workers by value, which needs the same minor version.
         if str(python).split(".")[:2] != driver_version.split(".")[:2]:
             raise LidarError(
@@ -222,7 +222,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
                 "machines, and restart the worker."
             )
     can_write = partial(_check_installed, written)
-    for address, answer in ask_workers(client, can_write, writing).items():
+    for address, answer in run_on_workers(client, can_write, writing).items():
         if isinstance(answer, LidarError):
             raise LidarError(
                 f"The worker at {address} cannot write the results. {answer}"
@@ -260,7 +260,7 @@ def _answers(
     client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
     """Return the answers of workers by address, or raise the first error."""
-    answers = ask_workers(client, question, workers)
+    answers = run_on_workers(client, question, workers)
     if workers and not answers:
         raise TooFewWorkersError(
             "The workers of partition 'GPU' left before the run started. See their logs."

@@ -198,14 +198,14 @@ class Cluster:
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
         for name, slots in required_slots.items():
-            self.partitions[name].want(max(slots, scan_count) if name == GPU else slots)
+            self.partitions[name].request_slots(max(slots, scan_count) if name == GPU else slots)
 
     def _release_slots(self) -> None:
         """Let partitions shrink that have grown for the run."""
         if self.client.status == "running":
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
-                    partition.want(0)
+                    partition.request_slots(0)
 
     def _lost_error(self) -> LidarError:
         return LidarError(

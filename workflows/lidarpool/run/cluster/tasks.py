@@ -10,7 +10,7 @@ from distributed import Future
 from lidarsim.base.plugins import Plugin
 from poolpart import Partition
 from poolpart.fetch import fetch_available
-from poolpart.task_locations import TaskLocations, look_for_tasks
+from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...base.software import call_with_plugins, call_with_same_sources
 from ..pipeline.task_book import TaskBook
@@ -59,10 +59,10 @@ class Tasks(Generic[T]):
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
-    def look(self) -> TaskLocations:
+    def look(self) -> PartitionSnapshot:
         """Return the locations of the running tasks."""
         keys = [future.key for future in self.running]
-        return look_for_tasks(self._client, self.partition.name, keys)
+        return take_snapshot(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
         """Cancel all tasks, although tasks that have begun run to their end."""
