@@ -15,7 +15,7 @@ from lidarpool.cli.scenario_commands import import_
 from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import surfels
 from lidarpool.scenario.scenario import Scenario
-from lidarscenes.helios import Imported, import_survey
+from lidarscenes.helios import ImportedSurvey, import_survey
 from lidarsim.media.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
@@ -48,14 +48,14 @@ def legs(settings, *places, platform='movePerSec_m="10"'):
     )
 
 
-def import_checked(survey: Path, out: Path) -> Imported:
+def import_checked(survey: Path, out: Path) -> ImportedSurvey:
     """Import a survey as the command does."""
     return import_survey(
         survey, out, check=lambda file: build(Scenario.load(file)), surfels=surfels
     )
 
 
-def scenario_of(imported: Imported) -> Scenario:
+def scenario_of(imported: ImportedSurvey) -> Scenario:
     return Scenario.load(imported.path)
 
 

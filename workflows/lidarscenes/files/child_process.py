@@ -25,7 +25,7 @@ from lidarsim.base.arrays import AnyArray
 Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
-class Child(NamedTuple):
+class ReaderProcess(NamedTuple):
     """A process that reads a file.
 
     Attributes

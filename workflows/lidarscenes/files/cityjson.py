@@ -325,7 +325,7 @@ class _CityFile:
             *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
         ]
         corners = np.concatenate(bounds)[bool(self._placed) :]
-        system = _System.of_head(self._head, corners)
+        system = _System.from_head(self._head, corners)
         system.check(corners)
         if system.height_units != 1 and self._unit is None:
             matrix = np.diag([1.0, 1.0, system.height_units, 1.0])
@@ -365,7 +365,7 @@ class _System:
     height_units: float = 1.0  # units of x and y in the unit of heights
 
     @classmethod
-    def of_head(cls, head: _Json, corners: Floats) -> _System:
+    def from_head(cls, head: _Json, corners: Floats) -> _System:
         """Return the system of a file, or of the first line of a sequence, with its corners."""
         text = str((head.get("metadata") or {}).get("referenceSystem") or "")
         looks_like_angles = _looks_like_angles(corners)

@@ -43,7 +43,7 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .child_process import Child
+from .child_process import ReaderProcess
 
 # {number: name, and classes of IFC with their subclasses}. Numbers are of ASPRS LAS 1.4, from 64
 # on free to use; 64 to 72 are of roads.
@@ -117,7 +117,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     allowance = Allowance(size, _ADVICE)
     # Packed files are about a tenth.
     memory = MIN_MEMORY_BYTES + MEMORY_TIMES * (10 * size if is_packed else size)
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("ifc_child.py"),
         "ifcopenshell",
         min(memory, MIN_MEMORY_BYTES + memory_share()),

@@ -25,7 +25,7 @@ _SKIPPED = {"<!--": "-->", "<?": "?>"}  # {start of a part without elements: end
 _CDATA = ("<![CDATA[", "]]>")
 
 
-def lenient_root(data: bytes) -> Element:
+def parse_lenient_xml(data: bytes) -> Element:
     """Return the root element of a file.
 
     Prefixes stay in tags, and comments are left out.

@@ -51,8 +51,8 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
 
-from .child_process import Child, Frame
-from .usd_materials import MeshLook, UsdMaterials, material_pieces
+from .child_process import Frame, ReaderProcess
+from .usd_materials import MeshAppearance, UsdMaterials, material_pieces
 
 _LIMITS = {
     "prims and instances": MAX_NODES,
@@ -122,7 +122,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
             allowance.grow(size)
         allowance.take(size)
 
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("usd_child.py"),
         "usd-core",
         memory_share() + USD_CORE_BYTES,
@@ -181,7 +181,7 @@ def _shape_mesh(
     if mesh is None or "materials" not in frame:
         return [mesh] if mesh else []
     rows = np.arange(len(mesh.faces))
-    look = MeshLook(frame, arrays, {"constant": np.zeros((len(rows), 3), np.int64)})
+    look = MeshAppearance(frame, arrays, {"constant": np.zeros((len(rows), 3), np.int64)})
     number = next((number for number, _ in frame["materials"]), None)
     # Without texture coordinates they have no masks either, and a note says so.
     materials.cutout(number, look, rows)

@@ -45,7 +45,7 @@ _SHOWN = (
 )
 
 
-class TooManyError(Exception):
+class StageLimitError(Exception):
     """The stage has more prims, copies or poses than are read."""
 
 
@@ -66,7 +66,9 @@ class StageNodes:
     A node that several instances share is a node of their prototype.
     """
 
-    def __init__(self, stage: Any, limits: dict[str, int], looks: Looks, write: Any) -> None:
+    def __init__(
+        self, stage: Any, limits: dict[str, int], looks: MaterialReader, write: Any
+    ) -> None:
         self._stage = stage
         self._remaining = limits
         self._looks = looks
@@ -116,7 +118,7 @@ class StageNodes:
         """
         self._remaining[kind] -= count
         if self._remaining[kind] < 0:
-            raise TooManyError(kind)
+            raise StageLimitError(kind)
 
     def _node(self, prim: Any, inherited: _Inherited) -> list[Any]:
         """Return name, number of the mesh, numbers of children, and copies as (child, array)."""
@@ -341,7 +343,7 @@ def _poses_up_to(
     return [stop]
 
 
-class Looks:
+class MaterialReader:
     """Images and materials, written when they are first used, and colors of meshes."""
 
     def __init__(self, request: dict[str, Any], write: Any) -> None:
@@ -738,7 +740,7 @@ def main(path: str, request: dict[str, Any]) -> None:
                 "times_s": (np.array(animation.codes) / stage.GetTimeCodesPerSecond()).tolist(),
             }
         )
-        looks = Looks(request, write)
+        looks = MaterialReader(request, write)
         for code in animation.codes:
             stage.GetSessionLayer().Clear()  # forget the previous pose
             stage.SetEditTarget(stage.GetSessionLayer())
@@ -764,7 +766,7 @@ def main(path: str, request: dict[str, Any]) -> None:
                 *nodes.motions,
                 *nodes.copies,
             )
-    except TooManyError as error:
+    except StageLimitError as error:
         write({"what": "too many", "of": str(error)})
     except Exception as error:  # readers of broken files raise errors of any type
         write({"what": "error", "reason": _reason(error, path)})

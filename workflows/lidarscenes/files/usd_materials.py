@@ -59,7 +59,7 @@ class _Use(NamedTuple):
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
 
 
-class MeshLook:
+class MeshAppearance:
     """Arrays of a mesh that its materials read: texture coordinates and colors.
 
     Parameters
@@ -84,7 +84,7 @@ class MeshLook:
         u, v = (matmul(values, matrix[:2]) + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
-    def painted(self, name: str, face_indices: Ints) -> Colors | None:
+    def value_colors(self, name: str, face_indices: Ints) -> Colors | None:
         """Return colors of triangles by values, linear light, or None without values."""
         if name not in self._values:
             return None
@@ -143,7 +143,7 @@ class UsdMaterials:
             else str(self._materials[number]["name"])
         )
 
-    def colors(self, number: int | None, look: MeshLook, face_indices: Ints) -> Colors | None:
+    def colors(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Colors | None:
         """Return the colors that a material gives triangles, or None."""
         if not self.colored:
             return None
@@ -161,10 +161,10 @@ class UsdMaterials:
                 if "image" in color_source:
                     coordinates = look.coordinates(color_source, face_indices)
                     return self._shades(_Use.from_source(color_source)).colors(*coordinates)
-                return look.painted(color_source["values"], face_indices)
+                return look.value_colors(color_source["values"], face_indices)
         return None
 
-    def cutout(self, number: int | None, look: MeshLook, face_indices: Ints) -> Cutout | None:
+    def cutout(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Cutout | None:
         """Return the mask that a material gives triangles, or None for solid triangles."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
@@ -248,7 +248,7 @@ def material_pieces(
     polygon = np.repeat(np.arange(len(sizes)), sizes)[faces]
     value_indices = {"constant": np.zeros_like(faces), "uniform": polygon, "faceVarying": faces}
     value_indices["vertex"] = value_indices["varying"] = corners[faces]
-    look = MeshLook(frame, arrays, value_indices)
+    look = MeshAppearance(frame, arrays, value_indices)
     group = np.zeros(len(sizes), np.int64)
     numbers: list[int | None] = [None]
     for number, array in frame.get("materials", ()):

@@ -12,7 +12,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.words import printable
 from lidarsim.scene.colors import as_bytes, as_srgb
 
-from .frames import numbers_of
+from .frames import child_numbers
 
 FULL_RETRO = 255.0  # value of <laser_retro> that is as bright as white
 
@@ -58,13 +58,13 @@ class Appearance(NamedTuple):
     is_hidden: bool
 
 
-def appearance_of(shape: Element, retro: float) -> Appearance:
+def read_appearance(shape: Element, retro: float) -> Appearance:
     """Return the appearance of a visual or collision.
 
     `retro` is its <laser_retro>, 0 for none.
     """
     material = shape.find("material")
-    hidden = numbers_of(shape, "transparency", 1, "0").item() >= 1
+    hidden = child_numbers(shape, "transparency", 1, "0").item() >= 1
     name = "" if material is None else printable(material.findtext("script/name") or "")
     if retro > 0:
         gray = as_srgb(np.full((1, 1, 3), min(retro / FULL_RETRO, 1.0)))
@@ -76,7 +76,7 @@ def appearance_of(shape: Element, retro: float) -> Appearance:
         if text and len(values) not in (3, 4):
             raise LidarError(f"<diffuse> is {text[:60]!r}; it must be 3 or 4 finite numbers.")
         if text:
-            color = as_bytes(numbers_of(material, "diffuse", len(values), "")[:3])
+            color = as_bytes(child_numbers(material, "diffuse", len(values), "")[:3])
         elif name.startswith(_PREFIX):
             named = _NAMED.get(name.removeprefix(_PREFIX).lower())
             color = None if named is None else as_bytes(named)

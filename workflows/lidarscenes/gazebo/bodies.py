@@ -17,10 +17,10 @@ from lidarsim.base.vectors import matmul
 from lidarsim.base.words import printable
 from lidarsim.scene.files.scene_graph import MAX_NODES
 
-from ..files.lenient_xml import lenient_root
-from .frames import Frames, RelativePose, placed_by, pose_of
+from ..files.lenient_xml import parse_lenient_xml
+from .frames import FrameGraph, RelativePose, placement_matrix, read_pose
 from .notes import Notes
-from .resources import MissingFileError, Resources, Source, short_name
+from .resources import ResourceNotFoundError, Resources, Source, short_name
 
 _MAX_NESTED = 30  # models within each other
 _MODEL_FRAME = "__model__"
@@ -47,16 +47,16 @@ class Link(NamedTuple):
     source: Source  # file that the link is in
 
 
-class Instance(NamedTuple):
+class PlacedModel(NamedTuple):
     """Placement of a model in a world or in another model."""
 
     name: str
-    body: Body
+    body: GazeboBody
     matrix: Floats  # (4, 4), to the frame of the world or model
 
 
 @dataclass(eq=False)
-class Body:
+class GazeboBody:
     """A model, or a world, without its pose.
 
     Equal includes share a body.
@@ -71,9 +71,9 @@ class Body:
         Models in it.
     """
 
-    frames: Frames
+    frames: FrameGraph
     links: list[Link] = field(default_factory=list)
-    children: list[Instance] = field(default_factory=list)
+    children: list[PlacedModel] = field(default_factory=list)
 
     @cached_property
     def size(self) -> int:
@@ -99,13 +99,13 @@ class BodyReader:
         self.notes = notes
         self.allowance = allowance
         self._files: dict[Path, _Included | None] = {}
-        self._bodies: dict[int, Body] = {}  # {id of a <model>: body}
+        self._bodies: dict[int, GazeboBody] = {}  # {id of a <model>: body}
         self._open_elements: list[int] = []  # ids of the <model>s that are being read
         self._ground: Element | None = None
 
-    def world(self, element: Element, source: Source) -> Body:
+    def world(self, element: Element, source: Source) -> GazeboBody:
         """Return the body of a <world>, or of a root with models."""
-        body = Body(Frames(WORLD_FRAME))
+        body = GazeboBody(FrameGraph(WORLD_FRAME))
         self._fill(body, element, source)
         if body.size > MAX_NODES:
             raise LidarError(
@@ -114,31 +114,31 @@ class BodyReader:
             )
         return body
 
-    def _fill(self, body: Body, element: Element, source: Source) -> None:
+    def _fill(self, body: GazeboBody, element: Element, source: Source) -> None:
         """Read links, frames and models of an element into a body."""
         self.notes.check_children(element)
         frames = body.frames
         for link in element.findall("link"):
             with prefixed(f"link {_name(link)!r}"):
-                name = frames.define(_name(link), pose_of(link), frames.root)
+                name = frames.define(_name(link), read_pose(link), frames.root)
             body.links.append(Link(name, link, source))
         for frame in element.findall("frame"):
             attached = printable(frame.get("attached_to", "")) or frames.root
             with prefixed(f"frame {_name(frame)!r}"):
-                frames.define(_name(frame), pose_of(frame), attached)
+                frames.define(_name(frame), read_pose(frame), attached)
         for joint in element.findall("joint"):
             child = joint.find("child")
             link_name = "" if child is None else (child.get("link") or child.text or "")
             if child is not None:
-                frames.define(_name(joint), pose_of(joint), printable(link_name) or frames.root)
+                frames.define(_name(joint), read_pose(joint), printable(link_name) or frames.root)
         nested = [*self._nested(body, element, source)]
         for name, child_body, _ in nested:
             with prefixed(f"model {name!r}"):
-                body.children.append(Instance(name, child_body, frames.matrix(name)))
+                body.children.append(PlacedModel(name, child_body, frames.matrix(name)))
 
     def _nested(
-        self, body: Body, element: Element, source: Source
-    ) -> Iterator[tuple[str, Body, RelativePose]]:
+        self, body: GazeboBody, element: Element, source: Source
+    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
         """Yield names, bodies and poses of the models in an element, with their frames defined."""
         for child in element:
             if child.tag == "model":
@@ -150,8 +150,8 @@ class BodyReader:
                 yield from self._include(body, child, source)
 
     def _include(
-        self, body: Body, include: Element, source: Source
-    ) -> Iterator[tuple[str, Body, RelativePose]]:
+        self, body: GazeboBody, include: Element, source: Source
+    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
         """Yield the model that an <include> names, or merge the model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
@@ -169,30 +169,32 @@ class BodyReader:
             yield self._define(body, name, nested, posed, include)
 
     def _define(
-        self, body: Body, name: str, nested: Body, posed: Element, placing: Element
-    ) -> tuple[str, Body, RelativePose]:
+        self, body: GazeboBody, name: str, nested: GazeboBody, posed: Element, placing: Element
+    ) -> tuple[str, GazeboBody, RelativePose]:
         """Define the frame of a nested model, and return name, body and pose of the model."""
         placement = _placement_frame(placing, posed)
-        pose = pose_of(posed)
-        pose = pose._replace(matrix=placed_by(pose.matrix, nested.frames, placement))
+        pose = read_pose(posed)
+        pose = pose._replace(matrix=placement_matrix(pose.matrix, nested.frames, placement))
         frames = body.frames
         name = frames.define(name, pose, frames.root)
         frames.nested[name] = nested.frames
         return name, nested, pose
 
-    def _merge(self, body: Body, nested: Body, posed: Element, placing: Element) -> None:
+    def _merge(
+        self, body: GazeboBody, nested: GazeboBody, posed: Element, placing: Element
+    ) -> None:
         """Add links and models of an included model to the body."""
-        pose = pose_of(posed)
+        pose = read_pose(posed)
         frames = body.frames
-        matrix = placed_by(pose.matrix, nested.frames, _placement_frame(placing, posed))
+        matrix = placement_matrix(pose.matrix, nested.frames, _placement_frame(placing, posed))
         matrix = matmul(frames.matrix(pose.frame or frames.root), matrix)
-        frames.adopt(nested.frames, matrix)
+        frames.merge(nested.frames, matrix)
         body.links += nested.links
         body.children += [
             child._replace(matrix=matmul(matrix, child.matrix)) for child in nested.children
         ]
 
-    def model(self, element: Element, source: Source) -> Body:
+    def model(self, element: Element, source: Source) -> GazeboBody:
         """Return the body of a <model>.
 
         Raises LidarError if includes go in a circle.
@@ -206,7 +208,7 @@ class BodyReader:
             raise LidarError(f"models are nested more than {_MAX_NESTED} levels deep.")
         if key not in self._bodies:
             self._open_elements.append(key)
-            body = Body(Frames(_MODEL_FRAME))
+            body = GazeboBody(FrameGraph(_MODEL_FRAME))
             self._fill(body, element, source)
             if body.size > MAX_NODES:
                 raise LidarError(
@@ -225,7 +227,7 @@ class BodyReader:
         name = short_name(uri).rpartition("/")[2].lower()
         try:
             file = self.resources.model(uri, source)
-        except MissingFileError as error:
+        except ResourceNotFoundError as error:
             if name in _GROUND_PLANES:
                 return _Included(self._ground_plane(), source)
             if name not in _LIGHTS:
@@ -236,7 +238,7 @@ class BodyReader:
     def _ground_plane(self) -> Element:
         """Return the model of the ground plane that Gazebo brings."""
         if self._ground is None:
-            self._ground = lenient_root(GROUND_PLANE.encode())
+            self._ground = parse_lenient_xml(GROUND_PLANE.encode())
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
@@ -246,7 +248,7 @@ class BodyReader:
             self._files[path] = None
             try:
                 data = read_input(path)
-                root = lenient_root(data)
+                root = parse_lenient_xml(data)
             except (OSError, ValueError, LidarError) as error:
                 reason = getattr(error, "strerror", None) or error
                 self.notes.unread_files[f"{path.parent.name}/{path.name}"] = f"{reason}"
@@ -271,6 +273,6 @@ def _name(element: Element) -> str:
     return printable(element.get("name", ""))
 
 
-def scoped(path: tuple[str, ...]) -> str:
+def scoped_name(path: tuple[str, ...]) -> str:
     """Return the name of a model or link within models, as Gazebo writes names."""
     return _SEPARATOR.join(path)

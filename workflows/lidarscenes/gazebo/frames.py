@@ -27,7 +27,7 @@ class RelativePose(NamedTuple):
     frame: str  # empty for the default of the element
 
 
-def numbers_of(
+def child_numbers(
     element: Element, name: str, count: int, default: str, *, at_least: float | None = None
 ) -> Floats:
     """Return `count` numbers of the text of a child element, or of `default` without a text.
@@ -38,10 +38,10 @@ def numbers_of(
         If the text is other than `count` finite numbers, or a number is below `at_least`.
     """
     text = (element.findtext(name) or "").strip() or default
-    return numbers_in(text, f"<{name}>", count, at_least=at_least)
+    return parse_numbers(text, f"<{name}>", count, at_least=at_least)
 
 
-def numbers_in(
+def parse_numbers(
     text: str,
     subject: str,
     count: int,
@@ -51,7 +51,7 @@ def numbers_in(
 ) -> Floats:
     """Return the numbers of a text.
 
-    Raises LidarError, which names `subject`, as `numbers_of` does.
+    Raises LidarError, which names `subject`, as `child_numbers` does.
 
     With `of_any_size`, numbers may also be infinite, NaN or very large.
     """
@@ -68,16 +68,16 @@ def numbers_in(
     return values
 
 
-def pose_of(element: Element) -> RelativePose:
+def read_pose(element: Element) -> RelativePose:
     """Return the pose of an element, or identity without <pose>."""
     pose = element.find("pose")
     if pose is None:
         return RelativePose(np.eye(4), "")
     frame = pose.get("relative_to") or pose.get("frame") or ""
-    return RelativePose(matrix_of(pose), printable(frame))
+    return RelativePose(read_matrix(pose), printable(frame))
 
 
-def matrix_of(pose: Element) -> Floats:
+def read_matrix(pose: Element) -> Floats:
     """Return the matrix (4, 4) of a <pose>: x, y, z, and roll, pitch, yaw or a quaternion.
 
     Physics may have thrown a model to a pose that is not finite, or has very large numbers: its
@@ -92,7 +92,7 @@ def matrix_of(pose: Element) -> Floats:
     is_quaternion = pose.get("rotation_format") == "quat_xyzw"
     if not text:
         return np.eye(4)
-    values = numbers_in(text, "<pose>", 7 if is_quaternion else 6, of_any_size=True)
+    values = parse_numbers(text, "<pose>", 7 if is_quaternion else 6, of_any_size=True)
     if not (np.abs(values) <= _MAX_POSE).all():
         return affine(np.full((3, 3), np.nan), np.full(3, np.nan))
     if is_quaternion:
@@ -105,7 +105,7 @@ def matrix_of(pose: Element) -> Floats:
     return affine(rotations_of(angles[::-1]) if angles.any() else np.eye(3), values[:3])
 
 
-class Frames:
+class FrameGraph:
     """Frames of a world or model, by name.
 
     `root` is the name of the frame of the world or model itself.
@@ -113,7 +113,7 @@ class Frames:
 
     def __init__(self, root: str) -> None:
         self.root = root
-        self.nested: dict[str, Frames] = {}  # {name of a nested model: its frames}
+        self.nested: dict[str, FrameGraph] = {}  # {name of a nested model: its frames}
         self._matrices: dict[str, Floats] = {root: np.eye(4)}  # (4, 4), to the root
         self._poses: dict[str, RelativePose] = {}
 
@@ -136,7 +136,7 @@ class Frames:
         """Return the names of all defined frames."""
         return [self.root, *self._poses]
 
-    def adopt(self, nested: Frames, placement: Floats) -> None:
+    def merge(self, nested: FrameGraph, placement: Floats) -> None:
         """Define the frames of a merged model, whose root is at `placement` (4, 4), as own."""
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
@@ -173,12 +173,12 @@ class Frames:
             )
         return self._poses[name]
 
-    def between(self, frame: str, target: str) -> Floats:
+    def transform_between(self, frame: str, target: str) -> Floats:
         """Return the matrix (4, 4) from a frame to another frame."""
         return matmul(inverted(self.matrix(target)), self.matrix(frame))
 
 
-def placed_by(pose: Floats, frames: Frames, placement_frame: str) -> Floats:
+def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
     """Return the matrix (4, 4) of a model whose `placement_frame` is at a pose (4, 4)."""
     if not placement_frame:
         return pose

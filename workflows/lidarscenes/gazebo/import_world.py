@@ -19,10 +19,10 @@ from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 
 from ..writers.lidar_scenario import write_scenario
-from .frames import numbers_of
-from .lidars import lidars_of, unknown_sensors
-from .visibility_flags import ALL_BITS, flags_of
-from .world import GazeboOptions, World, content_of, load_world
+from .frames import child_numbers
+from .lidars import find_lidars, unknown_sensors
+from .visibility_flags import ALL_BITS, read_flags
+from .world import GazeboOptions, World, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
@@ -49,7 +49,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     if len(assets) > 1:
         raise LidarError("it is a Gazebo world, for which only one `--assets` folder is allowed.")
     loaded = _loaded(world, assets)
-    lidars = [*lidars_of(loaded)]
+    lidars = [*find_lidars(loaded)]
     left_out = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
     if not lidars:
         reason = "".join(f" It contains {line}." for line in loaded.notes.remote_lines())
@@ -73,12 +73,12 @@ def _unseen_objects(
     visual.
     """
     visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]
-    flags = {flags_of(visual) for visual in visuals} - {0}
+    flags = {read_flags(visual) for visual in visuals} - {0}
     if all(mask and all(mask & value for value in flags) for mask in masks):
         return {}
     options = ReadOptions(masks=False, colors=False, folders=folders, own=GazeboOptions())
     with np.errstate(all="ignore"):
-        content, placed = content_of(world, options)
+        content, placed = build_content(world, options)
     # Objects without an area are not in the content, which is else in the same order.
     rest = iter(placed)
     objects = [item.name for item in content.meshes]
@@ -141,4 +141,4 @@ def _materials(world: World) -> dict[str, Any]:
 def _has_retro(link: Element) -> bool:
     """Return True if a shape of a link has a <laser_retro> above 0."""
     shapes = [*link.findall("visual"), *link.findall("collision")]
-    return any(numbers_of(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)
+    return any(child_numbers(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)

@@ -13,11 +13,11 @@ from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import did_you_mean, listed, printable
 
-from ..writers.lidar_scenario import Lidar, clean
-from .bodies import scoped
-from .frames import numbers_in, numbers_of, pose_of
+from ..writers.lidar_scenario import Lidar, rounded
+from .bodies import scoped_name
+from .frames import child_numbers, parse_numbers, read_pose
 from .notes import unknown_children
-from .visibility_flags import LIDARS, figures_of, lidar_elements, mask_of
+from .visibility_flags import LIDARS, lidar_elements, lidar_settings, read_mask
 from .world import PlacedLink, World
 
 _COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
@@ -52,7 +52,7 @@ class GazeboLidar(NamedTuple):
     mask: int
 
 
-def lidars_of(world: World) -> Iterator[GazeboLidar]:
+def find_lidars(world: World) -> Iterator[GazeboLidar]:
     """Yield the lidars of a world.
 
     Raises LidarError if figures of a lidar are impossible.
@@ -60,9 +60,9 @@ def lidars_of(world: World) -> Iterator[GazeboLidar]:
     for link in world.links:
         for element in lidar_elements(link.link.element):
             name = printable(element.get("name", "")) or "lidar"
-            full_name = scoped((*link.path, name))
+            full_name = scoped_name((*link.path, name))
             with prefixed(f"sensor {full_name!r}"):
-                yield GazeboLidar(_lidar(element, link, name, full_name), mask_of(element))
+                yield GazeboLidar(_lidar(element, link, name, full_name), read_mask(element))
 
 
 def unknown_sensors(world: World) -> Iterator[str]:
@@ -71,7 +71,7 @@ def unknown_sensors(world: World) -> Iterator[str]:
         for element in link.link.element.findall("sensor"):
             kind = element.get("type") or ""
             if kind not in (*LIDARS, *_OTHER_SENSORS):
-                name = scoped((*link.path, printable(element.get("name", ""))))
+                name = scoped_name((*link.path, printable(element.get("name", ""))))
                 hint = did_you_mean(kind, LIDARS)
                 yield f"sensor {name!r} has the unknown type {printable(kind)[:40]!r}.{hint}"
 
@@ -88,29 +88,29 @@ def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
     """Return the lidar of a <sensor>."""
-    figures = figures_of(element)
+    figures = lidar_settings(element)
     if figures is None:
         hint = did_you_mean("lidar", [printable(child.tag) for child in element])
         raise LidarError(f"it has neither <lidar> nor <ray>.{hint}")
-    pose = pose_of(element)
+    pose = read_pose(element)
     matrix = pose.matrix
     if pose.frame and pose.frame != link.link.name:
-        matrix = matmul(link.body.frames.between(pose.frame, link.link.name), matrix)
+        matrix = matmul(link.body.frames.transform_between(pose.frame, link.link.name), matrix)
     left_out = [*_unknown_elements(element, figures)]
-    rate_hz = numbers_of(element, "update_rate", 1, "0").item()
+    rate_hz = child_numbers(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
         left_out.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
-        "rate_hz": clean(rate_hz),
+        "rate_hz": rounded(rate_hz),
         **_directions(figures),
     }
     ranges = figures.find("range")
-    resolution_m = 0.0 if ranges is None else numbers_of(ranges, "resolution", 1, "0").item()
+    resolution_m = 0.0 if ranges is None else child_numbers(ranges, "resolution", 1, "0").item()
     if resolution_m > 0:
-        data["optics"] = {"resolution_m": clean(resolution_m)}
+        data["optics"] = {"resolution_m": rounded(resolution_m)}
     data |= _noise(element, figures, left_out)
     if element.get("type") in _COLLISION_LIDARS:
         left_out.append(
@@ -149,11 +149,11 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
     """
     scan = figures.find(f"scan/{name}")
     scan = Element(name) if scan is None else scan
-    stated = numbers_of(scan, "samples", 1, samples, at_least=1).item()
-    count = round(stated * numbers_of(scan, "resolution", 1, "1", at_least=0).item())
+    stated = child_numbers(scan, "samples", 1, samples, at_least=1).item()
+    count = round(stated * child_numbers(scan, "resolution", 1, "1", at_least=0).item())
     if count > _MAX_SAMPLES:
         raise LidarError(f"<{name}> has {count:,} samples; at most {_MAX_SAMPLES:,} are allowed.")
-    angles = [numbers_of(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
+    angles = [child_numbers(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
     first_deg, last_deg = np.degrees(angles).tolist()
     if last_deg < first_deg:
         raise LidarError(f"<{name}> has a <max_angle> below its <min_angle>.")
@@ -163,9 +163,9 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
 def _directions(figures: Element) -> dict[str, Any]:
     """Return the fields of a data file for the directions of the rays."""
     vertical = _scan(figures, "vertical", "1")
-    elevations: Any = [clean(vertical.first_deg)]
+    elevations: Any = [rounded(vertical.first_deg)]
     if vertical.samples > 1:
-        limits = {"first": clean(vertical.first_deg), "last": clean(vertical.last_deg)}
+        limits = {"first": rounded(vertical.first_deg), "last": rounded(vertical.last_deg)}
         elevations = {**limits, "count": vertical.samples}
     horizontal = _scan(figures, "horizontal", "640")
     step_deg = horizontal.step_deg
@@ -174,11 +174,11 @@ def _directions(figures: Element) -> dict[str, Any]:
         count -= 1  # the last sample is the first again
     fields: dict[str, Any] = {"firings_per_turn": count}
     if count == 1 or count * step_deg > _FULL_TURN - _SLACK_DEG:
-        fields["zero_deg"] = clean(horizontal.first_deg)
+        fields["zero_deg"] = rounded(horizontal.first_deg)
     else:  # firings of a line begin at its start, and end a step before its end
         width_deg = count * step_deg
-        fields["zero_deg"] = clean(horizontal.first_deg + width_deg / 2)
-        fields["mirror"] = {"motion": "sawtooth", "width_deg": clean(width_deg)}
+        fields["zero_deg"] = rounded(horizontal.first_deg + width_deg / 2)
+        fields["mirror"] = {"motion": "sawtooth", "width_deg": rounded(width_deg)}
     return {**fields, "beams": {"elevation_deg": elevations}}
 
 
@@ -188,8 +188,8 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
         return 0.0, math.inf
     longest = (ranges.findtext("max") or "inf").strip()
     is_infinite = longest.lower().lstrip("+").startswith("inf")
-    max_range_m = math.inf if is_infinite else numbers_in(longest, "<max>", 1).item()
-    return numbers_of(ranges, "min", 1, "0", at_least=0).item(), max_range_m
+    max_range_m = math.inf if is_infinite else parse_numbers(longest, "<max>", 1).item()
+    return child_numbers(ranges, "min", 1, "0", at_least=0).item(), max_range_m
 
 
 def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
@@ -207,7 +207,7 @@ def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str,
         return {}
     for name, words in _NOISE_LEFT_OUT.items():
         is_used = name != "precision" or kind == "gaussian_quantized"
-        if is_used and numbers_of(noise, name, 1, "0").item():
+        if is_used and child_numbers(noise, name, 1, "0").item():
             left_out.append(words)
-    sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
-    return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}
+    sigma_m = child_numbers(noise, "stddev", 1, "0", at_least=0).item()
+    return {"performance": {"range_m": rounded(sigma_m)}} if sigma_m and kind != "none" else {}

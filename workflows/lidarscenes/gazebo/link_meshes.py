@@ -25,13 +25,13 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..files.dae import read_dae
-from .appearance import FULL_RETRO, Appearance, appearance_of
-from .bodies import Body, Link
-from .frames import numbers_of, pose_of
+from .appearance import FULL_RETRO, Appearance, read_appearance
+from .bodies import GazeboBody, Link
+from .frames import child_numbers, read_pose
 from .notes import Notes
-from .resources import MissingFileError, Resources, Source
+from .resources import ResourceNotFoundError, Resources, Source
 from .sdf_shapes import height_map_mesh, polyline_mesh, shape_mesh
-from .visibility_flags import ALL_BITS, flags_of
+from .visibility_flags import ALL_BITS, read_flags
 
 # Formats that Gazebo reads; worlds would be read without end.
 MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")
@@ -66,10 +66,10 @@ class LinkMeshes:
     @property
     def _collisions(self) -> bool:
         """True if shapes for collisions are read in place of visuals."""
-        return bool(self.options.own.geometry == "collision")
+        return bool(self.options.own.geometry_meshes == "collision")
 
-    def meshes_of(
-        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+    def link_meshes(
+        self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
         """Return the mesh of a link, which instances of the model share.
 
@@ -86,9 +86,9 @@ class LinkMeshes:
         return self._links[key]
 
     def _read_link(
-        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+        self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the meshes of a link (`meshes_of`)."""
+        """Return the meshes of a link (`link_meshes`)."""
         # {whether each mask sees a shape: the first shape, its flags, and meshes of all shapes}
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):
@@ -109,7 +109,7 @@ class LinkMeshes:
     def _flags_of(self, shape: Element, name: str) -> int:
         """Return the flags of a visual, and note a visual that nothing sees."""
         with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
-            flags = flags_of(shape)
+            flags = read_flags(shape)
         if not flags:
             self.notes.invisible[name] = None
         return flags
@@ -125,7 +125,7 @@ class LinkMeshes:
         return shapes
 
     def _shape_meshes(
-        self, body: Body, link: Link, shape: Element, name: str, scale: tuple[float, ...]
+        self, body: GazeboBody, link: Link, shape: Element, name: str, scale: tuple[float, ...]
     ) -> list[SceneMesh]:
         """Return the meshes of a visual or a collision shape in the frame of its link."""
         self.notes.check_children(shape)
@@ -133,25 +133,25 @@ class LinkMeshes:
             retro = _retro(link.element, shape)
             if retro > FULL_RETRO:
                 self.notes.bright[name] = None
-            appearance = appearance_of(shape, retro)
+            appearance = read_appearance(shape, retro)
             if appearance.is_hidden:
                 self.notes.hidden[name] = None
                 return []
             geometry = shape.find("geometry")
-            parts = [] if geometry is None else self.geometry(geometry, link.source)
-            pose = pose_of(shape)
+            parts = [] if geometry is None else self.geometry_meshes(geometry, link.source)
+            pose = read_pose(shape)
             matrix = pose.matrix
             if pose.frame and pose.frame != link.name:
-                matrix = matmul(body.frames.between(pose.frame, link.name), matrix)
+                matrix = matmul(body.frames.transform_between(pose.frame, link.name), matrix)
         linear = matrix[:3, :3] * np.array(scale)
         moved = []
         for part in parts:
             self.allowance.take(part.vertices.nbytes + part.faces.nbytes)
             placed = part.moved(part.name, linear, matrix[:3, 3])
-            moved.append(self.painted(placed, appearance))
+            moved.append(self.with_appearance(placed, appearance))
         return moved
 
-    def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
+    def with_appearance(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
         """Return a mesh with color and material of its visual, unless its file has any."""
         color = appearance.color
         is_plain = mesh.colors is None or appearance.is_retro
@@ -161,7 +161,7 @@ class LinkMeshes:
             mesh = replace(mesh, materials=FaceMaterials.named(appearance.material))
         return mesh
 
-    def geometry(self, geometry: Element, source: Source) -> list[SceneMesh]:
+    def geometry_meshes(self, geometry: Element, source: Source) -> list[SceneMesh]:
         """Return the meshes of a <geometry>, or [] for a shape without a size or file."""
         shapes = [child for child in geometry if ":" not in child.tag]
         if not shapes:
@@ -186,7 +186,7 @@ class LinkMeshes:
     def _mesh(self, shape: Element, source: Source) -> list[SceneMesh]:
         """Return the meshes of a file, or of its <submesh>, scaled."""
         uri = (shape.findtext("uri") or "").strip()
-        scale = numbers_of(shape, "scale", 3, "1 1 1")
+        scale = child_numbers(shape, "scale", 3, "1 1 1")
         meshes = self.file_meshes(uri, source)
         part = shape.find("submesh")
         if part is not None:
@@ -312,7 +312,7 @@ class LinkMeshes:
         """Return the file of a URI, or None, with a note, for a missing file."""
         try:
             return self.resources.file(uri, source)
-        except MissingFileError as error:
+        except ResourceNotFoundError as error:
             self.notes.missing_files[str(error) or "a mesh without <uri>"] += 1
             return None
 
@@ -320,7 +320,7 @@ class LinkMeshes:
 def _retro(link: Element, shape: Element) -> float:
     """Return the <laser_retro> of a shape, or of the first collision shape that has any, else 0."""
     for candidate in (shape, *link.findall("collision")):
-        value = float(numbers_of(candidate, "laser_retro", 1, "0").item())
+        value = float(child_numbers(candidate, "laser_retro", 1, "0").item())
         if value > 0:
             return value
     return 0.0

@@ -15,7 +15,7 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import is_inside
 from lidarsim.base.words import natural, printable
 
-from ..files.lenient_xml import lenient_root
+from ..files.lenient_xml import parse_lenient_xml
 
 # Variables with folders of models and resources, of Gazebo Sim, then of Gazebo classic.
 FOLDER_VARIABLES = (
@@ -36,7 +36,7 @@ _WORLD_FOLDERS = ("worlds", "world")
 _SDF_VERSION = (1, 12)  # the newest that is known
 
 
-class MissingFileError(Exception):
+class ResourceNotFoundError(Exception):
     """A file or model that no folder has.
 
     The text of the error is the name to report.
@@ -90,7 +90,7 @@ class Resources:
     caches: tuple[Path, ...]
 
     @classmethod
-    def of_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
+    def for_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
         """Return the resources of a world, which `assets` are searched for first."""
         folder = path.parent.resolve()
         above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
@@ -125,7 +125,7 @@ class Resources:
                 return Source(_newest_file(target.path), _resolved(target.path))
             if target.path.is_file():
                 return Source(target.path, target.root)
-        raise MissingFileError(short_name(uri))
+        raise ResourceNotFoundError(short_name(uri))
 
     def file(self, uri: str, source: Source) -> Source:
         """Return a file of a mesh or an image.
@@ -135,7 +135,7 @@ class Resources:
         for target in self._targets(uri, source):
             if target.path.is_file():
                 return target
-        raise MissingFileError(printable(uri))
+        raise ResourceNotFoundError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
         """Yield the existing paths that a URI may name.
@@ -181,7 +181,7 @@ class Resources:
             if not location.startswith("/"):
                 yield from self._in_folders(location)
         else:
-            raise MissingFileError(printable(uri))
+            raise ResourceNotFoundError(printable(uri))
 
     def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
         """Yield the paths NAME/FILE in all folders."""
@@ -277,13 +277,13 @@ def _newest_file(folder: Path) -> Path:
                     return file
     if (folder / _MODEL).is_file():
         return folder / _MODEL
-    raise MissingFileError(printable(folder.name))
+    raise ResourceNotFoundError(printable(folder.name))
 
 
 def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
     """Return the files that a configuration names: {version: name}."""
     try:
-        root = lenient_root(read_input(path))
+        root = parse_lenient_xml(read_input(path))
     except (OSError, ValueError, LidarError):
         return {}
     return {_version(entry): (entry.text or "").strip() for entry in root.iter("sdf")}

@@ -19,7 +19,7 @@ from lidarsim.scene.scene_mesh import SceneMesh, stacked
 from lidarsim.scene.shapes import capsule, revolve
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
-from .frames import numbers_in, numbers_of
+from .frames import child_numbers, parse_numbers
 
 _PIXEL_BYTES = 72  # bytes of a pixel of a height map: a vertex, and two triangles
 _PARALLEL = 1e-12  # limit for unit vectors: 1 minus the cosine between them
@@ -40,7 +40,7 @@ def shape_mesh(shape: Element) -> SceneMesh | None:
 
 def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
     """Return `count` sizes of a shape, which are not negative."""
-    return numbers_of(shape, name, count, default, at_least=0.0)
+    return child_numbers(shape, name, count, default, at_least=0.0)
 
 
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
@@ -80,7 +80,7 @@ def _capsule(shape: Element) -> SceneMesh | None:
 
 def _plane(shape: Element) -> SceneMesh | None:
     """Return a rectangle across a normal."""
-    normal = numbers_of(shape, "normal", 3, "0 0 1")
+    normal = child_numbers(shape, "normal", 3, "0 0 1")
     size = length(normal)
     if not size > 0:
         raise LidarError("<normal> of a <plane> has zero length.")
@@ -145,7 +145,7 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
 def _ring(polyline: Element) -> Floats:
     """Return the points (n, 2) of a polyline, each once."""
     texts = [point.text or "" for point in polyline.findall("point")]
-    points = np.array([numbers_in(text, "<point>", 2) for text in texts]).reshape(-1, 2)
+    points = np.array([parse_numbers(text, "<point>", 2) for text in texts]).reshape(-1, 2)
     follows = np.ones(len(points), np.bool_)
     follows[1:] = (points[1:] != points[:-1]).any(axis=1)
     points = points[follows]
@@ -202,7 +202,7 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
         If the image cannot be read.
     """
     size = _sizes(shape, "size", 3, "1 1 1")
-    offset = numbers_of(shape, "pos", 3, "0 0 0")
+    offset = child_numbers(shape, "pos", 3, "0 0 0")
     values = read_heights(image, allowance, _PIXEL_BYTES)
     rows, columns = values.shape
     if min(rows, columns) < 2 or not size[:2].all():
@@ -227,7 +227,7 @@ def road_mesh(road: Element) -> SceneMesh | None:
     """Return a strip of a road's width along its points, or None without two points."""
     width = _sizes(road, "width", 1, "1").item()
     texts = [point.text or "" for point in road.findall("point")]
-    points = np.array([numbers_in(text, "<point>", 3) for text in texts]).reshape(-1, 3)
+    points = np.array([parse_numbers(text, "<point>", 3) for text in texts]).reshape(-1, 3)
     follows = np.ones(len(points), np.bool_)
     follows[1:] = (points[1:, :2] != points[:-1, :2]).any(axis=1)
     points = points[follows]

@@ -21,13 +21,13 @@ def lidar_elements(link: Element) -> Iterator[Element]:
     return (sensor for sensor in link.findall("sensor") if sensor.get("type") in LIDARS)
 
 
-def figures_of(sensor: Element) -> Element | None:
+def lidar_settings(sensor: Element) -> Element | None:
     """Return the <lidar> or <ray> of a <sensor>, or None without any."""
     figures = sensor.find("lidar")
     return sensor.find("ray") if figures is None else figures
 
 
-def flags_of(visual: Element) -> int:
+def read_flags(visual: Element) -> int:
     """Return the <visibility_flags> of a visual.
 
     Raises LidarError if they are not a number of 32 bits.
@@ -35,22 +35,22 @@ def flags_of(visual: Element) -> int:
     return _bits(visual, "visibility_flags")
 
 
-def mask_of(sensor: Element) -> int:
+def read_mask(sensor: Element) -> int:
     """Return the <visibility_mask> of a lidar.
 
     Raises LidarError if it is not a number of 32 bits.
     """
-    figures = figures_of(sensor)
+    figures = lidar_settings(sensor)
     return ALL_BITS if figures is None else _bits(figures, "visibility_mask")
 
 
-def masks_of(links: Iterable[Element]) -> tuple[int, ...]:
+def distinct_masks(links: Iterable[Element]) -> tuple[int, ...]:
     """Return the distinct masks of the lidars of links, ascending."""
     masks = set()
     for link in links:
         for sensor in lidar_elements(link):
             with prefixed(f"sensor {printable(sensor.get('name', ''))!r}"):
-                masks.add(mask_of(sensor))
+                masks.add(read_mask(sensor))
     return tuple(sorted(masks))
 
 

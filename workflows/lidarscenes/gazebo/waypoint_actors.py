@@ -14,7 +14,7 @@ from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.scene_graph import PlacedNode, RigidPart
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .frames import matrix_of, numbers_of, pose_of
+from .frames import child_numbers, read_matrix, read_pose
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Source
@@ -31,7 +31,7 @@ class Actors(NamedTuple):
     standing: list[PlacedNode]
 
 
-def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
+def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
     """Return the actors of a world, with their skins at rest."""
     actors = Actors([], [])
     for element in world.findall("actor"):
@@ -57,7 +57,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
     if skin is None:
         return None
     parts = meshes.skin_meshes((skin.findtext("filename") or "").strip(), source)
-    scale = numbers_of(skin, "scale", 1, "1").item()
+    scale = child_numbers(skin, "scale", 1, "1").item()
     if not parts or not scale:
         return None
     joined = join_meshes("skin", parts)
@@ -72,13 +72,13 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
     if not entries:
-        return np.zeros(1), pose_of(actor).matrix[None]
-    times_s = np.array([numbers_of(entry, "time", 1, "0").item() for entry in entries])
+        return np.zeros(1), read_pose(actor).matrix[None]
+    times_s = np.array([child_numbers(entry, "time", 1, "0").item() for entry in entries])
     poses = np.array([_waypoint_pose(entry) for entry in entries])
     times_s, rows = np.unique(times_s, return_index=True)
     poses = poses[rows]
     assert script is not None, "of entries"
-    delay_s = numbers_of(script, "delay_start", 1, "0").item()
+    delay_s = child_numbers(script, "delay_start", 1, "0").item()
     if (script.findtext("loop") or "true").strip() in ("true", "1") and times_s[-1] > 0:
         times_s, poses = _repeated(times_s, poses)
         if times_s[-1] < _LOOP_S:
@@ -97,7 +97,7 @@ def _waypoint_pose(waypoint: Element) -> Floats:
     pose = waypoint.find("pose")
     if pose is None:
         raise LidarError("a <waypoint> has no <pose>.")
-    return matrix_of(pose)
+    return read_matrix(pose)
 
 
 def _repeated(times_s: Floats, poses: Floats) -> tuple[Floats, Floats]:

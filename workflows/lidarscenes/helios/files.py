@@ -109,7 +109,7 @@ def _root(path: Path) -> Element:
     """
     try:
         with explained(f"{path} cannot be read"):
-            root = xml_root(read(path))
+            root = xml_root(read_file(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LidarError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "document":
@@ -120,7 +120,7 @@ def _root(path: Path) -> Element:
     return root
 
 
-def read(path: Path) -> bytes:
+def read_file(path: Path) -> bytes:
     """Read a regular file completely.
 
     Raises LidarError if the file does not fit into memory.
@@ -129,7 +129,7 @@ def read(path: Path) -> bytes:
         return read_input(path)
 
 
-def number(values: Element | dict[str, str], name: str, default: float) -> float:
+def read_number(values: Element | dict[str, str], name: str, default: float) -> float:
     """Return an attribute as a finite number.
 
     Raises LidarError for text that is not a finite number.
@@ -143,17 +143,17 @@ def number(values: Element | dict[str, str], name: str, default: float) -> float
     raise LidarError(f"{name} is {text!r}; it must be a number.")
 
 
-def flag(values: dict[str, str], name: str, default: bool) -> bool:
+def read_flag(values: dict[str, str], name: str, default: bool) -> bool:
     """Return an attribute as true or false."""
     return values[name].lower() in ("true", "1") if name in values else default
 
 
-def vector(values: Element | dict[str, str] | None) -> Floats:
+def read_vector(values: Element | dict[str, str] | None) -> Floats:
     """Return x, y and z of an element or its attributes: (3,), or zeros for missing attributes."""
-    return np.array([number({} if values is None else values, axis, 0.0) for axis in "xyz"])
+    return np.array([read_number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
-def rotation(element: Element | None) -> Floats:
+def read_rotation(element: Element | None) -> Floats:
     """Return the product (3, 3) of the rotations <rot> in an element, in their order.
 
     Rotations are about the axes around the element; with rotations="local" about the axes that the
@@ -164,19 +164,21 @@ def rotation(element: Element | None) -> Floats:
         axis = step.get("axis", "").lower()
         if axis not in ("x", "y", "z"):
             raise LidarError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
-        step_rotation = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
+        step_rotation = rotation_about(
+            np.eye(3)["xyz".index(axis)], read_number(step, "angle_deg", 0.0)
+        )
         local = element is not None and element.get("rotations") == "local"
         total = total @ step_rotation if local else step_rotation @ total
     return total
 
 
-def clean(values: Floats | float | Sequence[float]) -> list[float] | float:
+def rounded(values: Floats | float | Sequence[float]) -> list[float] | float:
     """Return numbers for a scenario, rounded to 12 digits.
 
     Roundings of zero are zero.
     """
     array = np.asarray(values, np.float64)
     if array.ndim:
-        return [clean(value) for value in array.tolist()]  # type: ignore[misc]
+        return [rounded(value) for value in array.tolist()]  # type: ignore[misc]
     value = array.item()
     return float(f"{value:.12g}") if abs(value) > 1e-9 else 0.0

@@ -21,8 +21,8 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.lidar_scenario import SCENARIO_FILE
-from .files import Assets, clean, number
-from .scanner_xml import Device, HeliosScanner, channels, device, unsupported_features
+from .files import Assets, read_number, rounded
+from .scanner_xml import Device, HeliosScanner, make_device, read_channels, unsupported_features
 from .survey_xml import AHEAD, returns_section
 
 _MAX_NAMES = 12  # limit for scanners in a message
@@ -35,7 +35,7 @@ class _Reference(NamedTuple):
     scanner: str  # its id; empty without one
 
     @classmethod
-    def of(cls, survey: Path) -> _Reference:
+    def from_path(cls, survey: Path) -> _Reference:
         """Return the file and the id in a path, as surveys write them."""
         name, mark, scanner = survey.name.rpartition("#")
         if mark and not survey.exists():
@@ -46,7 +46,7 @@ class _Reference(NamedTuple):
 def is_scanner(survey: Path) -> bool:
     """Return True if a path is of a file of HELIOS++ with scanners and without a survey."""
     with suppress(OSError, LidarError, ValueError, ParseError):
-        root = xml_root(read_input(_Reference.of(survey).file))
+        root = xml_root(read_input(_Reference.from_path(survey).file))
         has_scanner = root.find("scanner") is not None
         return root.tag == "document" and has_scanner and root.find("survey") is None
     return False
@@ -76,17 +76,17 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     LidarError
         If the file cannot be read, the scanner is not named or has no sensor like it.
     """
-    reference = _Reference.of(survey)
+    reference = _Reference.from_path(survey)
     files = Assets(reference.file, list(assets))
     element = _element(files, reference)
-    scanners = channels(element)
+    scanners = read_channels(element)
     first = next(iter(scanners.values()))
     lines = [line for scanner in scanners.values() for line in unsupported_features(scanner)]
     settings = _settings(files, reference.file, element)
     if settings is None:
         lines.append("scanners without <scannerSettings> (the highest rates are used)")
         settings = _highest_rates(first)
-    devices = {name: device(scanner, settings) for name, scanner in scanners.items()}
+    devices = {name: make_device(scanner, settings) for name, scanner in scanners.items()}
     sensors = _merged(devices)
     if len(sensors) > MAX_SENSORS:
         raise LidarError(
@@ -132,7 +132,7 @@ def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | N
 def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:
     """Return the settings of the highest rates of a scanner."""
     pulses = scanner.values.get("pulseFreqs_Hz", "").split(",")
-    settings = {"pulseFreq_hz": max(pulses, key=lambda hz: number({"hz": hz}, "hz", 0))}
+    settings = {"pulseFreq_hz": max(pulses, key=lambda hz: read_number({"hz": hz}, "hz", 0))}
     if scanner.number("scanFreqMax_Hz") > 0:
         settings["scanFreq_hz"] = scanner.values["scanFreqMax_Hz"]
     if scanner.number("scanAngleMax_deg") > 0:
@@ -164,7 +164,7 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
         "elevation_deg": [_only(table.get("elevation_deg", 0.0)) for table in tables],
         "azimuth_deg": [_only(table.get("azimuth_deg", 0.0)) for table in tables],
     }
-    heights = clean(starts[:, 2] - starts[0, 2])
+    heights = rounded(starts[:, 2] - starts[0, 2])
     if np.any(heights):
         beams["origin_m"] = [[0.0, 0.0, height] for height in np.atleast_1d(heights).tolist()]
     merged = replace(first, data=shared | {"beams": beams})
@@ -206,7 +206,7 @@ def _write(
         content: dict[str, Any] = {"scene": "seed", "sensor": only}
     else:
         content = {"scene": "seed", "sensors": entries}
-    if accuracy_m := clean(first.number("accuracy_m")):
+    if accuracy_m := rounded(first.number("accuracy_m")):
         content["noise"] = {"range_m": accuracy_m}
     waveforms = first.child("FWFSettings")
     if waveforms is not None or first.number("maxNOR"):
@@ -229,13 +229,13 @@ def _entry(file: str, mounted: Device) -> dict[str, Any]:
     mount: dict[str, Any] = {
         name: angle
         for name in ("yaw_deg", "pitch_deg", "roll_deg")
-        if (angle := clean(getattr(pose, name)))
+        if (angle := rounded(getattr(pose, name)))
     }
-    if any(position := clean(pose.position)):  # type: ignore[arg-type]
+    if any(position := rounded(pose.position)):  # type: ignore[arg-type]
         mount = {"position": position, **mount}
     entry: dict[str, Any] = {"model": file}
     if min_range_m:
-        entry["min_range_m"] = clean(min_range_m)
+        entry["min_range_m"] = rounded(min_range_m)
     if np.isfinite(max_range_m):
-        entry["max_range_m"] = clean(max_range_m)
+        entry["max_range_m"] = rounded(max_range_m)
     return {**entry, "mount": mount} if mount else entry

@@ -19,7 +19,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.transform import rotation_about
 
-from .files import clean, number, rotation, vector
+from .files import read_number, read_rotation, read_vector, rounded
 
 _Z = np.array([0.0, 0.0, 1.0])
 # Rotations from the sensor frame to the frame of HELIOS++: of a line to both sides, of a cone about
@@ -85,10 +85,10 @@ class HeliosScanner:
 
     def number(self, name: str, default: float = 0.0) -> float:
         """Return an attribute as a number."""
-        return number(self.values, name, default)
+        return read_number(self.values, name, default)
 
 
-def channels(element: Element) -> dict[str, HeliosScanner]:
+def read_channels(element: Element) -> dict[str, HeliosScanner]:
     """Return the channels of a scanner {id: channel}.
 
     {"": scanner} without channels.
@@ -115,7 +115,7 @@ def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
         yield f"turning points of the oscillating mirror of {scanner.name} (its speed is constant)"
 
 
-def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
+def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     """Return a scanner with the settings of a leg.
 
     Raises
@@ -124,7 +124,7 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
         If no sensor has the kind of optics, or the settings make no line.
     """
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
-    pulse_hz = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
+    pulse_hz = read_number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
     if pulse_hz <= 0:
         raise LidarError(f"{scanner.name} must have a pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
@@ -139,28 +139,30 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     if head.deg_per_s:
         data, sensor_rotation = _turning_head(scanner, head, line)
     elif line is not None:
-        data, line_rotation = line.standing()
-        sensor_rotation = rotation(emitter) @ line_rotation
+        data, line_rotation = line.mirror_sections()
+        sensor_rotation = read_rotation(emitter) @ line_rotation
     else:
         data, optics_rotation = _OPTICS[optics](scanner, settings, pulse_hz)
-        sensor_rotation = rotation(emitter) @ optics_rotation
+        sensor_rotation = read_rotation(emitter) @ optics_rotation
     return Device(
         data={
             "name": scanner.name,
             "sources": {"all": "a HELIOS++ survey and the files that it refers to"},
             **data,
-            "optics": {name: clean(value) for name, value in _light(scanner, settings).items()},
+            "optics": {name: rounded(value) for name, value in _light(scanner, settings).items()},
         },
         rotation=rotation_about(head.axis, head.start_deg) @ sensor_rotation,
-        position=vector(emitter),
+        position=read_vector(emitter),
         head_s=abs(head.range_deg / head.deg_per_s) if head.deg_per_s else None,
-        range_m=(scanner.number("rangeMin_m"), number(scanner.values, "rangeMax_m", np.inf)),
+        range_m=(scanner.number("rangeMin_m"), read_number(scanner.values, "rangeMax_m", np.inf)),
     )
 
 
 def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
     """Return the fields of `optics` of a scanner with the settings of a leg."""
-    divergence = number(settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4))
+    divergence = read_number(
+        settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4)
+    )
     return {
         "wavelength_nm": scanner.number("wavelength_nm", 1064),
         "divergence_mrad": 1e3 * divergence,
@@ -185,14 +187,14 @@ class _Head(NamedTuple):
 
         `line` is the line of rotating optics.
         """
-        axis = vector(scanner.child("headRotateAxis"))
+        axis = read_vector(scanner.child("headRotateAxis"))
         axis = axis if np.linalg.norm(axis) > 0.1 else _Z
-        start_deg = number(settings, "headRotateStart_deg", 0)
-        range_deg = number(settings, "headRotateStop_deg", 0) - start_deg
+        start_deg = read_number(settings, "headRotateStart_deg", 0)
+        range_deg = read_number(settings, "headRotateStop_deg", 0) - start_deg
         max_deg_per_s = scanner.number("headRotatePerSecMax_deg")
-        deg_per_s = number(settings, "headRotatePerSec_deg", 0)
+        deg_per_s = read_number(settings, "headRotatePerSec_deg", 0)
         if line is not None:  # a distance between lines takes precedence
-            by_lines = number(settings, "horizontalResolution_deg", 0) * line.scan_hz
+            by_lines = read_number(settings, "horizontalResolution_deg", 0) * line.scan_hz
             deg_per_s = by_lines or deg_per_s
         limited = float(np.clip(deg_per_s, -max_deg_per_s, max_deg_per_s))
         return cls(axis, start_deg, range_deg, limited)
@@ -203,7 +205,7 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
 
     Raises LidarError if the head cannot turn as the settings say.
     """
-    aim = _aim(rotation(scanner.child("beamOrigin")))
+    aim = _aim(read_rotation(scanner.child("beamOrigin")))
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
     if line is None or aim is None or not vertical:
         raise LidarError(
@@ -216,7 +218,7 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
             f"{head.deg_per_s:g} degrees per second, so it never reaches "
             f"{head.start_deg + head.range_deg:g} degrees."
         )
-    return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
+    return line.head_sections(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
 
 
 class _Aim(NamedTuple):
@@ -265,16 +267,16 @@ class _Line:
         """
         max_deg = scanner.number("scanAngleMax_deg")
         effective_deg = scanner.number("scanAngleEffectiveMax_deg")
-        resolution_deg = number(settings, "verticalResolution_deg", 0)
+        resolution_deg = read_number(settings, "verticalResolution_deg", 0)
         min_hz = scanner.number("scanFreqMin_Hz")
-        if not (resolution_deg or min_hz or number(settings, "scanFreq_hz", 0)):
+        if not (resolution_deg or min_hz or read_number(settings, "scanFreq_hz", 0)):
             return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
         scan_hz = _scan_hz(
             scanner, settings, pulse_hz * resolution_deg / (2 * max_deg) if resolution_deg else None
         )
         half_deg = min(effective_deg, _half_angle_deg(scanner, settings))
-        lowest_deg = number(settings, "verticalAngleMin_deg", -half_deg)
-        highest_deg = number(settings, "verticalAngleMax_deg", half_deg)
+        lowest_deg = read_number(settings, "verticalAngleMin_deg", -half_deg)
+        highest_deg = read_number(settings, "verticalAngleMax_deg", half_deg)
         if (
             highest_deg - lowest_deg > 2 * effective_deg + _SLACK
         ):  # HELIOS++ 1 leaves such pulses out, 2 refuses them
@@ -299,7 +301,7 @@ class _Line:
             scan_hz,
         )
 
-    def standing(self) -> ScannerSection:
+    def mirror_sections(self) -> ScannerSection:
         """Return a sensor with a mirror, whose firings are pulses.
 
         Raises
@@ -312,16 +314,16 @@ class _Line:
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
-            "width_deg": clean(min(width, 360)),
-            "duty": clean(self.count / self.pulses_per_line),
+            "width_deg": rounded(min(width, 360)),
+            "duty": rounded(self.count / self.pulses_per_line),
         }
         middle = self.first_deg + width / 2
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
-    def turning(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
+    def head_sections(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
         """Return a sensor with a head, whose firings are lines that an emitter aims."""
         between_us = 1e6 / self.pulse_hz
-        last = clean((self.count - 1) * between_us)
+        last = rounded((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
             "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
@@ -337,18 +339,18 @@ class _Line:
         """
         angles = self.first_deg + aim.tilt_deg + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
-            first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
+            first, last = (rounded(end) for end in angles[[0, -1]].clip(-90, 90))
             elevations_deg = {"first": first, "last": last, "count": self.count}
-            if not clean(aim.azimuth_deg):
+            if not rounded(aim.azimuth_deg):
                 return {"elevation_deg": elevations_deg}
-            azimuths_deg = clean(np.full(self.count, aim.azimuth_deg))
+            azimuths_deg = rounded(np.full(self.count, aim.azimuth_deg))
             return {"elevation_deg": elevations_deg, "azimuth_deg": azimuths_deg}
         angles = (angles + 180) % 360 - 180
         behind = np.abs(angles) > 90
         elevations = np.where(behind, np.copysign(180, angles) - angles, angles)
         return {
-            "elevation_deg": clean(elevations),
-            "azimuth_deg": clean(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
+            "elevation_deg": rounded(elevations),
+            "azimuth_deg": rounded(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
         }
 
 
@@ -357,7 +359,7 @@ def _mirror(
 ) -> dict[str, Any]:
     """Return a sensor with a mirror, whose lines have their middle at `middle` degrees."""
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
-    return data | ({"zero_deg": clean(middle)} if clean(middle) else {}) | {"mirror": mirror}
+    return data | ({"zero_deg": rounded(middle)} if rounded(middle) else {}) | {"mirror": mirror}
 
 
 def _oscillating(
@@ -369,21 +371,21 @@ def _oscillating(
     """
     scan_hz = _scan_hz(scanner, settings)
     max_deg = scanner.number("scanProduct", 1e6) / scan_hz
-    half_deg = min(number(settings, "scanAngle_deg", 0), max_deg)
+    half_deg = min(read_number(settings, "scanAngle_deg", 0), max_deg)
     firings = floor(pulse_hz / scan_hz + _SLACK)
     if half_deg <= 0 or not firings:
         raise LidarError(
             f"{scanner.name} must have a scanAngle_deg above 0 and at least one pulse per scan "
             "line."
         )
-    mirror = {"motion": "triangle", "width_deg": clean(2 * half_deg)}
+    mirror = {"motion": "triangle", "width_deg": rounded(2 * half_deg)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
     """Return a sensor with fibers side by side, each with a pulse in a line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
-    mirror = {"motion": "sawtooth", "width_deg": clean(2 * _half_angle_deg(scanner, settings))}
+    mirror = {"motion": "sawtooth", "width_deg": rounded(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
@@ -392,7 +394,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
-    beams = {"elevation_deg": [clean(90 - _half_angle_deg(scanner, settings))]}
+    beams = {"elevation_deg": [rounded(90 - _half_angle_deg(scanner, settings))]}
     return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
 
@@ -401,9 +403,9 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
-            "wedge_deg": clean(abs(angle)),
-            "index": clean(scanner.number(f"refrIndex{i}", 1) / air),
-            "rpm": clean(60 * scanner.number(f"rotorFreq{i}_Hz")),
+            "wedge_deg": rounded(abs(angle)),
+            "index": rounded(scanner.number(f"refrIndex{i}", 1) / air),
+            "rpm": rounded(60 * scanner.number(f"rotorFreq{i}_Hz")),
             "inclined_first": angle > 0,
         }
         for i in (1, 2, 3)
@@ -417,12 +419,12 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
         "prisms": prisms,
     }
     if (incident := scanner.child("incidentBeam")) is not None:
-        x, y, z = _PRISM.T @ vector(incident)
+        x, y, z = _PRISM.T @ read_vector(incident)
         elevation = np.arctan2(z, np.hypot(x, y))
         azimuth = np.arctan2(y, x)
         section["beams"] = {
-            "elevation_deg": [clean(np.degrees(elevation))],
-            "azimuth_deg": [clean(np.degrees(azimuth))],
+            "elevation_deg": [rounded(np.degrees(elevation))],
+            "azimuth_deg": [rounded(np.degrees(azimuth))],
         }
     return section, _PRISM
 
@@ -438,7 +440,7 @@ _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSecti
 def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
     """Return the scan angle to either side, degrees: at most, and by default, the scanner's."""
     max_deg = scanner.number("scanAngleMax_deg")
-    half_deg = min(max(number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
+    half_deg = min(max(read_number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
     if half_deg <= 0:
         raise LidarError(f"{scanner.name} must have a scanAngleMax_deg above 0.")
     return half_deg
@@ -451,7 +453,7 @@ def _scan_hz(
 
     Raises LidarError if they are not within the scanner's limits.
     """
-    rate_hz = number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
+    rate_hz = read_number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
     min_hz = scanner.number("scanFreqMin_Hz")
     max_hz = scanner.number("scanFreqMax_Hz") or np.inf
     if not min_hz <= rate_hz <= max_hz or rate_hz <= 0:

@@ -27,8 +27,8 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
 
-from ..procedural.floor import heights_at
-from .files import Assets, clean, number, read, rotation
+from ..procedural.floor import surface_heights
+from .files import Assets, read_file, read_number, read_rotation, rounded
 
 # Makes a mesh of surfels, a surfel for each cubic cell with points: of the path of the file, points
 # (n, 3) in meters, and the edge of the cells in meters.
@@ -74,7 +74,7 @@ class HeliosPart:
                     values[words[0].removeprefix("helios_")] = words[1]
         return {name: values for name, values in values_by_material.items() if name in used}
 
-    def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
+    def material_fields(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
         """Return reflectance and class of each material, {name: fields of `materials`}.
 
         `spectra` returns the reflectance by the name of a spectrum.
@@ -83,15 +83,15 @@ class HeliosPart:
         for name, values in self.materials.items():
             share = None
             if "reflectance" in values:
-                share = number(values, "reflectance", 0)
+                share = read_number(values, "reflectance", 0)
                 share = share if share <= 1 else share / 100
             elif "spectra" in values:
                 share = spectra(values["spectra"])
             kind: dict[str, Any] = {}
             if share is not None:
-                kind["reflectance"] = clean(np.clip(share, 0, 1))
+                kind["reflectance"] = rounded(np.clip(share, 0, 1))
             if "classification" in values:
-                kind["class"] = int(number(values, "classification", 0))
+                kind["class"] = int(read_number(values, "classification", 0))
             kinds[name] = kind
         return kinds
 
@@ -122,9 +122,9 @@ class HeliosPart:
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
             "up_axis": (self.up_axis, None),
-            "scale": (clean(self.scale), 1.0),
-            "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
-            "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
+            "scale": (rounded(self.scale), 1.0),
+            "rotation_deg": (rounded(degrees), [0.0, 0.0, 0.0]),
+            "translation": (rounded(self.offset), [0.0, 0.0, 0.0]),
         }
         changed = {key: value for key, (value, default) in placement.items() if value != default}
         return {"file": name, **changed}
@@ -207,7 +207,7 @@ class HeliosScene:
 
     def height(self, x: float, y: float) -> float:
         """Return the height of the lowest ground at x, y, in meters, or 0 without ground."""
-        heights = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
+        heights = np.zeros(0) if self._ground is None else surface_heights(self._ground, x, y)
         if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
             return 0.0
@@ -222,7 +222,7 @@ class HeliosScene:
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
         """Return the entries of `materials` for objects, or for faces of several materials."""
         spectra = partial(self._reflectance, wavelength_nm)
-        kinds = [part.kinds(spectra) for part in self.parts]
+        kinds = [part.material_fields(spectra) for part in self.parts]
         if not any(kind for part_kinds in kinds for kind in part_kinds.values()):
             return []
         meshes = [part.meshes() for part in self.parts]
@@ -286,7 +286,7 @@ class _PartDraft:
     def transform(self, kind: str, text: dict[str, str], rotations: Element | None) -> None:
         """Rotate, scale or move the part by a filter with the parameters {name: text}."""
         if kind == "rotate":
-            self.rotation = rotation(rotations) @ self.rotation
+            self.rotation = read_rotation(rotations) @ self.rotation
         elif kind == "scale":
             (scale,) = _numbers(text.get("scale", ""), 1)
             self.scale = float(scale or 1.0)
@@ -328,7 +328,7 @@ def _entries(
 ) -> list[dict[str, Any]]:
     """Return the entries of `materials` for an object.
 
-    `kinds` are {name of a material: fields}.
+    `material_fields` are {name of a material: fields}.
     """
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
@@ -372,7 +372,7 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
     Both are in meters.
     """
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
-    lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
+    lines = read_file(path).decode("utf-8", "replace").translate(separators).splitlines()
     if not any(line.partition("//")[0].strip() for line in lines):
         raise LidarError(f"{path} has no points.")
     try:
@@ -386,7 +386,7 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
             f"{path} has points that are not finite, or more than {MAX_COORDINATE_M / 1000:,.0f} "
             "km away. Remove these points."
         )
-    return points, number(settings, "voxelSize", 1.0) or 1.0
+    return points, read_number(settings, "voxelSize", 1.0) or 1.0
 
 
 def _text(path: Path) -> str:

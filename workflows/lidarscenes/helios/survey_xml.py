@@ -25,17 +25,17 @@ from lidarsim.sensor.disc import SUBRAYS
 from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
-from .files import Assets, clean, number, rotation, vector
+from .files import Assets, read_number, read_rotation, read_vector, rounded
 from .legs import (
     HeliosTrajectory,
     Leg,
-    Stretch,
+    LegSegment,
     moving_trajectory,
     read_legs,
     read_trajectory,
-    standing_trajectory,
+    stationary_trajectory,
 )
-from .scanner_xml import Device, channels, device, unsupported_features
+from .scanner_xml import Device, make_device, read_channels, unsupported_features
 from .scene_xml import HeliosScene, SurfelMaker
 
 SCENARIO_FILE = "scenario.yaml"
@@ -44,7 +44,7 @@ AHEAD = rotation_about((0, 0, 1), -90)
 
 
 @dataclass
-class Imported:
+class ImportedSurvey:
     """The file of a written scenario, and the unsupported features of its survey."""
 
     path: Path
@@ -58,7 +58,7 @@ def import_survey(
     *,
     check: Callable[[Path], object],
     surfels: SurfelMaker,
-) -> Imported:
+) -> ImportedSurvey:
     """Write a HELIOS++ survey as a scenario, into a new folder.
 
     The folder holds `scenario.yaml`, data files of its sensors, meshes of scanned points, and the
@@ -111,7 +111,7 @@ def import_survey(
         raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Imported(folder / SCENARIO_FILE, survey_import.left_out)
+    return ImportedSurvey(folder / SCENARIO_FILE, survey_import.left_out)
 
 
 class _Import:
@@ -130,7 +130,7 @@ class _Import:
             raise LidarError("it has no <survey>.")
         self._element = element
         self._name = element.get("name") or survey.stem
-        self._scanners = channels(self._asset("scanner"))
+        self._scanners = read_channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
         self.scene = HeliosScene(self._asset("scene"), self._assets, folder, surfels)
         self._notes: list[str] = []
@@ -147,9 +147,9 @@ class _Import:
         self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
         if element.get("legRandomOffset", "false") in ("true", "1"):
             self._notes.append("legRandomOffset (legs are at their specified positions)")
-        if number(element, "numRuns", 1) > 1:
+        if read_number(element, "numRuns", 1) > 1:
             self._notes.append("numRuns (a single run is simulated)")
-        if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
+        if read_number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
             self._notes.append("maxFullwaveRange_ns (waveforms are as long as their echoes)")
         unsupported = (
             line for scanner in self._scanners.values() for line in unsupported_features(scanner)
@@ -183,7 +183,7 @@ class _Import:
                 leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
                 for leg, by_channel in devices.items()
             }
-            trajectory = standing_trajectory(legs, heads)
+            trajectory = stationary_trajectory(legs, heads)
         self._mount_devices(mount, devices, trajectory)
         return trajectory
 
@@ -218,7 +218,7 @@ class _Import:
             with prefixed(f"leg {leg.number}"):
                 if leg.active:
                     devices[leg.number] = {
-                        channel: device(scanner, leg.scanner)
+                        channel: make_device(scanner, leg.scanner)
                         for channel, scanner in self._scanners.items()
                     }
         return devices
@@ -230,10 +230,10 @@ class _Import:
         trajectory: HeliosTrajectory,
     ) -> None:
         """Move the trajectory to the position of the scanners, and fill `_sensors`."""
-        mount_rotation = rotation(mount)
-        mount_position = vector(mount)
+        mount_rotation = read_rotation(mount)
+        mount_position = read_vector(mount)
         positions = {
-            tuple(clean(mount_position + mounted.position))  # type: ignore[arg-type]
+            tuple(rounded(mount_position + mounted.position))  # type: ignore[arg-type]
             for by_channel in devices.values()
             for mounted in by_channel.values()
         }
@@ -242,26 +242,28 @@ class _Import:
                 "different positions of channels (all channels have the same position)"
             )
         trajectory.rows[:, 1:4] += min(positions, default=(0, 0, 0))
-        for stretch in trajectory.stretches:
-            if not stretch.active:
+        for segment in trajectory.segments:
+            if not segment.active:
                 continue
-            for channel, mounted in devices[stretch.leg].items():
-                name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
-                self._sensors[name] = self._sensor(mounted, stretch, mount_rotation)
+            for channel, mounted in devices[segment.leg].items():
+                name = f"leg{segment.leg}" + (f"-{channel}" if channel else "")
+                self._sensors[name] = self._sensor(mounted, segment, mount_rotation)
 
-    def _sensor(self, mounted: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
+    def _sensor(self, mounted: Device, segment: LegSegment, mount: Floats) -> dict[str, Any]:
         """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
-        step_deg, steps = mounted.steps(stretch.seconds)
+        step_deg, steps = mounted.steps(segment.seconds)
         min_range_m, max_range_m = mounted.range_m
         pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
-        angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+        angles = {
+            name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")
+        }
         return {
             "model": self._file_of(mounted.data),
             "step_deg": step_deg,
-            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": clean(max_range_m)} if np.isfinite(max_range_m) else {}),
+            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": rounded(max_range_m)} if np.isfinite(max_range_m) else {}),
             "mount": {name: angle for name, angle in angles.items() if angle},
-            "start_s": clean(stretch.start_s),
+            "start_s": rounded(segment.start_s),
             "steps": steps,
         }
 
@@ -326,18 +328,18 @@ class _Import:
                 waveform_settings, scanner.number("maxNOR"), scanner.number("pulseLength_ns", 4)
             ),
             "noise": {
-                "range_m": clean(
-                    number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
+                "range_m": rounded(
+                    read_number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
                 )
             },
             # HELIOS++ has the visibility at a contrast of 2 %.
             "weather": {
-                "visibility_km": clean(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
+                "visibility_km": rounded(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
             },
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
         return sections, {
-            field: number(detector_settings, name, 0)
+            field: read_number(detector_settings, name, 0)
             for field, name in ranges.items()
             if name in detector_settings
         }
@@ -347,7 +349,7 @@ def returns_section(
     settings: dict[str, str], max_returns: float, pulse_ns: float
 ) -> dict[str, Any]:
     """Return the section `returns` by FWFSettings, maxNOR and the length of a pulse."""
-    quality = number(settings, "beamSampleQuality", 3.0)
+    quality = read_number(settings, "beamSampleQuality", 3.0)
     return {
         "mode": "first" if max_returns == 1 else "all",
         "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
@@ -365,8 +367,8 @@ def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}
-    sample_ns = 2 * number(settings, "binSize_ns", 0.25)
-    return {"waveform": "peaks", "sample_ns": clean(min(sample_ns, pulse_ns / 2))}
+    sample_ns = 2 * read_number(settings, "binSize_ns", 0.25)
+    return {"waveform": "peaks", "sample_ns": rounded(min(sample_ns, pulse_ns / 2))}
 
 
 def _dumped(data: dict[str, Any]) -> str:

@@ -26,8 +26,8 @@ from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
 from lidarsim.worlds.mujoco_bodies import Choice, names_of, seen_geoms
 
-from ..writers.lidar_scenario import Lidar, clean, write_scenario
-from .model_file import MujocoOptions, body_matrix, load_model, objects_of_bodies
+from ..writers.lidar_scenario import Lidar, rounded, write_scenario
+from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
@@ -86,7 +86,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     ]
     entry: dict[str, Any] = {"file": path, **({"assets": assets[0]} if assets else {})}
     carriers = [body for body in dict.fromkeys(group.body for group in groups) if body]
-    objects = objects_of_bodies(model, _options(path, assets)) if len(carriers) > 1 else {}
+    objects = body_object_names(model, _options(path, assets)) if len(carriers) > 1 else {}
     lidars = [
         lidar._replace(unseen=(escape(objects[group.body]),)) if group.body in objects else lidar
         for lidar, group in zip(lidars, groups, strict=True)
@@ -165,16 +165,16 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     site_names = names_of(model, "site")
     channels = ", ".join(printable(site_names[sites[row]]) for row in order) if sites else ""
     if origins.any():
-        beams["origin_m"] = [[clean(value) for value in origin] for origin in origins.tolist()]
+        beams["origin_m"] = [[rounded(value) for value in origin] for origin in origins.tolist()]
     data: dict[str, Any] = {
         "name": f"{name} of MuJoCo",
         "sources": {"channels": f"rangefinders of {channels or 'the pixels, lowest first'}"},
-        "rate_hz": clean(group.rate_hz),
+        "rate_hz": rounded(group.rate_hz),
         "firings_per_turn": 1,
         "beams": beams,
     }
     if group.noise_m > 0:
-        data["performance"] = {"range_m": clean(group.noise_m)}
+        data["performance"] = {"range_m": rounded(group.noise_m)}
     root = int(model.body_rootid[group.body])
     return Lidar(
         name=name,
@@ -231,7 +231,7 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
 
 def _degrees(angles: Floats) -> list[float]:
     """Return angles as numbers for a file, degrees."""
-    return [clean(angle) for angle in np.degrees(angles).tolist()]
+    return [rounded(angle) for angle in np.degrees(angles).tolist()]
 
 
 def _unusable(model: Any, camera: int | None) -> str:

@@ -47,7 +47,7 @@ from lidarsim.worlds.mujoco_bodies import (
 )
 from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, segments
 
-from ..files.child_process import Child
+from ..files.child_process import ReaderProcess
 from .model_sources import check_sources
 
 MUJOCO_BYTES = 512 * 2**20  # bytes that MuJoCo takes for any file
@@ -117,7 +117,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         raise MeshFileError("is a MuJoCo model, which is not supported on Windows")
     request = {"keyframe": options.own.keyframe, "colors": options.colors}
     with TemporaryDirectory() as folder:
-        child = Child(
+        child = ReaderProcess(
             Path(__file__).with_name("model_child.py"),
             "MuJoCo",
             allowance.limit + MUJOCO_BYTES,
@@ -137,7 +137,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
     return SimpleNamespace(**frame, **fields)
 
 
-def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
+def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
     """Return the names of the objects of a model's bodies in its scene: {body: name}.
 
     Bodies without an object, and the world itself, are missing.

@@ -15,7 +15,7 @@ from lidarsim.base.input_files import check_input, read_input
 from lidarsim.scene.files.companions import outside
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 
-from ..files.lenient_xml import lenient_root
+from ..files.lenient_xml import parse_lenient_xml
 
 ROOT = "mujoco"
 _INCLUDED_ROOTS = (ROOT, "mujocoinclude")
@@ -44,7 +44,7 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
     MeshFileError
         If a file is not a model of MuJoCo, or a file is in a folder that is not allowed.
     """
-    root = lenient_root(data)
+    root = parse_lenient_xml(data)
     if root.tag != ROOT:
         advice = "is an XML file, but not a MuJoCo model. Its root element is <{}>"
         raise MeshFileError(_OTHER_ROOTS.get(root.tag, advice.format(root.tag[:40])))
@@ -114,7 +114,7 @@ def _included_root(file: Path) -> Element:
     Raises ValueError if it is not XML.
     """
     try:
-        root = lenient_root(read_input(file))
+        root = parse_lenient_xml(read_input(file))
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from error
     if root.tag not in _INCLUDED_ROOTS:

@@ -9,14 +9,14 @@ import numpy as np
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
-from .city_kinds import loft, lying, regular
+from .city_kinds import lay_down, loft, regular_polygon
 
 _RECESS_M = 0.03  # depth of a window
 _FRAME = 0.12  # share of a window's width that is frame
 
 
 @dataclass(frozen=True)
-class Model:
+class CarModel:
     """Outline of a car that faces x, from the front to the back, meters.
 
     A station is (x, half width, height of the belt line, height of the roof); without a cabin the
@@ -31,7 +31,7 @@ class Model:
 
 
 MODELS = (
-    Model(
+    CarModel(
         "Saloon",
         (
             (2.28, 0.62, 0.6, 0.62), (2.1, 0.82, 0.72, 0.76), (1.0, 0.89, 0.88, 0.94),
@@ -41,7 +41,7 @@ MODELS = (
         range(2, 6),
         (1.4, -1.35),
     ),
-    Model(
+    CarModel(
         "Estate",
         (
             (2.3, 0.62, 0.6, 0.62), (2.12, 0.83, 0.74, 0.78), (1.05, 0.9, 0.9, 0.96),
@@ -51,7 +51,7 @@ MODELS = (
         range(2, 7),
         (1.42, -1.4),
     ),
-    Model(
+    CarModel(
         "Panel van",
         (
             (2.48, 0.7, 0.7, 0.72), (2.35, 0.9, 0.95, 1.0), (1.75, 0.96, 1.12, 1.2),
@@ -65,7 +65,7 @@ MODELS = (
 )  # fmt: skip
 
 
-def car(model: Model) -> SceneMesh:
+def car(model: CarModel) -> SceneMesh:
     """Return a car that stands on z = 0 around the origin.
 
     Examples
@@ -74,10 +74,12 @@ def car(model: Model) -> SceneMesh:
     >>> saloon.name, 400 < len(saloon.faces) < 800
     ('Saloon', True)
     """
-    wheel = loft(regular(12, model.wheel_m), [(-0.11, 0.03), (-0.08, 0), (0.08, 0), (0.11, 0.03)])
+    wheel = loft(
+        regular_polygon(12, model.wheel_m), [(-0.11, 0.03), (-0.08, 0), (0.08, 0), (0.11, 0.03)]
+    )
     track = max(half for _, half, _, _ in model.stations) - 0.1
     down = -wheel.vertices[:, 1].min()
-    wheels = [lying(wheel).moved(x, y, down) for x in model.axles for y in (-track, track)]
+    wheels = [lay_down(wheel).translated(x, y, down) for x in model.axles for y in (-track, track)]
     return SceneMesh(model.name, *stacked([_body(model), *wheels]))
 
 
@@ -86,7 +88,7 @@ def all_cars() -> tuple[SceneMesh, ...]:
     return tuple(car(model) for model in MODELS)
 
 
-def _body(model: Model) -> tuple[Floats, Ints]:
+def _body(model: CarModel) -> tuple[Floats, Ints]:
     """Return vertices and faces of a body: rings of eight corners, joined by quadrangles."""
     rings = []
     for x, half, belt, roof in model.stations:

@@ -23,7 +23,7 @@ class Solid(NamedTuple):
     vertices: Floats
     faces: Ints
 
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
+    def translated(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
         """Return a copy, moved by x, y and z, meters."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
@@ -53,7 +53,7 @@ def _towers() -> list[Solid]:
         for tower in (
             _with_plant_room(loft(rectangle(18, 16), _storeys(floors)), floors),
             _stepped(floors),
-            _with_plant_room(loft(regular(14, 8.5), _storeys(floors)), floors),
+            _with_plant_room(loft(regular_polygon(14, 8.5), _storeys(floors)), floors),
             loft(corner, _storeys(floors)),
         )
     ]
@@ -76,11 +76,11 @@ def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[f
 def _with_plant_room(tower: Solid, floors: int) -> Solid:
     """Return a tower with plant rooms and a mast on its roof."""
     top = floors * FLOOR_M
-    return joined([
+    return join_solids([
         tower,
-        box(5, 4, 3).moved(1.5, -1, top),
-        box(2, 2, 1.4).moved(-3, 2.5, top),
-        loft(regular(6, 0.12), [(0, 0), (6, 0)]).moved(3, -1, top + 3),
+        box(5, 4, 3).translated(1.5, -1, top),
+        box(2, 2, 1.4).translated(-3, 2.5, top),
+        loft(regular_polygon(6, 0.12), [(0, 0), (6, 0)]).translated(3, -1, top + 3),
     ])  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def _stepped(floors: int) -> Solid:
     for step, count in enumerate(counts):
         parts.append(loft(rectangle(18, 16), _storeys(count, base, 2.0 * step)))
         base += count * FLOOR_M
-    return joined([*parts, box(4, 4, 3).moved(0, 0, base)])
+    return join_solids([*parts, box(4, 4, 3).translated(0, 0, base)])
 
 
 def _houses() -> list[Solid]:
@@ -102,11 +102,13 @@ def _houses() -> list[Solid]:
         for hip in (0.0, 3.0):
             body = _dwelling(11, 8.5, storeys, hip)
             houses.append(
-                joined([body, *_front(storeys), box(0.8, 0.8, 2.6).moved(2.6, 1, _eaves(storeys))])
+                join_solids(
+                    [body, *_front(storeys), box(0.8, 0.8, 2.6).translated(2.6, 1, _eaves(storeys))]
+                )
             )
             wing = _dwelling(6, 5, max(1, storeys - 1), 0.0)
             turned = Solid(wing.vertices[:, [1, 0, 2]] * [-1, 1, 1], wing.faces)
-            houses.append(joined([body, *_front(storeys), turned.moved(2.4, -6, 0)]))
+            houses.append(join_solids([body, *_front(storeys), turned.translated(2.4, -6, 0)]))
     return houses
 
 
@@ -123,15 +125,18 @@ def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
     eaves = _eaves(storeys)
     walls = loft(rectangle(width, depth), [(0, -0.15), (0.4, -0.15), (0.4, 0), (eaves, 0)])
     roof = gable(width + 1, depth + 1, eaves - 0.05, 0.42 * depth, hip)
-    return joined([walls, roof])
+    return join_solids([walls, roof])
 
 
 def _front(storeys: int) -> list[Solid]:
     """Return windows that stand out a little on the long sides, and a door with a step."""
-    door = [box(1.1, 0.3, 2.1).moved(-1.2, -4.3, 0.3), box(1.8, 1.2, 0.3).moved(-1.2, -4.8, 0)]
+    door = [
+        box(1.1, 0.3, 2.1).translated(-1.2, -4.3, 0.3),
+        box(1.8, 1.2, 0.3).translated(-1.2, -4.8, 0),
+    ]
     window = box(1.3, 0.25, 1.4)
     positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(storeys))
-    return [*door, *(window.moved(x, y, 1.3 + 2.8 * storey) for x, y, storey in positions)]
+    return [*door, *(window.translated(x, y, 1.3 + 2.8 * storey) for x, y, storey in positions)]
 
 
 def _trees(seed: int) -> list[Solid]:
@@ -145,7 +150,7 @@ def _trees(seed: int) -> list[Solid]:
 
 def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
     """Return a broad-leaved tree whose crown is `height_ratio` times as high as wide."""
-    trunk = loft(regular(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
+    trunk = loft(regular_polygon(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
     crown = revolve(
         np.stack([2.2 * np.cos(angle), 2.2 * height_ratio * (1 + np.sin(angle))], axis=1), 10
@@ -153,17 +158,17 @@ def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
     bumps = 1 + rng.uniform(-0.22, 0.22, (len(crown.vertices), 1))
     middle = np.array([0, 0, 2.2 * height_ratio])
     leaves = Solid((crown.vertices - middle) * bumps + middle, crown.faces)
-    return joined([trunk, leaves.moved(0, 0, 2)])
+    return join_solids([trunk, leaves.translated(0, 0, 2)])
 
 
 def _conifer(tiers: int) -> Solid:
     """Return a conifer of several tiers of branches."""
-    parts = [loft(regular(6, 0.2), [(0, 0), (1.4, 0)])]
+    parts = [loft(regular_polygon(6, 0.2), [(0, 0), (1.4, 0)])]
     for tier in range(tiers):
         radius = 2.0 - 1.3 * tier / tiers
         base = 1.1 + 1.7 * tier
-        parts.append(loft(regular(9, radius), [(base, 0), (base + 2.6, radius * 0.93)]))
-    return joined(parts)
+        parts.append(loft(regular_polygon(9, radius), [(base, 0), (base + 2.6, radius * 0.93)]))
+    return join_solids(parts)
 
 
 def _cars() -> list[Solid]:
@@ -179,21 +184,25 @@ def _cars() -> list[Solid]:
 
 def _car(side: list[tuple[float, float]]) -> Solid:
     """Return a car by the outline of its side: points x, z, meters."""
-    body = lying(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
-    wheel = lying(loft(regular(8, 0.33), [(-0.12, 0), (0.12, 0)]))
-    wheels = [wheel.moved(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
-    return joined([body, *wheels])
+    body = lay_down(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
+    wheel = lay_down(loft(regular_polygon(8, 0.33), [(-0.12, 0), (0.12, 0)]))
+    wheels = [wheel.translated(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
+    return join_solids([body, *wheels])
 
 
 def _lamp() -> Solid:
     """Return a street lamp whose arm points along x."""
-    pole = loft(regular(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
-    return joined(
-        [pole, box(1.6, 0.1, 0.1).moved(0.8, 0, 6.1), box(0.7, 0.3, 0.15).moved(1.6, 0, 6)]
+    pole = loft(regular_polygon(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
+    return join_solids(
+        [
+            pole,
+            box(1.6, 0.1, 0.1).translated(0.8, 0, 6.1),
+            box(0.7, 0.3, 0.15).translated(1.6, 0, 6),
+        ]
     )
 
 
-def joined(solids: Iterable[Solid]) -> Solid:
+def join_solids(solids: Iterable[Solid]) -> Solid:
     """Return a solid of several solids.
 
     Touching or overlapping parts keep their surfaces.
@@ -238,7 +247,7 @@ def rectangle(width: float, depth: float) -> Floats:
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
 
 
-def regular(sides: int, radius: float) -> Floats:
+def regular_polygon(sides: int, radius: float) -> Floats:
     """Return the outline of a regular polygon around zero: (sides, 2)."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -259,9 +268,9 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
     ridge = [[hip - x, 0, rise], [x - hip, 0, rise]]
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], *ridge]
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
-    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).moved(z=eaves)
+    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).translated(z=eaves)
 
 
-def lying(solid: Solid) -> Solid:
+def lay_down(solid: Solid) -> Solid:
     """Return a solid laid down: z becomes y, and y becomes z."""
     return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])

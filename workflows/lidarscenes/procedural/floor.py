@@ -13,7 +13,7 @@ SLAB_M = 0.5
 FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 
 
-def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
+def floor_and_ceiling(scene: Scene, x: float, y: float) -> tuple[float, float]:
     """Return the heights of the floor and the ceiling at a position, world coordinates, meters.
 
     The floor is the lowest triangle at the position if it faces up, like ground, or the top of the
@@ -28,13 +28,13 @@ def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
     return float(floor + scene.origin[2]), float(ceiling + scene.origin[2])
 
 
-def heights_at(scene: Scene, x: float, y: float) -> Floats:
+def surface_heights(scene: Scene, x: float, y: float) -> Floats:
     """Return the heights (k,), world meters, at which a vertical line at x, y crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
-def triangles_reaching(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
+def triangles_in_box(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
     """Return the triangles that may reach into a box: (k,).
 
     The box is from `lower` to `upper`, local coordinates (3,), or (2,) for any height.
@@ -56,7 +56,7 @@ def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
     The line is at a local position (2,); the mask (k,) is true for triangles that face up.
     """
     a, b, c = np.moveaxis(
-        scene.vertices[scene.faces[triangles_reaching(scene, position, position)]], 1, 0
+        scene.vertices[scene.faces[triangles_in_box(scene, position, position)]], 1, 0
     )
     # Twice the areas of the triangles of the position with each side, seen from above.
     parts = np.stack([_areas(p, q, position) for p, q in ((b, c), (c, a), (a, b))], axis=1)

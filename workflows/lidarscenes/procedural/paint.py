@@ -36,7 +36,7 @@ _FLAT = 0.98  # minimum of level roofs
 _STEEP = 0.65  # maximum of rock
 
 
-def painted(scene: Scene) -> Scene:
+def paint_scene(scene: Scene) -> Scene:
     """Return a scene of `city` or `terrain` with plain colors, by the names of its objects."""
     numbered = [name.rpartition("-") for name in scene.names]
     kinds = [kind or name for kind, _, name in numbered]

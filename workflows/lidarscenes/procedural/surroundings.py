@@ -12,7 +12,7 @@ from lidarsim.base.arrays import Bools, Floats
 from lidarsim.scene.scene import Scene
 from raybeam import RayCaster, available_backends
 
-from .floor import triangles_reaching
+from .floor import triangles_in_box
 
 RAYS = 1000  # rays of each position, and of the outside
 HAND_M = 0.1  # surfaces nearer than this are in the way
@@ -49,14 +49,14 @@ _STEPS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0
 _DIRECTIONS = 16
 
 
-def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
+def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
     """Return whether a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
     points = np.asarray(positions, np.float64).reshape(-1, 3)
-    nearby = triangles_reaching(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
+    nearby = triangles_in_box(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
     if not len(nearby):
         return False
     caster = RayCaster(scene.vertices, scene.faces[nearby], "numpy")
-    directions = np.tile(directions_around(RAYS), (len(points), 1))
+    directions = np.tile(sphere_directions(RAYS), (len(points), 1))
     return bool(caster.cast(np.repeat(points, RAYS, axis=0), directions, t_max=CLEAR_M).hit.any())
 
 
@@ -76,14 +76,14 @@ class Views:
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
-    def in_a_body(self) -> bool:
+    def is_inside_body(self) -> bool:
         """Whether surfaces are around, with only their backs visible."""
         enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
         return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class EnclosingBody:
     """The object around a position."""
 
     name: str
@@ -91,7 +91,7 @@ class Body:
     is_whole_scene: bool  # whether the scene has hardly anything else
 
 
-class Surroundings:
+class PlacementChecker:
     """Caster of a few thousand rays around positions in a scene without actors."""
 
     def __init__(self, scene: Scene) -> None:
@@ -100,17 +100,17 @@ class Surroundings:
         backend = "numpy" if available_backends()["tiles"] else "tiles"
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
-    def views(self, positions: ArrayLike) -> Views:
+    def cast_around(self, positions: ArrayLike) -> Views:
         """Return the views in all directions from local positions (k, 3)."""
         points = np.asarray(positions, np.float64).reshape(-1, 3)
-        directions = directions_around(RAYS)
+        directions = sphere_directions(RAYS)
         return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
 
-    def outside(self) -> Views:
+    def cast_from_outside(self) -> Views:
         """Return the views of the scene from outside, from all directions."""
         lower, upper = self._scene.bounds
         across = float(np.linalg.norm(upper - lower))
-        towards = -directions_around(RAYS)
+        towards = -sphere_directions(RAYS)
         # Parallel rays would meet thin objects seldom: aim at a grid of points in the box.
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
         return self.cast(lower + shares * (upper - lower) - 2 * across * towards, towards)
@@ -127,7 +127,7 @@ class Surroundings:
         above = np.mean(views.hit[~down])
         if below < _GROUND and above < _GROUND:
             return True
-        outside = self.outside()
+        outside = self.cast_from_outside()
         back = np.mean(outside.back[outside.hit])
         if back > 1 - _CLOSED:
             # A terrain from below, or the walls of a room. Of leaves and surfels, half are seen
@@ -140,37 +140,37 @@ class Surroundings:
             return not (ground and (above < _SKY or _has_floor(views)))
         return not self._is_room(views)
 
-    def in_a_body(self, position: ArrayLike) -> bool:
+    def is_inside_body(self, position: ArrayLike) -> bool:
         """Return whether a local position (3,) is inside a closed body that is not a room.
 
         A body that stands on the ground may lack a bottom.
         """
-        views = self.views(position)
+        views = self.cast_around(position)
         hit_points = views.distance[views.hit, None] * views.directions[views.hit]
         sides = np.ptp(hit_points, axis=0) if len(hit_points) else np.zeros(3)
         spans = bool((sides >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
-        if views.in_a_body:
+        if views.is_inside_body:
             return not (spans and self._is_room(views))
         raised = views.directions[:, 2] > _RAISED
         closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
-    def body_around(self, position: ArrayLike) -> Body:
+    def find_enclosing_body(self, position: ArrayLike) -> EnclosingBody:
         """Return the object whose surfaces the most directions from a local position (3,) meet.
 
         The position must see a surface.
         """
         points = np.tile(np.asarray(position, np.float64).reshape(3), (RAYS, 1))
-        hits = self._caster.cast(points, directions_around(RAYS))
+        hits = self._caster.cast(points, sphere_directions(RAYS))
         owner = int(np.bincount(self._scene.face_object[hits.triangle[hits.hit]]).argmax())
         faces = self._scene.faces[self._scene.face_object == owner]
         corners = self._scene.vertices[faces].reshape(-1, 3)
         bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
         sides = np.ptp(bounds, axis=0)
         whole = bool((sides >= _WHOLE * np.ptp(self._scene.bounds, axis=0)).all())
-        return Body(self._scene.names[owner], bounds, is_whole_scene=whole)
+        return EnclosingBody(self._scene.names[owner], bounds, is_whole_scene=whole)
 
-    def free_position(self, position: ArrayLike) -> Floats | None:
+    def find_free_position(self, position: ArrayLike) -> Floats | None:
         """Return the nearest free position (3,) of a grid around a local position, or None.
 
         The grid is level and within the scene. At a free position, the ground or a floor is
@@ -187,12 +187,12 @@ class Surroundings:
 
     def is_free(self, position: ArrayLike) -> bool:
         """Return whether a local position (3,) has ground below and no surfaces around or close."""
-        views = self.views(position)
+        views = self.cast_around(position)
         below = np.mean((views.hit & ~views.back)[views.directions[:, 2] < 0])
         return bool(
             below >= _GROUND
             and views.distance.min() >= CLEAR_M
-            and not self.in_a_body(position)
+            and not self.is_inside_body(position)
             and not self.is_covered(position)
         )
 
@@ -202,7 +202,7 @@ class Surroundings:
         Under ground without thickness, backs are above. Under other objects, such as a bridge, the
         position is lower than the scene, and objects are above in almost all directions.
         """
-        views = self.views(position)
+        views = self.cast_around(position)
         up = views.directions[:, 2]
         hits = np.isfinite(views.distance)
         if hits[up < _DOWNWARD].any():
@@ -270,7 +270,7 @@ def _openness(scene: Scene) -> float:
     return float(np.linalg.norm(total)) / max(area, 1e-300)
 
 
-def directions_around(count: int) -> Floats:
+def sphere_directions(count: int) -> Floats:
     """Return unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count

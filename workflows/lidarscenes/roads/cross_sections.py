@@ -34,7 +34,7 @@ _TWIST_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # across a cell, where the error of i
 
 
 @dataclass(frozen=True, eq=False)
-class Stations:
+class RoadStations:
     """Stations on a road.
 
     Attributes
@@ -49,29 +49,29 @@ class Stations:
     pieces: Floats
 
     @classmethod
-    def at(cls, distances: Floats) -> Stations:
+    def at(cls, distances: Floats) -> RoadStations:
         """Return stations at distances (k,), each after the steps there."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
         return len(self.s)
 
-    def take(self, station_selection: AnyArray | slice) -> Stations:
+    def select(self, station_selection: AnyArray | slice) -> RoadStations:
         """Return selected stations."""
-        return Stations(self.s[station_selection], self.pieces[station_selection])
+        return RoadStations(self.s[station_selection], self.pieces[station_selection])
 
 
-class Samples(NamedTuple):
+class SurfaceSamples(NamedTuple):
     """Stations at which a surface is measured, and the intervals that these belong to."""
 
     intervals: Intervals
-    stations: Stations
+    stations: RoadStations
 
 
 class PlacedStations(NamedTuple):
     """The stations of a surface."""
 
-    stations: Stations
+    stations: RoadStations
     steps: Ints  # (j,): stations that the next follows at the same distance, after a step
 
 
@@ -131,15 +131,15 @@ class Intervals:
             has_lead=True,
         )
 
-    def sampled(self, *, are_planes: bool) -> Samples:
+    def sampled(self, *, are_planes: bool) -> SurfaceSamples:
         """Return stations that measure the surface, in intervals that may be shorter.
 
         Of planes two samples in an interval show their steps.
         """
         if are_planes:
-            return Samples(self, self.samples(2))
+            return SurfaceSamples(self, self.samples(2))
         intervals = self._cut()
-        return Samples(intervals, intervals.samples(SAMPLES))
+        return SurfaceSamples(intervals, intervals.samples(SAMPLES))
 
     def _cut(self) -> Intervals:
         """Return shorter intervals, whose samples show curvatures that change along the road."""
@@ -163,7 +163,7 @@ class Intervals:
     def __len__(self) -> int:
         return len(self.ends)
 
-    def samples(self, count: int) -> Stations:
+    def samples(self, count: int) -> RoadStations:
         """Return stations of each interval, (n * count,), from its start to its stop."""
         starts = self.ends[:, :1]
         s = starts + (self.ends[:, 1:] - starts) * np.linspace(0, 1, count)
@@ -171,7 +171,7 @@ class Intervals:
         pieces = s.copy()
         pieces[:, 0] = self.pieces[:, 0]
         pieces[:, -1] = self.pieces[:, 1]
-        return Stations(s.ravel(), pieces.ravel())
+        return RoadStations(s.ravel(), pieces.ravel())
 
     def placed(self, counts: Ints, steps: Bools) -> PlacedStations:
         """Return stations that divide each interval into a number of parts.
@@ -196,7 +196,7 @@ class Intervals:
         s[is_stop] = self.ends[interval_indices[is_stop], 1]
         pieces = np.where(within == 0, self.pieces[interval_indices, 0], s)
         pieces[is_stop] = self.pieces[interval_indices[is_stop], 1]
-        return PlacedStations(Stations(s, pieces), np.flatnonzero(is_stop)[:-1])
+        return PlacedStations(RoadStations(s, pieces), np.flatnonzero(is_stop)[:-1])
 
 
 class SampledSurface(NamedTuple):
@@ -237,7 +237,7 @@ class SampledSurface(NamedTuple):
             )
 
 
-def placed_stations(
+def place_stations(
     surfaces: Sequence[SampledSurface], sag_m: float, allowance: Allowance, bytes_per_point: int
 ) -> list[PlacedStations]:
     """Return the stations of surfaces whose triangles are within a tolerance.
@@ -295,7 +295,7 @@ def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats
         return []
     points = np.concatenate([surface.points.reshape(-1, SAMPLES, 3) for surface in surfaces])
     x, y, z = np.moveaxis(points, -1, 0)
-    columns = _Columns.of(surfaces)
+    columns = _Columns.from_surfaces(surfaces)
     beside, heights = _bend_errors(x, y, z, columns)
     twist = _twist_errors(x, y, z, columns)
     in_plan = np.sqrt(beside / (_MARGIN * sag_m))
@@ -316,7 +316,7 @@ class _Columns(NamedTuple):
     left: Ints  # (q,): columns on the left of cells
 
     @classmethod
-    def of(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
+    def from_surfaces(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
         """Return the columns of surfaces."""
         intervals = []
         right = []

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
 
-from .cross_sections import Stations
-from .elements import number
+from .cross_sections import RoadStations
+from .elements import read_number
 
 
 class Cubics:
@@ -39,15 +39,15 @@ class Cubics:
     def read(cls, elements: Iterable[Element], start: str = "s", origin: float = 0.0) -> Cubics:
         """Return the polynomials of elements, whose starts are relative to an origin."""
         rows = [
-            (origin + number(e, start, 0.0), *(number(e, name, 0.0) for name in "abcd"))
+            (origin + read_number(e, start, 0.0), *(read_number(e, name, 0.0) for name in "abcd"))
             for e in elements
         ]
-        return cls(rows) if rows else NOTHING
+        return cls(rows) if rows else NO_CUBICS
 
     def __len__(self) -> int:
         return len(self.starts)
 
-    def values(self, stations: Stations) -> Floats:
+    def values(self, stations: RoadStations) -> Floats:
         """Return the values at stations (k,)."""
         if not len(self):
             return np.zeros_like(stations.s)
@@ -58,7 +58,7 @@ class Cubics:
         x = np.maximum(stations.s - self.starts[row_indices], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
-    def slopes(self, stations: Stations) -> Floats:
+    def slopes(self, stations: RoadStations) -> Floats:
         """Return the first derivatives at stations (k,)."""
         if self.is_constant:
             return np.zeros_like(stations.s)
@@ -72,4 +72,4 @@ class Cubics:
         return np.maximum(np.searchsorted(self.starts, distances, "right") - 1, 0)
 
 
-NOTHING = Cubics()
+NO_CUBICS = Cubics()

@@ -15,7 +15,7 @@ MAX_SHOWN = 40  # letters of a value that an error shows
 _WITHOUT_GEOMETRY = {"userData", "dataQuality", "link", "validity", "vectorScene", "vectorRoad"}
 
 
-def number(element: Element, name: str, default: float | None = None) -> float:
+def read_number(element: Element, name: str, default: float | None = None) -> float:
     """Return a number of an element.
 
     Raises MeshFileError if it is missing without a default, or broken.
@@ -41,12 +41,12 @@ def number(element: Element, name: str, default: float | None = None) -> float:
     return value
 
 
-def positive(element: Element, name: str, default: float | None = None) -> float:
+def read_non_negative(element: Element, name: str, default: float | None = None) -> float:
     """Return a number of 0 or more of an element.
 
     Raises MeshFileError if it is negative.
     """
-    value = number(element, name, default)
+    value = read_number(element, name, default)
     if value < 0:
         raise MeshFileError(
             f"contains <{element.tag}> with {name} {value:g}, which must not be negative. "

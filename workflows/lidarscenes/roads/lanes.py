@@ -25,15 +25,15 @@ from .cross_sections import (
     SAMPLES,
     Intervals,
     PlacedStations,
+    RoadStations,
     SampledSurface,
-    Samples,
-    Stations,
+    SurfaceSamples,
     has_extent,
-    placed_stations,
+    place_stations,
 )
-from .cubics import NOTHING, Cubics
-from .elements import MAX_SHOWN, UnreadElements, number
-from .road import Frames, Network, Road
+from .cubics import NO_CUBICS, Cubics
+from .elements import MAX_SHOWN, UnreadElements, read_number
+from .road import Road, RoadFrames, RoadNetwork
 
 _ACROSS_SHARE = 0.3  # share of the tolerance of heights, for cross sections that are curved
 _KERB_M = 1e-3  # least height of a kerb
@@ -58,11 +58,11 @@ class Lane:
 
     def __init__(self, element: Element, start: float) -> None:
         self.element = element
-        self.number = int(number(element, "id"))
+        self.number = int(read_number(element, "id"))
         self.type = (element.get("type") or "none")[:MAX_SHOWN]
         self.level = element.get("level") in ("true", "1")
         self.widths = Cubics.read(element.iterfind("width"), "sOffset", start)
-        self.borders = NOTHING
+        self.borders = NO_CUBICS
         if not len(self.widths):
             self.borders = Cubics.read(element.iterfind("border"), "sOffset", start)
         heights = element.findall("height")
@@ -84,7 +84,7 @@ class Lane:
         """Whether the lane is above or below the road."""
         return len(self.inner_heights) > 0
 
-    def width(self, stations: Stations, inner_t: Floats, middle_t: Floats) -> Floats:
+    def width(self, stations: RoadStations, inner_t: Floats, middle_t: Floats) -> Floats:
         """Return the width (k,), negative as the file has it, m.
 
         `inner_t` and `middle_t` are t (k,) of the inner border and of the middle of the road, m.
@@ -97,12 +97,12 @@ class Lane:
 def _steps(elements: Sequence[Element], start: float, *names: str) -> Cubics:
     """Return constants, each valid to the start of the next, by the first name that exists."""
     if not elements:
-        return NOTHING
+        return NO_CUBICS
     rows = []
     for element in elements:
         name = next((name for name in names if element.get(name)), names[0])
-        s = start + number(element, "sOffset", 0.0)
-        rows.append((s, number(element, name, 0.0), 0.0, 0.0, 0.0))
+        s = start + read_number(element, "sOffset", 0.0)
+        rows.append((s, read_number(element, name, 0.0), 0.0, 0.0, 0.0))
     return Cubics(rows)
 
 
@@ -141,7 +141,7 @@ class LaneSection:
         """Lanes of both sides."""
         return [*self.lanes[1], *self.lanes[-1]]
 
-    def borders(self, road: Road, stations: Stations) -> dict[int, Floats]:
+    def borders(self, road: Road, stations: RoadStations) -> dict[int, Floats]:
         """Return t (k,) of the outer borders of lanes, and of the middle, {number of lane: t}."""
         return self._borders_and_widths(road, stations)[0]
 
@@ -159,7 +159,7 @@ class LaneSection:
             intervals = Intervals.between(start, stop, np.concatenate([breaks, crossings]))
         return intervals
 
-    def samples(self, network: Network, road: Road) -> Samples:
+    def samples(self, network: RoadNetwork, road: Road) -> SurfaceSamples:
         """Return the stations at which the surface of the section is measured."""
         intervals = self.intervals(road, self.start, self.stop).with_lead(road.breaks)
         are_planes = self.is_plain and road.is_plain and network.is_straight(road, intervals)
@@ -175,11 +175,11 @@ class LaneSection:
         )
 
     def _borders_and_widths(
-        self, road: Road, stations: Stations
+        self, road: Road, stations: RoadStations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
         """Return t (k,) of borders, and widths as the file has them, both by numbers of lanes."""
         # Where the section starts with a step of the road, the lanes of the section count.
-        stations = Stations(stations.s, np.maximum(stations.pieces, self.start))
+        stations = RoadStations(stations.s, np.maximum(stations.pieces, self.start))
         middle = road.lane_offset.values(stations)
         borders = {0: middle}
         widths = {}
@@ -200,7 +200,7 @@ class LaneSection:
         ):
             return kinks
 
-        def values(stations: Stations) -> Floats:
+        def values(stations: RoadStations) -> Floats:
             """Return widths and borders (v, k)."""
             borders, widths = self._borders_and_widths(road, stations)
             return np.stack([*widths.values(), *borders.values()])
@@ -225,7 +225,7 @@ class LaneSection:
         def is_above_at(distances: Floats) -> Bools:
             """Return whether each width or border is above its level at a distance."""
             pair_indices = np.arange(len(pairs))
-            return values(Stations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
+            return values(RoadStations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
 
         return _changes(is_above_at, s[:, :-1][tuple(cells)], s[:, 1:][tuple(cells)])
 
@@ -244,7 +244,7 @@ def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) 
 def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
     """Return the lane sections of a road that have a length."""
     elements = road.element.findall("lanes/laneSection")
-    starts = [number(element, "s", 0.0) for element in elements]
+    starts = [read_number(element, "s", 0.0) for element in elements]
     order = sorted(range(len(starts)), key=starts.__getitem__)
     stops = [*(min(starts[k], road.length) for k in order), road.length][1:]
     return [
@@ -255,7 +255,7 @@ def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
 
 
 def section_surfaces(
-    network: Network,
+    network: RoadNetwork,
     sections: Sequence[tuple[Road, LaneSection]],
     sag_m: float,
     allowance: Allowance,
@@ -274,7 +274,11 @@ def section_surfaces(
         stops = np.cumsum([len(entry.stations) for entry in placed]).tolist()
         return [
             SectionSurface(
-                *pair, entry, frames.take(slice(stop - len(entry.stations), stop)), sag_m, allowance
+                *pair,
+                entry,
+                frames.select(slice(stop - len(entry.stations), stop)),
+                sag_m,
+                allowance,
             )
             for pair, entry, stop in zip(pairs, placed, stops, strict=True)
         ]
@@ -287,7 +291,7 @@ def section_surfaces(
     surfaces = surfaces_at(
         range(len(sections)), [PlacedStations(entry.stations, no_steps) for entry in samples]
     )
-    placed = placed_stations(
+    placed = place_stations(
         [
             surface.sampled(entry.intervals)
             for surface, entry in zip(surfaces, samples, strict=True)
@@ -370,7 +374,7 @@ class SectionSurface:
         road: Road,
         section: LaneSection,
         placed: PlacedStations,
-        frames: Frames,
+        frames: RoadFrames,
         sag_m: float,
         allowance: Allowance,
     ) -> None:
@@ -418,7 +422,7 @@ class SectionSurface:
             return None
         surface = copy(self)
         surface.stations, surface.steps = placed
-        surface.frames = self.frames.take(station_indices)
+        surface.frames = self.frames.select(station_indices)
         surface.borders = {key: t[station_indices] for key, t in self.borders.items()}
         surface.strips = [
             Strip(

@@ -32,11 +32,11 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .elements import UnreadElements, number
+from .elements import UnreadElements, read_number
 from .lanes import Lane, SectionSurface, lane_sections, section_surfaces
-from .road import Network, Road
+from .road import Road, RoadNetwork
 from .road_marks import painted_quads
-from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, color_of, material_of_lane
+from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, lane_material, material_color
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
@@ -77,7 +77,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
             f"is an XML file, but not an OpenDRIVE file. Its root element is <{root.tag[:40]}>"
         )
     header = root.find("header")
-    if header is not None and number(header, "revMajor", 1.0) > 1:
+    if header is not None and read_number(header, "revMajor", 1.0) > 1:
         raise MeshFileError(
             f"uses OpenDRIVE {header.get('revMajor')}, but only versions 1.4 to 1.8 are supported"
         )
@@ -87,7 +87,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
         unread.check(junction, _KNOWN_OF_JUNCTIONS)
     allowance = Allowance(len(data), _SMALLER)
     reader = _RoadReader(options, allowance, unread)
-    network = Network(root.findall("road"), allowance, unread)
+    network = RoadNetwork(root.findall("road"), allowance, unread)
     content = Content(reader.meshes(network))
     content.unit_m = 1.0
     content.up_axis = "z"
@@ -108,7 +108,7 @@ class _RoadReader:
         own: RoadOptions = options.own
         self._sag_m = own.sag_m
 
-    def meshes(self, network: Network) -> list[SceneMesh]:
+    def meshes(self, network: RoadNetwork) -> list[SceneMesh]:
         """Return the meshes of all objects."""
         sections_of_roads = [lane_sections(road, self._unread) for road in network.roads]
         sections = [
@@ -154,7 +154,7 @@ class _RoadReader:
             return
         colors = None
         if self._options.colors:
-            colors = Colors.plain(color_of(piece.material), len(piece.faces))
+            colors = Colors.plain(material_color(piece.material), len(piece.faces))
         material = piece.material if self._options.materials else ""
         self._pieces[name].append(piece._replace(colors=colors, material=material))
 
@@ -188,7 +188,7 @@ class _RoadReader:
 def _material(lane: Lane) -> str:
     """Return the material of a lane."""
     stated = lane.element.find("material")
-    return material_of_lane(lane.type, None if stated is None else stated.get("surface"))
+    return lane_material(lane.type, None if stated is None else stated.get("surface"))
 
 
 def _notes(
@@ -216,7 +216,7 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
     offset = header.find("offset")
     shift = [0.0] * 4
     if offset is not None:
-        shift = [number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
+        shift = [read_number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
     place = middle + shift[:2]  # a heading turns roads about their zero, which is near
     problem = scale_problem(f"EPSG:{epsg}" if epsg else text, *place.tolist()) if text else ""

@@ -21,7 +21,7 @@ from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import hypot
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-from .elements import number, positive
+from .elements import read_non_negative, read_number
 
 _MAX_TURN = 0.5  # rad of a piece of a clothoid
 _CUBIC_PIECES = 16  # pieces of a cubic geometry, each with separate stations
@@ -92,7 +92,7 @@ class PlanTable:
 
         The last geometry ends with the road, of `length` meters.
         """
-        starts = [positive(geometry, "s") for geometry in geometries]
+        starts = [read_non_negative(geometry, "s") for geometry in geometries]
         first = len(self._bends)
         for geometry, start, stop in zip(geometries, starts, [*starts[1:], length], strict=True):
             if stop - start > _LEAST_M:
@@ -164,17 +164,17 @@ class PlanTable:
                 f"contains <geometry> with {tags[:40]}; expected line, arc, spiral, poly3 or "
                 "paramPoly3"
             )
-        stated_length = positive(geometry, "length")
+        stated_length = read_non_negative(geometry, "length")
         if shape.tag in ("poly3", "paramPoly3"):
             self._add_cubic(geometry, shape, start, stated_length)
             return
         curvature = 0.0
         growth = 0.0
         if shape.tag == "arc":
-            curvature = number(shape, "curvature")
+            curvature = read_number(shape, "curvature")
         elif shape.tag == "spiral":
-            curvature = number(shape, "curvStart", 0.0)
-            growth = (number(shape, "curvEnd", 0.0) - curvature) / max(stated_length, _LEAST_M)
+            curvature = read_number(shape, "curvStart", 0.0)
+            growth = (read_number(shape, "curvEnd", 0.0) - curvature) / max(stated_length, _LEAST_M)
         self._add_clothoid(
             _Clothoid(start, *_origin(geometry), curvature=curvature, growth=growth), length
         )
@@ -237,7 +237,7 @@ _SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
 
 def _origin(geometry: Element) -> tuple[float, float, float]:
     """Return x, y and heading of the start of a geometry."""
-    return number(geometry, "x"), number(geometry, "y"), number(geometry, "hdg")
+    return read_number(geometry, "x"), read_number(geometry, "y"), read_number(geometry, "hdg")
 
 
 def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
@@ -283,10 +283,10 @@ def _coefficients(shape: Element) -> tuple[Floats, Floats]:
     """Return the coefficients (4,) of a cubic along the heading, and to the left."""
     if shape.tag == "poly3":
         u = [0.0, 1.0, 0.0, 0.0]
-        v = [number(shape, name, 0.0) for name in "abcd"]
+        v = [read_number(shape, name, 0.0) for name in "abcd"]
     else:
-        u = [number(shape, f"{name}U", 0.0) for name in "abcd"]
-        v = [number(shape, f"{name}V", 0.0) for name in "abcd"]
+        u = [read_number(shape, f"{name}U", 0.0) for name in "abcd"]
+        v = [read_number(shape, f"{name}V", 0.0) for name in "abcd"]
     return np.array(u), np.array(v)
 
 

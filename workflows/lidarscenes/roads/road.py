@@ -19,9 +19,9 @@ from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import length
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-from .cross_sections import GAP_M, Intervals, Stations
+from .cross_sections import GAP_M, Intervals, RoadStations
 from .cubics import Cubics
-from .elements import MAX_SHOWN, UnreadElements, number, positive
+from .elements import MAX_SHOWN, UnreadElements, read_non_negative, read_number
 from .plan_view import PlanTable
 
 _STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
@@ -36,7 +36,7 @@ _KNOWN = (
 )  # fmt: skip
 
 
-class Frames(NamedTuple):
+class RoadFrames(NamedTuple):
     """Frames of roads at stations: a point is origin + t * side + h * up."""
 
     origins: Floats  # (k, 3), m
@@ -45,9 +45,9 @@ class Frames(NamedTuple):
     up: Floats  # (k, 3): unit vectors, upright on both
     level_side: Floats  # (k, 3): horizontal unit vectors to the left
 
-    def take(self, station_selection: slice | Ints) -> Frames:
+    def select(self, station_selection: slice | Ints) -> RoadFrames:
         """Return the frames of selected stations."""
-        return Frames(*(array[station_selection] for array in self))
+        return RoadFrames(*(array[station_selection] for array in self))
 
 
 class Road:
@@ -64,7 +64,7 @@ class Road:
     def __init__(self, element: Element, unread: UnreadElements) -> None:
         self.element = element
         self.name = (element.get("id") or "")[:MAX_SHOWN]
-        self.length = positive(element, "length")
+        self.length = read_non_negative(element, "length")
         if self.length > MAX_ROAD_M:
             raise MeshFileError(
                 f"contains the road {self.name!r} with a length of {self.length:g} m, which "
@@ -100,9 +100,9 @@ class Road:
         geometries = self.element.findall("planView/geometry")
         if not geometries:
             raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
-        geometries.sort(key=lambda geometry: number(geometry, "s"))
+        geometries.sort(key=lambda geometry: read_number(geometry, "s"))
         last = geometries[-1]
-        end = positive(last, "s") + positive(last, "length")
+        end = read_non_negative(last, "s") + read_non_negative(last, "length")
         if self.length - end > _MAX_MISSING * self.length:
             raise MeshFileError(
                 f"contains the road {self.name!r} with a length of {self.length:,.9g} m, but its "
@@ -143,7 +143,7 @@ class Road:
             starts.append(self.shapes.stations)
         return np.concatenate(starts)
 
-    def heights(self, stations: Stations, t: Floats, pieces: Floats | None = None) -> Floats:
+    def heights(self, stations: RoadStations, t: Floats, pieces: Floats | None = None) -> Floats:
         """Return heights above the banked plane of crossfall and shapes, for t (..., k), m.
 
         `pieces` are t (..., k) in whose cubics of shapes the heights are; `t` itself if None.
@@ -193,8 +193,8 @@ class LateralShapes:
     def __init__(self, elements: Sequence[Element]) -> None:
         groups: dict[float, list[list[float]]] = {}
         for element in elements:
-            row = [number(element, name, 0.0) for name in ("t", *"abcd")]
-            groups.setdefault(number(element, "s"), []).append(row)
+            row = [read_number(element, name, 0.0) for name in ("t", *"abcd")]
+            groups.setdefault(read_number(element, "s"), []).append(row)
         self.stations: Floats = np.array(sorted(groups))  # (m,)
         # Cubics of each station in ascending order; those that lack are never reached.
         count = max(map(len, groups.values()))
@@ -260,7 +260,7 @@ class LateralShapes:
         return np.asarray(((d * x + c) * x + b) * x + a)
 
 
-class Network:
+class RoadNetwork:
     """The roads of a file, and their reference lines in one table.
 
     Parameters
@@ -286,11 +286,11 @@ class Network:
         ends = road.offset + intervals.ends
         return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
-    def frames(self, roads: Sequence[Road], stations: Sequence[Stations]) -> Frames:
+    def frames(self, roads: Sequence[Road], stations: Sequence[RoadStations]) -> RoadFrames:
         """Return the frames of roads at stations (k,) of each, one after another."""
         pairs = [*zip(roads, stations, strict=True)]
         if not pairs:
-            return Frames(*np.zeros((5, 0, 3)))
+            return RoadFrames(*np.zeros((5, 0, 3)))
         points = self._table.points(
             np.concatenate([road.offset + at.s for road, at in pairs]),
             np.concatenate([road.offset + at.pieces for road, at in pairs]),
@@ -305,12 +305,12 @@ class Network:
         level_side = np.stack([-points.sines, points.cosines, zero], axis=1)
         upright = np.cross(along, level_side)
         if not roll.any():
-            return Frames(origins, along, level_side, upright, level_side)
+            return RoadFrames(origins, along, level_side, upright, level_side)
         sines, cosines = (values[:, None] for values in sin_cos(roll))
         side = level_side * cosines + upright * sines
-        return Frames(origins, along, side, upright * cosines - level_side * sines, level_side)
+        return RoadFrames(origins, along, side, upright * cosines - level_side * sines, level_side)
 
     def point(self, road: Road, s: float, t: float, h: float = 0.0) -> Floats:
         """Return the point (3,) of a road at a distance, at t and a height above its plane."""
-        frames = self.frames([road], [Stations.at(np.array([s]))])
+        frames = self.frames([road], [RoadStations.at(np.array([s]))])
         return np.asarray(frames.origins[0] + t * frames.side[0] + h * frames.up[0])

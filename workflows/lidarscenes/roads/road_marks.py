@@ -12,7 +12,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 
 from .cross_sections import GAP_M
-from .elements import UnreadElements, number, positive
+from .elements import UnreadElements, read_non_negative, read_number
 from .lanes import Lane, SectionSurface
 
 LIFT_M = 0.003  # height of marks above the road: thickness of thermoplastic marks
@@ -186,7 +186,7 @@ def _lines_of(
     marks = lane.element.findall("roadMark")
     if all(mark.get("type", "none") in _UNPAINTED for mark in marks):
         return
-    starts = [start + number(mark, "sOffset", 0.0) for mark in marks]
+    starts = [start + read_number(mark, "sOffset", 0.0) for mark in marks]
     order = sorted(range(len(marks)), key=starts.__getitem__)
     stops = [*(min(starts[k], stop) for k in order), stop][1:]
     for k, mark_stop in zip(order, stops, strict=True):
@@ -202,13 +202,13 @@ def _lines_of_mark(
 ) -> list[_Line]:
     """Return the lines of a mark: explicit lines, the lines of its type, or lines by its name."""
     color = _color(mark, "white")
-    width = positive(mark, "width", 0.0) or WIDTH_M
+    width = read_non_negative(mark, "width", 0.0) or WIDTH_M
     explicit = mark.findall("explicit/line")
     if explicit:
         return [_explicit_line(line, start, stop, width, color) for line in explicit]
     typed = mark.find("type")
     if typed is not None and typed.find("line") is not None:
-        width = positive(typed, "width", 0.0) or width
+        width = read_non_negative(typed, "width", 0.0) or width
         return [
             _typed_line(line, start, stop, width, color, allowance)
             for line in typed.iterfind("line")
@@ -234,14 +234,14 @@ def _lines_of_mark(
 
 def _explicit_line(line: Element, start: float, stop: float, width: float, color: str) -> _Line:
     """Return a single line of a mark."""
-    first = start + number(line, "sOffset", 0.0)
-    last = min(first + positive(line, "length", 0.0), stop)
+    first = start + read_number(line, "sOffset", 0.0)
+    last = min(first + read_non_negative(line, "length", 0.0), stop)
     starts = np.array([first] if last > first else [])
     return _Line(
         starts,
         np.array([last] if last > first else []),
-        number(line, "tOffset", 0.0),
-        positive(line, "width", 0.0) or width,
+        read_number(line, "tOffset", 0.0),
+        read_non_negative(line, "width", 0.0) or width,
         color,
     )
 
@@ -250,14 +250,18 @@ def _typed_line(
     line: Element, start: float, stop: float, width: float, color: str, allowance: Allowance
 ) -> _Line:
     """Return a line of the type of a mark, which repeats its length and space."""
-    first = start + max(0.0, number(line, "sOffset", 0.0))
+    first = start + max(0.0, read_number(line, "sOffset", 0.0))
     dashes = _dashes(
-        first, stop, positive(line, "length", 0.0), positive(line, "space", 0.0), allowance
+        first,
+        stop,
+        read_non_negative(line, "length", 0.0),
+        read_non_negative(line, "space", 0.0),
+        allowance,
     )
     return _Line(
         *dashes,
-        number(line, "tOffset", 0.0),
-        positive(line, "width", 0.0) or width,
+        read_number(line, "tOffset", 0.0),
+        read_non_negative(line, "width", 0.0) or width,
         _color(line, color),
     )
 

@@ -118,12 +118,12 @@ CLASSES = {
 
 
 @cache
-def color_of(material: str) -> Bytes:
+def material_color(material: str) -> Bytes:
     """Return the sRGB color (1, 1, 3) of a material."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 
-def material_of_lane(lane_type: str, surface: str | None) -> str:
+def lane_material(lane_type: str, surface: str | None) -> str:
     """Return the material of a lane by its type, or by the surface that it states."""
     for word, material in _SURFACES.items():
         if surface and word in surface.lower():
@@ -131,6 +131,6 @@ def material_of_lane(lane_type: str, surface: str | None) -> str:
     return _LANES.get(lane_type, ASPHALT)
 
 
-def material_of_object(object_type: str) -> str:
+def object_material(object_type: str) -> str:
     """Return the material of an object by its type."""
     return _OBJECTS.get(object_type, CONCRETE)

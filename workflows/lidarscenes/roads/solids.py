@@ -25,7 +25,7 @@ FRONT_FACES = slice(10, 12)  # triangles of a box that face along x
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 
 
-def rotation(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
+def rotation_matrix(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
     """Return the matrix (3, 3) of a rotation about x by roll, y by pitch and z by heading, rad."""
     (sh, sp, sr), (ch, cp, cr) = (
         values.tolist() for values in sin_cos(np.array([heading, pitch, roll]))
@@ -36,7 +36,7 @@ def rotation(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
     return matmul(matmul(about_z, about_y), about_x)
 
 
-def placed(points: Floats, origin: Floats, turn: Floats) -> Floats:
+def transform_points(points: Floats, origin: Floats, turn: Floats) -> Floats:
     """Return points (n, 3) rotated by a matrix and moved to an origin."""
     return np.asarray(applied(turn, points) + origin)
 
@@ -44,7 +44,7 @@ def placed(points: Floats, origin: Floats, turn: Floats) -> Floats:
 def box(size: ArrayLike, origin: Floats, turn: Floats, material: str) -> Piece:
     """Return a rotated box of the given size whose bottom face is centered at `origin`."""
     size = np.maximum(size, MIN_SIZE_M)
-    return Piece(placed(_CORNERS * size, origin, turn), _BOX, material=material)
+    return Piece(transform_points(_CORNERS * size, origin, turn), _BOX, material=material)
 
 
 def cylinder(
@@ -56,7 +56,7 @@ def cylinder(
     sines, cosines = sin_cos(2 * np.pi * np.arange(count) / count)
     ring = np.stack([radius * cosines, radius * sines, np.zeros(count)], axis=1)
     up = np.array([0, 0, height])
-    points = placed(np.concatenate([ring, ring + up]), origin, turn)
+    points = transform_points(np.concatenate([ring, ring + up]), origin, turn)
     lower = np.arange(count)
     following = (lower + 1) % count
     walls = _walls(lower, following, count)
@@ -101,7 +101,7 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
     return Piece(points, triangles, material=material)
 
 
-def extruded(sections: Floats, material: str, *, capped: bool = True) -> Piece:
+def extrude_sections(sections: Floats, material: str, *, capped: bool = True) -> Piece:
     """Return the surface through cross sections (k, c, 3), each a ring of corners, with ends."""
     count, corners, _ = sections.shape
     numbers = np.arange(count * corners).reshape(count, corners)
@@ -120,7 +120,7 @@ def extruded(sections: Floats, material: str, *, capped: bool = True) -> Piece:
     return Piece(sections.reshape(-1, 3), faces, material=material)
 
 
-def joined(pieces: Sequence[Piece]) -> Piece:
+def merge_pieces(pieces: Sequence[Piece]) -> Piece:
     """Return pieces of a material as one."""
     counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     return Piece(
@@ -142,7 +142,7 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
     return Piece(points, faces, material=material)
 
 
-def zebra(ring: Floats, stripe_m: float, material: str) -> Piece:
+def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
     """Return stripes and gaps across the longest side of a convex, level outline (n, 3)."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring

@@ -288,7 +288,7 @@ class Robot:
         times = table.pop("time_s", np.zeros(1))
         self._check_table(times, table)
         self._add_missing(table, len(times))
-        self._tell_limits(table, tell)
+        self._report_limits(table, tell)
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
@@ -329,7 +329,7 @@ class Robot:
                 mimicked, factor, offset = joint.mimic
                 table[joint.name] = factor * table[mimicked] + offset
 
-    def _tell_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
+    def _report_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
         """Tell of the joints whose values are beyond their limits."""
         for name, joint in self._moving_joints().items():
             lower, upper = joint.limits or (-np.inf, np.inf)
@@ -446,7 +446,7 @@ class LinkPath:
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            motion = motion.transformed(hinge.before).through(hinge, value)
+            motion = motion.transformed(hinge.before).after_hinge(hinge, value)
         motion = motion.transformed(self.last)
         return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
@@ -468,10 +468,10 @@ class LinkPath:
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            at_hinge = motion.transformed(hinge.before).anchored()
-            driven = at_hinge.driven(hinge, self._slopes(hinge, moments_s))
-            motion = driven.through(hinge, value)
-        motion = motion.transformed(self.last).anchored()
+            at_hinge = motion.transformed(hinge.before).at_origin()
+            driven = at_hinge.with_hinge_velocity(hinge, self._slopes(hinge, moments_s))
+            motion = driven.after_hinge(hinge, value)
+        motion = motion.transformed(self.last).at_origin()
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
@@ -531,20 +531,20 @@ class _LinkMotion(NamedTuple):
         moved = _product(self.rotations, matrix[:3, :, None])
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
 
-    def anchored(self) -> _LinkMotion:
+    def at_origin(self) -> _LinkMotion:
         """Return the motion with the velocities of the frame's origin."""
         levers = self.positions - self.anchors
         moved = self.velocities + np.cross(self.rates, levers, axis=0)
         return self._replace(anchors=self.positions, velocities=moved)
 
-    def driven(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
+    def with_hinge_velocity(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
         """Return the motion with the velocity of a hinge, whose value changes by `slopes` (k,)."""
         added = _product(self.rotations, hinge.axis[:, None, None] * slopes)[:, 0]
         if hinge.slides:
             return self._replace(velocities=self.velocities + added)
         return self._replace(rates=self.rates + added)
 
-    def through(self, hinge: Hinge, value: Floats) -> _LinkMotion:
+    def after_hinge(self, hinge: Hinge, value: Floats) -> _LinkMotion:
         """Return the motion with the poses behind a hinge with values (k,)."""
         if hinge.slides:
             slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]

@@ -109,9 +109,9 @@ def load_robot(
         meshes = {}
         for link in order:
             with prefixed(f"link {link!r}"):
-                if parts := list(reader.meshes_of(link, links[link])):
+                if parts := list(reader.link_meshes(link, links[link])):
                     meshes[link] = join_meshes(link, parts)
-        reader.tell_left_out()
+        reader.report_skipped_links()
         if not meshes:
             raise LidarError("no link has a <visual> with triangles.")
     return Robot(name, tuple(order), {link: joints[link] for link in order[1:]}, meshes)
@@ -316,7 +316,7 @@ class _LinkMeshes:
         self._folders_above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
         self._package = next(filter(_is_package, self._folders_above), folder)
 
-    def meshes_of(self, link: str, element: Element) -> Iterator[SceneMesh]:
+    def link_meshes(self, link: str, element: Element) -> Iterator[SceneMesh]:
         """Yield the meshes of a link, in the link's frame."""
         visuals = element.findall("visual")
         if not visuals and element.find("collision/geometry") is not None:
@@ -340,7 +340,7 @@ class _LinkMeshes:
                     mesh = replace(mesh, materials=_material(visual))
                 yield mesh
 
-    def tell_left_out(self) -> None:
+    def report_skipped_links(self) -> None:
         """Tell of the links that were left out."""
         for links, reason in (
             (self._collide, "have collision shapes but no visual shapes"),

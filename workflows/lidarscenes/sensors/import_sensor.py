@@ -13,8 +13,8 @@ from lidarsim.sensor_files import ray_npz
 from lidarsim.sensor_files.fired_rays import FiredRays
 from lidarsim.sensor_files.format_table import read_rays
 
-from ..writers.lidar_scenario import SCENARIO_FILE, clean
-from .omnilidar import ReadSensor, read_omnilidar
+from ..writers.lidar_scenario import SCENARIO_FILE, rounded
+from .omnilidar import ImportedSensor, read_omnilidar
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 ENDINGS = (".csv", ".npz", ".parquet", *USD_ENDINGS)
@@ -70,13 +70,13 @@ def _section(rays: FiredRays) -> dict[str, float | str]:
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}
     if min_range_m:
-        section["min_range_m"] = clean(min_range_m)
+        section["min_range_m"] = rounded(min_range_m)
     if isfinite(max_range_m):
-        section["max_range_m"] = clean(max_range_m)
+        section["max_range_m"] = rounded(max_range_m)
     return section
 
 
-def _read(path: Path) -> ReadSensor:
+def _read(path: Path) -> ImportedSensor:
     """Return the sensor of a file.
 
     Raises LidarError if the file cannot be used.
@@ -89,4 +89,4 @@ def _read(path: Path) -> ReadSensor:
         raise LidarError("it contains no rays with azimuths and elevations, or with directions.")
     channels = int(rays.channels.max()) + 1
     lost = [f"{channels} channels (a ray list has one channel)"] if channels > 1 else []
-    return ReadSensor(rays, lost)
+    return ImportedSensor(rays, lost)

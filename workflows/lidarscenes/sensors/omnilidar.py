@@ -26,7 +26,7 @@ from lidarsim.base.words import listed, printable
 from lidarsim.sensor.optics import Optics
 from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
 
-from ..files.child_process import Child
+from ..files.child_process import ReaderProcess
 from ..files.usd import USD_CORE_BYTES
 
 _SENSOR = "omni:sensor:"
@@ -59,7 +59,7 @@ _WITHOUT_EFFECT = {
 _AZIMUTH_TOLERANCE_DEG = 1e-4  # angles are float32
 
 
-class ReadSensor(NamedTuple):
+class ImportedSensor(NamedTuple):
     """A sensor of another program.
 
     Attributes
@@ -74,7 +74,7 @@ class ReadSensor(NamedTuple):
     left_out: list[str]
 
 
-def read_omnilidar(path: Path) -> ReadSensor:
+def read_omnilidar(path: Path) -> ImportedSensor:
     """Return the rays of the first OmniLidar prim of a file of OpenUSD.
 
     Raises
@@ -111,7 +111,7 @@ def _read_prim(path: Path) -> _Prim:
     Raises ValueError if the file has no such prim.
     """
     allowance = Allowance(check_input(path), "export it with fewer rays")
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("omnilidar_child.py"),
         "usd-core",
         memory_share() + USD_CORE_BYTES,
@@ -126,7 +126,7 @@ def _read_prim(path: Path) -> _Prim:
     return _Prim(frame["prims"], frame["values"], dict(zip(frame["names"], arrays, strict=True)))
 
 
-def _sensor(prim: _Prim) -> ReadSensor:
+def _sensor(prim: _Prim) -> ImportedSensor:
     """Return the rays of a prim.
 
     Raises ValueError if its attributes make no pattern.
@@ -149,7 +149,7 @@ def _sensor(prim: _Prim) -> ReadSensor:
         range_m=(prim.number("nearRangeM", 0.0), prim.number("farRangeM", np.inf)),
         name=str(prim.values.get("omni:sensor:modelName", "")) or "OmniLidar",
     )
-    return ReadSensor(rays, [*_left_out(prim, states, kind)])
+    return ImportedSensor(rays, [*_left_out(prim, states, kind)])
 
 
 class _State(NamedTuple):

@@ -29,7 +29,7 @@ _NEAREST = 9728  # filter of textures
 _TYPES = {"f": 5126, "u": 5125}  # {kind of NumPy type: component type}
 
 
-def glb_of(scene: Scene) -> bytes:
+def encode_glb(scene: Scene) -> bytes:
     """Return a .glb file with all objects of a scene but the actors, in meters, Y-up.
 
     Nodes have the scene's origin, in double precision, so that scenes far from zero lose no digits.

@@ -135,8 +135,8 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
         sensors[name] = {
             "model": files.name_of(lidar),
             "step_deg": 360,
-            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": clean(max_range_m)} if math.isfinite(max_range_m) else {}),
+            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": rounded(max_range_m)} if math.isfinite(max_range_m) else {}),
             "mount": _pose(mount),
             **({"unseen": list(lidar.unseen)} if lidar.unseen else {}),
         }
@@ -147,9 +147,9 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
 def _pose(matrix: Floats) -> dict[str, Any]:
     """Return the pose of a matrix (4, 4) as a scenario has it."""
     pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
-    angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+    angles = {name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
     return {
-        "position": [clean(value) for value in matrix[:3, 3].tolist()],
+        "position": [rounded(value) for value in matrix[:3, 3].tolist()],
         **{name: angle for name, angle in angles.items() if angle},
     }
 
@@ -187,7 +187,7 @@ def _dumped(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def clean(value: float) -> float:
+def rounded(value: float) -> float:
     """Return a number for a file, rounded to 12 digits.
 
     Roundings of zero are zero.

@@ -19,7 +19,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import stacked
 from lidarsim.scene.simplified import SimplifiedScene
 
-from .glb_file import glb_of
+from .glb_file import encode_glb
 
 SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -91,7 +91,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         comments = "".join(f"\ncomment {line}" for line in _comments(scene))
         return head + f"{comments}\n".encode() + tail.partition(b"\n")[2]
     if suffix == ".glb":
-        return glb_of(scene)
+        return encode_glb(scene)
     objects = trimesh.Scene()
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
         flat = [part.flat() if isinstance(part, SceneInstance) else part for part in parts]
