@@ -236,7 +236,7 @@ def test_a_card_seen_from_behind_is_no_body(far):
     surroundings = PlacementChecker(fence)
     views = surroundings.cast_around([[-far, 0, 1]])
     assert views.back[views.hit].all() and views.hit.any()
-    assert not surroundings.in_a_body([-far, 0, 1])
+    assert not surroundings.is_inside_body([-far, 0, 1])
 
 
 @pytest.mark.parametrize(

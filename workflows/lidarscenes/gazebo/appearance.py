@@ -1,4 +1,4 @@
-"""Colors and names of materials in SDFormat."""
+"""Read the colors and material names of SDFormat visuals."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Appearance(NamedTuple):
     color
         uint8 (1, 1, 3), sRGB; None without a color.
     material
-        Name of the material; empty without a name.
+        Name of the material, or an empty string.
     is_retro
-        Whether <laser_retro> gives the color, and takes precedence over images.
+        Whether the color comes from <laser_retro>, which takes precedence over images.
     is_hidden
-        Whether the visual is transparent altogether.
+        Whether the visual is fully transparent.
     """
 
     color: Bytes | None
@@ -61,7 +61,7 @@ class Appearance(NamedTuple):
 def read_appearance(shape: Element, retro: float) -> Appearance:
     """Return the appearance of a visual or collision.
 
-    `retro` is its <laser_retro>, 0 for none.
+    `retro` is its <laser_retro>, or 0 if there is none.
     """
     material = shape.find("material")
     hidden = child_numbers(shape, "transparency", 1, "0").item() >= 1

@@ -1,4 +1,4 @@
-"""Models of SDFormat as trees of bodies, with the frames that place links and nested models."""
+"""Read SDFormat models as trees of bodies, with frames that place links and nested models."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Link(NamedTuple):
 
 
 class PlacedModel(NamedTuple):
-    """Placement of a model in a world or in another model."""
+    """A model placed in a world or in another model."""
 
     name: str
     body: GazeboBody
@@ -57,18 +57,18 @@ class PlacedModel(NamedTuple):
 
 @dataclass(eq=False)
 class GazeboBody:
-    """A model, or a world, without its pose.
+    """The content of a model or a world, without its own pose.
 
-    Equal includes share a body.
+    Identical includes share a body.
 
     Attributes
     ----------
     frames
-        Frames of the model and of its nested models.
+        Frames of the model and its nested models.
     links
         Links of the model itself.
     children
-        Models in it.
+        Nested models.
     """
 
     frames: FrameGraph
@@ -77,22 +77,19 @@ class GazeboBody:
 
     @cached_property
     def size(self) -> int:
-        """Number of links and models in the model, at all depths."""
+        """Total number of links and nested models."""
         return len(self.links) + sum(1 + child.body.size for child in self.children)
 
 
 class _Included(NamedTuple):
-    """The content of a file of a model."""
+    """The model in a file that an <include> refers to."""
 
     element: Element  # its <model>
     source: Source
 
 
 class BodyReader:
-    """Reader of the bodies of a world.
-
-    Each file and each model is read once.
-    """
+    """Reads the bodies in a world, each file and each model once."""
 
     def __init__(self, resources: Resources, notes: Notes, allowance: Allowance) -> None:
         self.resources = resources
@@ -104,7 +101,7 @@ class BodyReader:
         self._ground: Element | None = None
 
     def world(self, element: Element, source: Source) -> GazeboBody:
-        """Return the body of a <world>, or of a root with models."""
+        """Return the body of a <world>, or of a root element with models."""
         body = GazeboBody(FrameGraph(WORLD_FRAME))
         self._fill(body, element, source)
         if body.size > MAX_NODES:
@@ -115,7 +112,7 @@ class BodyReader:
         return body
 
     def _fill(self, body: GazeboBody, element: Element, source: Source) -> None:
-        """Read links, frames and models of an element into a body."""
+        """Read the links, frames, and models in an element into a body."""
         self.notes.check_children(element)
         frames = body.frames
         for link in element.findall("link"):
@@ -139,7 +136,7 @@ class BodyReader:
     def _nested(
         self, body: GazeboBody, element: Element, source: Source
     ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
-        """Yield names, bodies and poses of the models in an element, with their frames defined."""
+        """Yield the names, bodies, and poses of nested models, after defining their frames."""
         for child in element:
             if child.tag == "model":
                 name = _name(child)
@@ -152,7 +149,7 @@ class BodyReader:
     def _include(
         self, body: GazeboBody, include: Element, source: Source
     ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
-        """Yield the model that an <include> names, or merge the model into the body."""
+        """Yield the model that an <include> refers to, or merge the model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
         included = self._included(uri, source)
@@ -171,7 +168,7 @@ class BodyReader:
     def _define(
         self, body: GazeboBody, name: str, nested: GazeboBody, posed: Element, placing: Element
     ) -> tuple[str, GazeboBody, RelativePose]:
-        """Define the frame of a nested model, and return name, body and pose of the model."""
+        """Define the frame of a nested model, and return the model's name, body, and pose."""
         placement = _placement_frame(placing, posed)
         pose = read_pose(posed)
         pose = pose._replace(matrix=placement_matrix(pose.matrix, nested.frames, placement))
@@ -183,7 +180,7 @@ class BodyReader:
     def _merge(
         self, body: GazeboBody, nested: GazeboBody, posed: Element, placing: Element
     ) -> None:
-        """Add links and models of an included model to the body."""
+        """Merge the links and nested models of an included model into the body."""
         pose = read_pose(posed)
         frames = body.frames
         matrix = placement_matrix(pose.matrix, nested.frames, _placement_frame(placing, posed))
@@ -197,7 +194,7 @@ class BodyReader:
     def model(self, element: Element, source: Source) -> GazeboBody:
         """Return the body of a <model>.
 
-        Raises LidarError if includes go in a circle.
+        Raises LidarError if includes are circular.
         """
         key = id(element)
         if key in self._open_elements:
@@ -220,7 +217,7 @@ class BodyReader:
         return self._bodies[key]
 
     def _included(self, uri: str, source: Source) -> _Included | None:
-        """Return the model of a URI, or None for a light, or for a model that is missing."""
+        """Return the model at a URI, or None if it is a light or missing."""
         if not uri:
             self.notes.missing_models["an <include> without <uri>"] += 1
             return None
@@ -236,13 +233,13 @@ class BodyReader:
         return self._read(file)
 
     def _ground_plane(self) -> Element:
-        """Return the model of the ground plane that Gazebo brings."""
+        """Return the ground plane model that is part of Gazebo."""
         if self._ground is None:
             self._ground = parse_lenient_xml(GROUND_PLANE.encode())
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
-        """Return the model of a file, or None without a model, or for an unreadable file."""
+        """Return the model in a file, or None if the file is unreadable or has no model."""
         path = source.path.resolve()
         if path not in self._files:
             self._files[path] = None
@@ -263,16 +260,22 @@ class BodyReader:
 
 
 def _placement_frame(placing: Element, posed: Element) -> str:
-    """Return the frame of a model that its pose is for, or no text for the model's own frame."""
+    """Return the frame of a model that its pose refers to; empty for the model's own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element, without characters that cannot be printed."""
+    """Return the name of an element without unprintable characters."""
     return printable(element.get("name", ""))
 
 
 def scoped_name(path: tuple[str, ...]) -> str:
-    """Return the name of a model or link within models, as Gazebo writes names."""
+    """Join the names of nested models and a link in Gazebo's notation.
+
+    Examples
+    --------
+    >>> scoped_name(("car", "wheel"))
+    'car::wheel'
+    """
     return _SEPARATOR.join(path)

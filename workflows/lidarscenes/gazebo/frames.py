@@ -1,4 +1,4 @@
-"""Poses of SDFormat, and frames that poses are relative to."""
+"""Resolve SDFormat poses and the frames that they are relative to."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidarsim.base.words import did_you_mean, printable
 from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
 
-MAX_NUMBER = 1e8  # limit for numbers in a file, but for poses
-_MAX_POSE = 1e12  # number of a pose, beyond which it is as if it were infinite
-_MIN_NORM = 1e-6  # limit for the norm of a quaternion
+MAX_NUMBER = 1e8  # largest number in a file, except in poses
+_MAX_POSE = 1e12  # larger numbers in a pose are treated as infinite
+_MIN_NORM = 1e-6  # smallest norm of a quaternion
 
 
 class RelativePose(NamedTuple):
@@ -30,12 +30,12 @@ class RelativePose(NamedTuple):
 def child_numbers(
     element: Element, name: str, count: int, default: str, *, at_least: float | None = None
 ) -> Floats:
-    """Return `count` numbers of the text of a child element, or of `default` without a text.
+    """Return the `count` numbers in a child element, or in `default` if it is missing or empty.
 
     Raises
     ------
     LidarError
-        If the text is other than `count` finite numbers, or a number is below `at_least`.
+        If the text does not consist of `count` finite numbers, or a number is below `at_least`.
     """
     text = (element.findtext(name) or "").strip() or default
     return parse_numbers(text, f"<{name}>", count, at_least=at_least)
@@ -49,11 +49,10 @@ def parse_numbers(
     at_least: float | None = None,
     of_any_size: bool = False,
 ) -> Floats:
-    """Return the numbers of a text.
+    """Parse `count` numbers in a text, which error messages call `subject`.
 
-    Raises LidarError, which names `subject`, as `child_numbers` does.
-
-    With `of_any_size`, numbers may also be infinite, NaN or very large.
+    With `of_any_size`, numbers may also be infinite, NaN, or very large. Raises LidarError as
+    `child_numbers` does.
     """
     try:
         values = np.array(text.split(), np.float64)
@@ -69,7 +68,7 @@ def parse_numbers(
 
 
 def read_pose(element: Element) -> RelativePose:
-    """Return the pose of an element, or identity without <pose>."""
+    """Return the pose of an element, or the identity if it has no <pose>."""
     pose = element.find("pose")
     if pose is None:
         return RelativePose(np.eye(4), "")
@@ -78,15 +77,16 @@ def read_pose(element: Element) -> RelativePose:
 
 
 def read_matrix(pose: Element) -> Floats:
-    """Return the matrix (4, 4) of a <pose>: x, y, z, and roll, pitch, yaw or a quaternion.
+    """Return the matrix (4, 4) of a <pose>.
 
-    Physics may have thrown a model to a pose that is not finite, or has very large numbers: its
-    matrix is of NaN, apart from the last row.
+    The pose consists of x, y, z, and either roll, pitch, and yaw or a quaternion. In a recorded
+    state, physics may have moved a model to a pose with infinite or very large numbers. The matrix
+    of such a pose is NaN, except for its last row.
 
     Raises
     ------
     LidarError
-        If there are not as many numbers as expected, or the quaternion has no length.
+        If the number of values is wrong, or the quaternion has zero length.
     """
     text = (pose.text or "").strip()
     is_quaternion = pose.get("rotation_format") == "quat_xyzw"
@@ -106,7 +106,7 @@ def read_matrix(pose: Element) -> Floats:
 
 
 class FrameGraph:
-    """Frames of a world or model, by name.
+    """The frames of a world or model, by name.
 
     `root` is the name of the frame of the world or model itself.
     """
@@ -118,11 +118,9 @@ class FrameGraph:
         self._poses: dict[str, RelativePose] = {}
 
     def define(self, name: str, pose: RelativePose, default: str) -> str:
-        """Define a frame by its pose.
+        """Define a frame, and return its name, with a number if the name is already used.
 
-        `default` is the frame of poses that name none.
-
-        Returns the name, with a number if the name is in use.
+        `default` is the reference frame if the pose does not name one.
         """
         unique = name
         number = 0
@@ -137,7 +135,7 @@ class FrameGraph:
         return [self.root, *self._poses]
 
     def merge(self, nested: FrameGraph, placement: Floats) -> None:
-        """Define the frames of a merged model, whose root is at `placement` (4, 4), as own."""
+        """Add the frames of a merged model whose root is placed by a matrix (4, 4)."""
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
             self.define(name, RelativePose(matrix, self.root), self.root)
@@ -149,7 +147,7 @@ class FrameGraph:
         Raises
         ------
         LidarError
-            If the frame, or one that it is relative to, is not defined, or they go in a circle.
+            If a frame is not defined, or if frames refer to each other in a circle.
         """
         chain: list[str] = []
         while name not in self._matrices:
@@ -163,7 +161,7 @@ class FrameGraph:
         return self._matrices[chain[0] if chain else name]
 
     def _pose(self, name: str) -> RelativePose:
-        """Return the pose of a frame, or of a frame MODEL::FRAME of a nested model."""
+        """Return the pose of a frame, which may be MODEL::FRAME of a nested model."""
         model, mark, inner = name.partition("::")
         if name not in self._poses and mark and model in self.nested:
             self._poses[name] = RelativePose(self.nested[model].matrix(inner), model)
@@ -179,7 +177,7 @@ class FrameGraph:
 
 
 def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
-    """Return the matrix (4, 4) of a model whose `placement_frame` is at a pose (4, 4)."""
+    """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose (4, 4)."""
     if not placement_frame:
         return pose
     return matmul(pose, inverted(frames.matrix(placement_frame)))

@@ -1,4 +1,4 @@
-"""Worlds of Gazebo as scenarios: a sensor for each lidar, on one carrier that stands."""
+"""Convert Gazebo worlds to scenarios, with a sensor for each lidar on a stationary platform."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from .world import GazeboOptions, World, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a world as a scenario into a folder: `scenario.yaml`, and a data file of each lidar.
+    """Write a world as a scenario: `scenario.yaml`, and a data file for each lidar.
 
     Parameters
     ----------
     world
         A .sdf or .world file with lidars.
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
         Folders that are searched first for models.
 
     Returns
     -------
-    What is not as in Gazebo, a line each.
+    Differences from Gazebo, one line each.
 
     Raises
     ------
     LidarError
-        If the world cannot be read, or has no lidar.
+        If the world cannot be read or has no lidar.
     """
     if len(assets) > 1:
         raise LidarError("it is a Gazebo world, for which only one `--assets` folder is allowed.")
@@ -67,10 +67,10 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 def _unseen_objects(
     world: World, masks: Sequence[int], folders: tuple[Path, ...]
 ) -> dict[int, list[str]]:
-    """Return the patterns of the objects that lidars do not see: {<visibility_mask>: patterns}.
+    """Return the name patterns of objects that lidars do not see, by <visibility_mask>.
 
-    The names come from the scene of the world. Its meshes are read only if a lidar does not see a
-    visual.
+    The names are those in the scene. The meshes of the world are read only if a lidar does not see
+    one of the visuals.
     """
     visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]
     flags = {read_flags(visual) for visual in visuals} - {0}
@@ -79,7 +79,7 @@ def _unseen_objects(
     options = ReadOptions(masks=False, colors=False, folders=folders, own=GazeboOptions())
     with np.errstate(all="ignore"):
         content, placed = build_content(world, options)
-    # Objects without an area are not in the content, which is else in the same order.
+    # The content has the same order, but lacks objects without an area.
     rest = iter(placed)
     objects = [item.name for item in content.meshes]
     flags_of_objects = [
@@ -95,9 +95,9 @@ def _unseen_objects(
 
 
 def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
-    """Return patterns that fit the names that are unseen, and no other name.
+    """Return patterns that match exactly the names of unseen objects.
 
-    All objects of a model, if there are several, are one pattern: MODEL/*.
+    If a model has several objects that are all unseen, the pattern is MODEL/*.
     """
     if all(is_unseen):
         return ["*"]
@@ -112,12 +112,12 @@ def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
 
 
 def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the folders of a world, resolved: its own first."""
+    """Return the resolved folders of a world, its own folder first."""
     return world.parent.resolve(), *(folder.resolve() for folder in assets)
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
-    """Return a world.
+    """Load a world.
 
     Raises LidarError if the file cannot be read.
     """
@@ -132,13 +132,13 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
 
 
 def _materials(world: World) -> dict[str, Any]:
-    """Return the section of materials, for shapes with a <laser_retro>."""
+    """Return the `materials` section if a shape has a <laser_retro>."""
     if not any(_has_retro(link.link.element) for link in world.links):
         return {}
     return {"materials": [{"objects": "*", "reflectance": "texture"}]}
 
 
 def _has_retro(link: Element) -> bool:
-    """Return True if a shape of a link has a <laser_retro> above 0."""
+    """Return True if a shape of a link has a positive <laser_retro>."""
     shapes = [*link.findall("visual"), *link.findall("collision")]
     return any(child_numbers(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)

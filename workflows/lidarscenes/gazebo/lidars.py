@@ -1,4 +1,4 @@
-"""Lidars of Gazebo, <sensor type="gpu_lidar"> and the like, as data files of sensors."""
+"""Convert Gazebo lidars, such as <sensor type="gpu_lidar">, to sensor data files."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .notes import unknown_children
 from .visibility_flags import LIDARS, lidar_elements, lidar_settings, read_mask
 from .world import PlacedLink, World
 
-_COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
-# Types of sensors of SDFormat 1.0 to 1.12 that are not lidars.
+_COLLISION_LIDARS = ("ray", "lidar")  # their rays hit collision shapes
+# Sensor types in SDFormat 1.0 to 1.12 that are not lidars.
 _OTHER_SENSORS = (
     *("air_pressure", "air_speed", "altimeter", "contact", "custom", "force_torque", "gps", "imu"),
     *("magnetometer", "navsat", "rfid", "rfidtag", "sonar"),
@@ -38,24 +38,24 @@ _NOISE_LEFT_OUT = {
     "dynamic_bias_stddev": "the dynamic bias of the noise",
     "precision": "the precision of the noise",
 }
-_MAX_NAMES = 12  # limit for the names that a line lists
-_RATE_HZ = 10.0  # default rate of sensors
+_MAX_NAMES = 12  # maximum number of names in a line
+_RATE_HZ = 10.0  # default update rate
 _FULL_TURN = 360.0
 _SLACK_DEG = 1e-3
 _MAX_SAMPLES = 1_000_000
 
 
 class GazeboLidar(NamedTuple):
-    """A lidar, and its <visibility_mask>."""
+    """A lidar and its <visibility_mask>."""
 
     lidar: Lidar
     mask: int
 
 
 def find_lidars(world: World) -> Iterator[GazeboLidar]:
-    """Yield the lidars of a world.
+    """Yield the lidars in a world.
 
-    Raises LidarError if figures of a lidar are impossible.
+    Raises LidarError if a lidar has invalid values.
     """
     for link in world.links:
         for element in lidar_elements(link.link.element):
@@ -66,7 +66,7 @@ def find_lidars(world: World) -> Iterator[GazeboLidar]:
 
 
 def unknown_sensors(world: World) -> Iterator[str]:
-    """Yield clauses on the sensors of a world whose type SDFormat does not define."""
+    """Yield a clause for each sensor whose type is not defined by SDFormat."""
     for link in world.links:
         for element in link.link.element.findall("sensor"):
             kind = element.get("type") or ""
@@ -77,7 +77,7 @@ def unknown_sensors(world: World) -> Iterator[str]:
 
 
 def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
-    """Yield a clause on elements of a lidar that SDFormat does not define, if any."""
+    """Yield a clause if a lidar has elements that are not defined by SDFormat."""
     scans = figures.findall("scan")
     parents = [element, figures, *scans]
     parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
@@ -87,7 +87,7 @@ def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
 
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
-    """Return the lidar of a <sensor>."""
+    """Convert a <sensor> to a lidar."""
     figures = lidar_settings(element)
     if figures is None:
         hint = did_you_mean("lidar", [printable(child.tag) for child in element])
@@ -130,7 +130,7 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
 
 
 class _Scan(NamedTuple):
-    """Evenly spaced angles, both ends included."""
+    """Evenly spaced angles, including both ends."""
 
     first_deg: float
     last_deg: float
@@ -143,7 +143,7 @@ class _Scan(NamedTuple):
 
 
 def _scan(figures: Element, name: str, samples: str) -> _Scan:
-    """Return the samples of <horizontal> or <vertical>.
+    """Return the samples in <horizontal> or <vertical>.
 
     `samples` is the default number.
     """
@@ -161,7 +161,7 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
 
 
 def _directions(figures: Element) -> dict[str, Any]:
-    """Return the fields of a data file for the directions of the rays."""
+    """Return the data file fields that describe the ray directions."""
     vertical = _scan(figures, "vertical", "1")
     elevations: Any = [rounded(vertical.first_deg)]
     if vertical.samples > 1:
@@ -171,11 +171,11 @@ def _directions(figures: Element) -> dict[str, Any]:
     step_deg = horizontal.step_deg
     count = horizontal.samples
     while count > 1 and count * step_deg > _FULL_TURN + _SLACK_DEG:
-        count -= 1  # the last sample is the first again
+        count -= 1  # the last sample repeats the first
     fields: dict[str, Any] = {"firings_per_turn": count}
     if count == 1 or count * step_deg > _FULL_TURN - _SLACK_DEG:
         fields["zero_deg"] = rounded(horizontal.first_deg)
-    else:  # firings of a line begin at its start, and end a step before its end
+    else:  # the last firing is one step before the end of the scan line
         width_deg = count * step_deg
         fields["zero_deg"] = rounded(horizontal.first_deg + width_deg / 2)
         fields["mirror"] = {"motion": "sawtooth", "width_deg": rounded(width_deg)}
@@ -183,7 +183,7 @@ def _directions(figures: Element) -> dict[str, Any]:
 
 
 def _range_m(ranges: Element | None) -> tuple[float, float]:
-    """Return the shortest and the longest range, meters."""
+    """Return the minimum and the maximum range in meters."""
     if ranges is None:
         return 0.0, math.inf
     longest = (ranges.findtext("max") or "inf").strip()
@@ -193,10 +193,7 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
 
 
 def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
-    """Return the fields of a data file for noise.
-
-    Differences to Gazebo go to `left_out`.
-    """
+    """Return the data file fields for noise, and add differences from Gazebo to `left_out`."""
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:

@@ -1,4 +1,4 @@
-"""Actors of Gazebo: skins that follow waypoints."""
+"""Read Gazebo actors, which are skins that follow waypoints."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Source
 
-_LOOP_S = 600.0  # duration of the repetitions of a script that loops
-_MAX_POSES = 5000  # limit for the poses of an actor
-_JUMP_S = 1e-3  # time of an actor between its last waypoint and its first
+_LOOP_S = 600.0  # duration for which a looping script is repeated
+_MAX_POSES = 5000  # maximum number of poses of an actor
+_JUMP_S = 1e-3  # time in which an actor returns from its last waypoint to the first
 
 
 class Actors(NamedTuple):
-    """Actors of a world."""
+    """The actors in a world."""
 
     moving: list[RigidPart]
     standing: list[PlacedNode]
 
 
 def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
-    """Return the actors of a world, with their skins at rest."""
+    """Return the actors in a world, with their skins in the rest pose."""
     actors = Actors([], [])
     for element in world.findall("actor"):
         notes.check_children(element)
@@ -52,7 +52,7 @@ def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes
 
 
 def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
-    """Return the skin of an actor, or None without a skin, or if its file is missing."""
+    """Return the skin of an actor, or None if there is none or its file is missing."""
     skin = actor.find("skin")
     if skin is None:
         return None
@@ -65,9 +65,9 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
-    """Return times (k,), seconds, and poses (k, 4, 4) of an actor.
+    """Return the times (k,) in seconds and the poses (k, 4, 4) of an actor.
 
-    For an actor that stands, k is 1.
+    A stationary actor has a single pose.
     """
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
@@ -77,7 +77,7 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
     poses = np.array([_waypoint_pose(entry) for entry in entries])
     times_s, rows = np.unique(times_s, return_index=True)
     poses = poses[rows]
-    assert script is not None, "of entries"
+    assert script is not None, "a script that has waypoints"
     delay_s = child_numbers(script, "delay_start", 1, "0").item()
     if (script.findtext("loop") or "true").strip() in ("true", "1") and times_s[-1] > 0:
         times_s, poses = _repeated(times_s, poses)
@@ -92,7 +92,7 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
 def _waypoint_pose(waypoint: Element) -> Floats:
     """Return the pose (4, 4) of a waypoint in the world.
 
-    Raises LidarError without a pose.
+    Raises LidarError if the waypoint has no pose.
     """
     pose = waypoint.find("pose")
     if pose is None:
@@ -101,9 +101,9 @@ def _waypoint_pose(waypoint: Element) -> Floats:
 
 
 def _repeated(times_s: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """Return waypoints repeated for `_LOOP_S` or longer, but `_MAX_POSES` at most."""
+    """Repeat waypoints for at least `_LOOP_S`, but with at most `_MAX_POSES` poses."""
     duration_s = float(times_s[-1])
-    # A second round begins a moment after the first one ends.
+    # Each repetition begins shortly after the previous one ends.
     start_s = np.maximum(times_s, _JUMP_S) if duration_s > _JUMP_S else times_s
     start_s, rows = np.unique(start_s, return_index=True)
     rounds = int(min(np.ceil(_LOOP_S / duration_s), _MAX_POSES // len(poses)))

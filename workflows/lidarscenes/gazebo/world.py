@@ -1,8 +1,8 @@
-"""Worlds and models of Gazebo, .sdf and .world, as scenes.
+"""Read Gazebo worlds and models (.sdf and .world) as scenes.
 
-After the specification of SDFormat 1.12 (http://sdformat.org/spec) and what Gazebo does where the
-specification leaves questions open. No package of the index reads SDFormat: libsdformat comes with
-Gazebo alone.
+The reader follows the specification of SDFormat 1.12 (http://sdformat.org/spec) and, where it is
+ambiguous, the behavior of Gazebo. No package on PyPI reads SDFormat; libsdformat is only available
+as a part of Gazebo.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from .visibility_flags import ALL_BITS, distinct_masks
 from .waypoint_actors import read_actors
 
 _ADVICE = "simplify its meshes, or export them in parts"
-_OLD_ROOT = "gazebo"  # root of Gazebo before 1.9
+_OLD_ROOT = "gazebo"  # root element before Gazebo 1.9
 _NO_SCALE = (1.0, 1.0, 1.0)
 
 
-# A model that is farther along x, y or z from the origin of its world has fallen, or physics has
-# thrown it there: northings of maps reach 10,000 km, and no world is 1,000 km high.
+# A model that is farther from the origin along x, y, or z has fallen or was moved by physics. Map
+# northings reach 10,000 km, and no world is 1,000 km high.
 _REACH_M = np.array([1e7, 1e7, 1e6])
 
 
 @dataclass(frozen=True)
 @checked_fields
 class GazeboOptions:
-    """Options of worlds of Gazebo."""
+    """Options for reading Gazebo worlds."""
 
     geometry: Annotated[
         Literal["visual", "collision"],
@@ -65,9 +65,9 @@ class GazeboOptions:
 
 
 class PlacedLink(NamedTuple):
-    """A link in the world."""
+    """A link placed in the world."""
 
-    path: tuple[str, ...]  # names of the models that contain it, and its own
+    path: tuple[str, ...]  # names of the enclosing models and of the link
     body: GazeboBody
     link: Link
     matrix: Floats  # (4, 4), to the world
@@ -77,9 +77,9 @@ class PlacedLink(NamedTuple):
 
 @dataclass
 class _State:
-    """The <state> of a world of Gazebo classic: poses that replace the poses of the models.
+    """The <state> of a Gazebo classic world, whose poses replace those of the models.
 
-    Poses are in world coordinates by the names of models and links, MODEL::LINK.
+    Poses are in world coordinates, by the names of models and links (MODEL::LINK).
     """
 
     poses: dict[str, Floats] = field(default_factory=dict)  # (4, 4)
@@ -102,7 +102,7 @@ class World:
 
     @cached_property
     def links(self) -> list[PlacedLink]:
-        """All links, but those that are too far away, whose models are noted."""
+        """All links except those that are too far away, whose models are noted."""
         links = []
         for link in self._placed_links():
             if is_in_reach(link.matrix):
@@ -112,9 +112,9 @@ class World:
         return links
 
     def _placed_links(self) -> Iterator[PlacedLink]:
-        """Yield the links of all models, the state's poses first."""
+        """Yield the links of all models, with poses from the state where it has any."""
         state = self.state
-        # Instances with the names of the models around them, and the matrix of these models.
+        # Models with the names, the matrix, and the outermost matrix of their enclosing models
         stack: list[tuple[PlacedModel, tuple[str, ...], Floats | None, Floats | None]] = [
             (child, (), None, None)
             for child in reversed(self.body.children)
@@ -142,19 +142,19 @@ class World:
 
 
 class PlacedObject(NamedTuple):
-    """An object that stands in the world."""
+    """A stationary object in the world."""
 
     node: PlacedNode
     flags: int  # <visibility_flags> of its visuals
 
 
 def is_in_reach(matrix: Floats) -> bool:
-    """Return True if a matrix (4, 4) is of a position that a world may have."""
+    """Return True if the position of a matrix (4, 4) is finite and plausible for a world."""
     return bool(np.isfinite(matrix).all() and (np.abs(matrix[:3, 3]) < _REACH_M).all())
 
 
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visuals, or the collision shapes, of all links, and the moving actors."""
+    """Read the visuals or the collision shapes of all links, and the moving actors."""
     world = load_world(data, path, options.folders)
     content = build_content(world, options)[0]
     if not content.meshes and not content.moving:
@@ -168,7 +168,10 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def build_content(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
-    """Return the content of a world, and its objects that stand, also those without an area."""
+    """Return the content of a world, and its stationary objects.
+
+    The objects include those without an area, which the content lacks.
+    """
     notes = world.notes
     masks = distinct_masks(link.link.element for link in world.links)
     meshes = LinkMeshes(world.resources, options, notes, world.allowance, masks)
@@ -191,21 +194,21 @@ def build_content(world: World, options: ReadOptions) -> tuple[Content, list[Pla
 
 
 def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
-    """Read a file of SDFormat, and the included models.
+    """Read an SDFormat file and the models that it includes.
 
     Parameters
     ----------
     data
         Content of the file.
     path
-        The file.
+        Path of the file.
     folders
-        The file's folder, and further folders that are searched for models.
+        Folder of the file, followed by additional folders that are searched for models.
 
     Raises
     ------
     LidarError, ValueError, lidarsim.scene.files.scene_graph.MeshFileError
-        If the file is broken, or none of Gazebo.
+        If the file is invalid or not an SDFormat file.
     """
     root = parse_lenient_xml(data)
     if root.tag == _OLD_ROOT:
@@ -237,7 +240,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
 
 
 def _world_element(root: Element, notes: Notes) -> Element:
-    """Return the <world> of a file, or a <world> with its models."""
+    """Return the <world> of a file, or a new <world> that contains its models."""
     if root.tag == "world":
         return root
     if root.tag == "sdf":
@@ -253,7 +256,7 @@ def _world_element(root: Element, notes: Notes) -> Element:
 
 
 def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
-    """Yield the roads of a world."""
+    """Yield the roads in a world."""
     for road in world.element.findall("road"):
         world.notes.check_children(road)
         name = printable(road.get("name", "")) or "road"
@@ -266,7 +269,7 @@ def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
 
 
 def _state_of(world: Element) -> _State:
-    """Return the last state of a world, or an empty state without <state>."""
+    """Return the last <state> of a world, or an empty state if there is none."""
     state = _State()
     elements = world.findall("state")
     if not elements:
@@ -290,7 +293,7 @@ def _state_of(world: Element) -> _State:
 def _state_entries(
     element: Element, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], Element]]:
-    """Yield the models and links in a state, with their names."""
+    """Yield the names and elements of the models and links in a state."""
     for child in element:
         if child.tag in ("model", "link"):
             inner = (*path, printable(child.get("name", "")))

@@ -1,4 +1,4 @@
-"""Surveys and scanners of HELIOS++ as scenarios."""
+"""Convert HELIOS++ surveys and scanners to scenarios."""
 
 from .import_scanner import import_scanner, is_scanner
 from .survey_xml import ImportedSurvey, import_survey

@@ -1,4 +1,7 @@
-"""Legs of HELIOS++ as a trajectory: from leg to leg, standing at each, or from a file."""
+"""Convert HELIOS++ legs to a trajectory.
+
+The platform moves from leg to leg, is stationary at each leg, or follows a trajectory file.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ from lidarsim.scene.transform import rotation_about
 
 from .files import Assets, read_file, read_flag, read_number, read_vector, rounded
 
-_SPEED = 70.0  # default, meters a second
-_BETWEEN_S = 0.001  # time between legs: the carrier turns on the spot or goes to its next leg
+_SPEED = 70.0  # default speed in m/s
+_BETWEEN_S = 0.001  # time in which the platform turns on the spot or moves to the next leg
 _AFTER_S = 1.0  # duration of the trajectory after the last leg
 _FACING_Y_DEG = 90.0  # yaw of platforms that do not turn
 TRAJECTORY_FILE = "trajectory.tum"
@@ -30,23 +33,23 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass
 class Leg:
-    """A leg of a survey: its start and its settings."""
+    """A leg of a survey, with its start position and its settings."""
 
     number: int
-    position: Floats  # (3,): of the start, meters
+    position: Floats  # (3,) start in meters
     scanner: dict[str, str]  # settings
     platform: dict[str, str]  # settings
     longest_s: float  # maximum duration; infinite without a limit
 
     @property
     def active(self) -> bool:
-        """Whether the scanner scans during the leg."""
+        """Whether the scanner is active during the leg."""
         return read_flag(self.scanner, "active", True)
 
 
 @dataclass
 class LegSegment:
-    """Part of the trajectory: a leg, from its start to its end."""
+    """The part of the trajectory that belongs to a leg."""
 
     leg: int  # number
     active: bool
@@ -56,16 +59,17 @@ class LegSegment:
 
 @dataclass
 class HeliosTrajectory:
-    """Poses of a carrier, and the stretches of its legs.
+    """The poses of a platform, and the segments of its legs.
 
-    `rows` hold seconds, x, y, z and yaw in degrees, or quaternions x, y, z, w in its place.
+    The columns of `rows` are time in seconds, x, y, z, and either the yaw in degrees or a
+    quaternion x, y, z, w.
     """
 
     rows: Floats
     segments: list[LegSegment]
 
     def section_and_files(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
-        """Return the section `trajectory` of a scenario, and its files {name: text}."""
+        """Return the `trajectory` section of a scenario, and the text of the files it refers to."""
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
@@ -81,7 +85,7 @@ def read_legs(
 ) -> list[Leg]:
     """Return the legs of a survey.
 
-    `height` returns the height of the ground at x, y, meters.
+    `height` returns the height of the ground at x, y in meters.
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
@@ -101,7 +105,10 @@ def read_legs(
 
 
 def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
-    """Return a trajectory straight from leg to leg, at the speed of each, turning on the spot."""
+    """Return a trajectory that moves straight from leg to leg at the speed of each leg.
+
+    The platform turns on the spot between legs.
+    """
     rows = []
     segments = []
     clock = 0.0
@@ -130,9 +137,9 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
 
 
 def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
-    """Return a trajectory that stands at each leg until its head has turned.
+    """Return a trajectory that is stationary at each leg until the scanner head has rotated.
 
-    `heads` are durations of the heads' rotations, {number of a leg: seconds}, 0 without rotation.
+    `heads` are the rotation times in seconds by leg number, 0 for a head that does not rotate.
     """
     rows = []
     segments = []
@@ -157,10 +164,7 @@ def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> Helio
 
 
 def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
-    """Return the trajectory in the file of an interpolated platform.
-
-    Legs are its stretches.
-    """
+    """Read the trajectory file of an interpolated platform, and return a segment for each leg."""
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarError("all legs of an interpolated platform must name the same trajectory.")
@@ -191,7 +195,7 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
 
 
 def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
-    """Return the stretch of a leg in a trajectory from `first_s` to `last_s`."""
+    """Return the segment of a leg in a trajectory between two times."""
     start = max(read_number(leg.platform, "tStart", first_s), first_s)
     stop = min(read_number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
     if stop <= start:
@@ -202,7 +206,7 @@ def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the rotation (3, 3) of a platform by angles in degrees, as HELIOS++ reads files."""
+    """Return a platform rotation (3, 3) for angles in degrees, as HELIOS++ interprets them."""
     if kind == "CANONICAL":
         return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":
@@ -211,7 +215,10 @@ def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floa
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
-    """Return the columns of a trajectory {name: values}, named by indices, header or default."""
+    """Return the columns of a trajectory by name.
+
+    The names come from column indices in the settings, from the header, or from the default order.
+    """
     default_names = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     separator = settings.get("trajectory_seperator", ",")
@@ -236,7 +243,7 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     description = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
         raise LidarError(f"{description}. It must have t, x, y and z.")
-    used = [name for name in names if name]  # indices may leave columns out
+    used = [name for name in names if name]  # column indices may skip columns
     unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
         fault = "A name occurs twice."

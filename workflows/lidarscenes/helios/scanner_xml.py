@@ -1,7 +1,7 @@
-"""Scanners of HELIOS++ as sensors: data files, and rotations on their platforms.
+"""Convert HELIOS++ scanners to sensors: data files, and rotations on their platforms.
 
-HELIOS++ looks along y with z up and x to the right. Every pulse is a step: mirrors and heads move
-by their step between two pulses, which is reproduced, including the rounding of lines.
+HELIOS++ scanners look along y, with z up and x to the right. Mirrors and heads move by a step
+between two pulses. This is reproduced, including the rounding to whole pulses per scan line.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from lidarsim.scene.transform import rotation_about
 from .files import read_number, read_rotation, read_vector, rounded
 
 _Z = np.array([0.0, 0.0, 1.0])
-# Rotations from the sensor frame to the frame of HELIOS++: of a line to both sides, of a cone about
-# the direction ahead, of prisms that look ahead, of a head.
+# Rotations from the sensor frame to the frame of HELIOS++, for a scan line to both sides, for a
+# cone about the forward direction, for forward-looking prisms, and for a head.
 _LINE = rotation_about(np.array([1.0, 0.0, 0.0]), 90)
 _CONE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
-_HEAD_STEP_DEG = 10.0  # rotation of a head in a scan; without a head, a scan is at most a cycle
-_FRAME_HZ = 10.0  # prisms have no cycle
+_HEAD_STEP_DEG = 10.0  # maximum rotation per scan with a head; without, it is a full cycle
+_FRAME_HZ = 10.0  # arbitrary, because prism patterns do not repeat
 _SLACK = 1e-9  # slack for divisions whose exact quotients are whole numbers
 
-# A data file without name and light, and the rotation from the sensor frame to HELIOS++'s frame.
+# A data file without name and optics, and the rotation from the sensor frame to HELIOS++'s frame.
 ScannerSection = tuple[dict[str, Any], Floats]
 
 
@@ -45,11 +45,11 @@ class Device:
     data
         Content of the sensor's data file.
     rotation
-        Rotation (3, 3) from the sensor frame to the frame of the platform's mount.
+        Rotation (3, 3) from the sensor frame to the mount on the platform.
     position
-        Start of the light (3,), meters beside the mount.
+        Origin of the beams (3,), relative to the mount, in meters.
     head_s
-        Duration of the head's rotation from start to stop, seconds; None without a head.
+        Time in seconds that the head takes to rotate from start to stop; None without a head.
     range_m
         Minimum and maximum range.
     """
@@ -61,16 +61,16 @@ class Device:
     range_m: tuple[float, float]
 
     def steps(self, seconds: float) -> tuple[float, int]:
-        """Return the rotation of a time step, degrees, and the number of steps in `seconds`."""
+        """Return the rotation per time step in degrees, and the number of steps in a time."""
         turned = 360 * self.data["rate_hz"] * seconds
         count = max(ceil(turned / (360 if self.head_s is None else _HEAD_STEP_DEG) - _SLACK), 1)
         return turned / count, count
 
 
 class HeliosScanner:
-    """Attributes of a scanner.
+    """The attributes of a scanner or of one of its channels.
 
-    For a channel, its attributes take precedence over the scanner's.
+    The attributes of a channel take precedence over those of the scanner.
     """
 
     def __init__(self, element: Element, channel: Element | None = None) -> None:
@@ -89,9 +89,9 @@ class HeliosScanner:
 
 
 def read_channels(element: Element) -> dict[str, HeliosScanner]:
-    """Return the channels of a scanner {id: channel}.
+    """Return the channels of a scanner by ID.
 
-    {"": scanner} without channels.
+    A scanner without channels is returned with an empty ID.
     """
     elements = element.findall("channels/channel")
     if not elements:
@@ -103,7 +103,7 @@ def read_channels(element: Element) -> dict[str, HeliosScanner]:
 
 
 def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
-    """Yield the features of a scanner that a scenario does not support, in words."""
+    """Describe the features of a scanner that a scenario does not support."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
             yield f"<{tag}> of {scanner.name}"
@@ -116,12 +116,12 @@ def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
 
 
 def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
-    """Return a scanner with the settings of a leg.
+    """Convert a scanner with the settings of a leg.
 
     Raises
     ------
     LidarError
-        If no sensor has the kind of optics, or the settings make no line.
+        If the scanner's optics are not supported, or if the settings result in no pulses.
     """
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
     pulse_hz = read_number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
@@ -159,7 +159,7 @@ def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
 
 
 def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
-    """Return the fields of `optics` of a scanner with the settings of a leg."""
+    """Return the `optics` fields of a scanner with the settings of a leg."""
     divergence = read_number(
         settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4)
     )
@@ -172,12 +172,12 @@ def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]
 
 
 class _Head(NamedTuple):
-    """Rotation of a scanner's head."""
+    """The rotation of a scanner's head."""
 
     axis: Floats  # (3,)
     start_deg: float
     range_deg: float  # angle between start and stop
-    deg_per_s: float  # 0 if the head stands
+    deg_per_s: float  # 0 if the head does not rotate
 
     @classmethod
     def from_settings(
@@ -185,7 +185,7 @@ class _Head(NamedTuple):
     ) -> _Head:
         """Return the head of a scanner with the settings of a leg.
 
-        `line` is the line of rotating optics.
+        `line` is the scan line of rotating optics, or None for other optics.
         """
         axis = read_vector(scanner.child("headRotateAxis"))
         axis = axis if np.linalg.norm(axis) > 0.1 else _Z
@@ -193,7 +193,7 @@ class _Head(NamedTuple):
         range_deg = read_number(settings, "headRotateStop_deg", 0) - start_deg
         max_deg_per_s = scanner.number("headRotatePerSecMax_deg")
         deg_per_s = read_number(settings, "headRotatePerSec_deg", 0)
-        if line is not None:  # a distance between lines takes precedence
+        if line is not None:  # a distance between scan lines takes precedence
             by_lines = read_number(settings, "horizontalResolution_deg", 0) * line.scan_hz
             deg_per_s = by_lines or deg_per_s
         limited = float(np.clip(deg_per_s, -max_deg_per_s, max_deg_per_s))
@@ -201,9 +201,9 @@ class _Head(NamedTuple):
 
 
 def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
-    """Return a sensor whose head turns.
+    """Return the section of a sensor with a rotating head.
 
-    Raises LidarError if the head cannot turn as the settings say.
+    Raises LidarError if the settings do not describe a supported rotation.
     """
     aim = _aim(read_rotation(scanner.child("beamOrigin")))
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
@@ -222,14 +222,14 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
 
 
 class _Aim(NamedTuple):
-    """Rotation of an emitter: first about x, then about z."""
+    """The rotation of an emitter, first about x and then about z."""
 
     tilt_deg: float
     azimuth_deg: float
 
 
 def _aim(emitter: Floats) -> _Aim | None:
-    """Return the angles of a rotation (3, 3), or None if the rotation rolls."""
+    """Decompose a rotation (3, 3), or return None if it includes a roll."""
     if abs(emitter[2, 0]) > 1e-12:
         return None
     tilt = np.arctan2(emitter[2, 1], emitter[2, 2])
@@ -238,16 +238,16 @@ def _aim(emitter: Floats) -> _Aim | None:
 
 
 def _exact_us(pulses: int, pulse_hz: float) -> int | str:
-    """Return the exact duration of `pulses`, microseconds, with a fraction as text."""
+    """Return the exact duration of `pulses` in microseconds, as text if it is a fraction."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """Pulses of a polygon's line.
+    """The pulses of a scan line made by a rotating polygon mirror.
 
-    A line has time for `pulses_per_line` pulses. `count` pulses are within its angles.
+    A scan line takes the time of `pulses_per_line` pulses, of which `count` are within its angles.
     """
 
     first_deg: float
@@ -255,22 +255,22 @@ class _Line:
     count: int
     pulses_per_line: int
     pulse_hz: float
-    scan_hz: float  # 0 if the mirror stands
+    scan_hz: float  # 0 if the mirror does not move
 
     @classmethod
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
     ) -> _Line:
-        """Return the line of a scanner with the settings of a leg.
+        """Return the scan line of a scanner with the settings of a leg.
 
-        Raises LidarError without pulses.
+        Raises LidarError if the scan line contains no pulse.
         """
         max_deg = scanner.number("scanAngleMax_deg")
         effective_deg = scanner.number("scanAngleEffectiveMax_deg")
         resolution_deg = read_number(settings, "verticalResolution_deg", 0)
         min_hz = scanner.number("scanFreqMin_Hz")
         if not (resolution_deg or min_hz or read_number(settings, "scanFreq_hz", 0)):
-            return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
+            return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror does not move
         scan_hz = _scan_hz(
             scanner, settings, pulse_hz * resolution_deg / (2 * max_deg) if resolution_deg else None
         )
@@ -279,12 +279,13 @@ class _Line:
         highest_deg = read_number(settings, "verticalAngleMax_deg", half_deg)
         if (
             highest_deg - lowest_deg > 2 * effective_deg + _SLACK
-        ):  # HELIOS++ 1 leaves such pulses out, 2 refuses them
+        ):  # HELIOS++ 1 omits such pulses, and HELIOS++ 2 refuses them
             lowest_deg = max(lowest_deg, -effective_deg)
             highest_deg = min(highest_deg, effective_deg)
         step_deg = 2 * max_deg * scan_hz / pulse_hz
         pulses_per_line = ceil(pulse_hz / scan_hz - _SLACK)
-        # Angles above the lowest, up to the highest; the next line starts before a full revolution.
+        # The lowest angle is exclusive and the highest inclusive. The next scan line starts before
+        # a full revolution.
         first = floor((lowest_deg + max_deg) / step_deg + _SLACK) + 1
         last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), pulses_per_line - 1)
         if last < first:
@@ -302,12 +303,12 @@ class _Line:
         )
 
     def mirror_sections(self) -> ScannerSection:
-        """Return a sensor with a mirror, whose firings are pulses.
+        """Return the section of a sensor with a mirror and no head, whose firings are pulses.
 
         Raises
         ------
         LidarError
-            If the mirror stands.
+            If the mirror does not move.
         """
         if not self.scan_hz:
             raise LidarError("scanFreq_hz is 0, and the head does not rotate.")
@@ -321,7 +322,7 @@ class _Line:
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
     def head_sections(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
-        """Return a sensor with a head, whose firings are lines that an emitter aims."""
+        """Return the section of a sensor with a rotating head, whose firings are scan lines."""
         between_us = 1e6 / self.pulse_hz
         last = rounded((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
@@ -357,7 +358,10 @@ class _Line:
 def _mirror(
     firings: int, rate_hz: float, mirror: dict[str, Any], middle: float = 0.0
 ) -> dict[str, Any]:
-    """Return a sensor with a mirror, whose lines have their middle at `middle` degrees."""
+    """Return the section of a sensor with a mirror.
+
+    The center of the scan lines is at `middle` degrees.
+    """
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
     return data | ({"zero_deg": rounded(middle)} if rounded(middle) else {}) | {"mirror": mirror}
 
@@ -365,9 +369,9 @@ def _mirror(
 def _oscillating(
     scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
 ) -> ScannerSection:
-    """Return a sensor with a mirror that swings.
+    """Return the section of a sensor with an oscillating mirror.
 
-    The scan product limits the angle of the mirror.
+    The angle of the mirror is limited by the scan product.
     """
     scan_hz = _scan_hz(scanner, settings)
     max_deg = scanner.number("scanProduct", 1e6) / scan_hz
@@ -383,14 +387,17 @@ def _oscillating(
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with fibers side by side, each with a pulse in a line."""
+    """Return the section of a sensor with adjacent fibers that each fire once per scan line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
     mirror = {"motion": "sawtooth", "width_deg": rounded(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
 def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with a rotating wedge (Palmer), at its greatest rate, as in HELIOS++."""
+    """Return the section of a sensor with a rotating wedge (Palmer scanner).
+
+    As in HELIOS++, the wedge rotates at its maximum rate.
+    """
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
@@ -399,7 +406,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with Risley prisms."""
+    """Return the section of a sensor with Risley prisms."""
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
@@ -438,7 +445,10 @@ _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSecti
 
 
 def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
-    """Return the scan angle to either side, degrees: at most, and by default, the scanner's."""
+    """Return the scan angle to either side, which is limited by the scanner's maximum.
+
+    The maximum is also the default.
+    """
     max_deg = scanner.number("scanAngleMax_deg")
     half_deg = min(max(read_number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
     if half_deg <= 0:
@@ -449,9 +459,9 @@ def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
 def _scan_hz(
     scanner: HeliosScanner, settings: dict[str, str], requested_hz: float | None = None
 ) -> float:
-    """Return the lines a second.
+    """Return the number of scan lines per second.
 
-    Raises LidarError if they are not within the scanner's limits.
+    Raises LidarError if it is outside the scanner's limits.
     """
     rate_hz = read_number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
     min_hz = scanner.number("scanFreqMin_Hz")

@@ -1,4 +1,7 @@
-"""Surveys of HELIOS++ as scenarios: a sensor for each leg that scans, on one trajectory."""
+"""Convert HELIOS++ surveys to scenarios.
+
+Each active leg becomes a sensor, and all sensors share a trajectory.
+"""
 
 from __future__ import annotations
 
@@ -39,13 +42,13 @@ from .scanner_xml import Device, make_device, read_channels, unsupported_feature
 from .scene_xml import HeliosScene, SurfelMaker
 
 SCENARIO_FILE = "scenario.yaml"
-# Carriers look along x, the platforms of HELIOS++ along y.
+# Vehicles in lidarsim look along x, platforms in HELIOS++ along y.
 AHEAD = rotation_about((0, 0, 1), -90)
 
 
 @dataclass
 class ImportedSurvey:
-    """The file of a written scenario, and the unsupported features of its survey."""
+    """The path of a converted scenario, and the unsupported features of its survey."""
 
     path: Path
     left_out: list[str]
@@ -59,30 +62,30 @@ def import_survey(
     check: Callable[[Path], object],
     surfels: SurfelMaker,
 ) -> ImportedSurvey:
-    """Write a HELIOS++ survey as a scenario, into a new folder.
+    """Convert a HELIOS++ survey to a scenario in a new folder.
 
-    The folder holds `scenario.yaml`, data files of its sensors, meshes of scanned points, and the
-    trajectory if the survey has a file of poses.
+    The folder contains `scenario.yaml`, the data files of its sensors, meshes made from points and,
+    if the survey refers to a file of poses, the trajectory.
 
     Parameters
     ----------
     survey
-        The XML file of the survey.
+        XML file of the survey.
     folder
-        The new folder.
+        New folder.
     assets
-        Folders that are searched first for referenced files, before the folder of the survey and
-        the folders above.
+        Folders that are searched for referenced files before the folder of the survey and its
+        parent folders.
     check
-        Reads the written `scenario.yaml` and raises a LidarError if it cannot be simulated.
+        Reads the written `scenario.yaml`, and raises a LidarError if it cannot be simulated.
     surfels
-        Makes a mesh of the points of a file that an `xyzloader` reads.
+        Makes a mesh from the points of a file that an `xyzloader` reads.
 
     Raises
     ------
     LidarError
-        If a file is missing or broken, an essential feature is not supported, or `check` refuses
-        the scenario; nothing is written then.
+        If a file is missing or invalid, an essential feature is not supported, or `check` refuses
+        the scenario. In this case, nothing is written.
     """
     survey = Path(survey)
     folder = Path(folder)
@@ -104,7 +107,7 @@ def import_survey(
             if part.surfels is not None:
                 write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
         check(partial / SCENARIO_FILE)
-        partial.chmod(0o755)  # mkdtemp gives a folder to its owner alone
+        partial.chmod(0o755)  # only its owner can read a folder from mkdtemp
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
@@ -115,10 +118,7 @@ def import_survey(
 
 
 class _Import:
-    """A survey whose XML files have been read.
-
-    `files` returns the scenario's files.
-    """
+    """A survey whose XML files have been read and converted."""
 
     def __init__(
         self, survey: Path, asset_folders: Sequence[Path], folder: Path, surfels: SurfelMaker
@@ -134,7 +134,7 @@ class _Import:
         self._first = next(iter(self._scanners.values()))
         self.scene = HeliosScene(self._asset("scene"), self._assets, folder, surfels)
         self._notes: list[str] = []
-        self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
+        self._files: dict[str, dict[str, Any]] = {}  # {name of a data file: its content}
         self._sensors: dict[str, dict[str, Any]] = {}
         self._trajectory = self._read_legs()
         if not self._sensors:
@@ -157,7 +157,7 @@ class _Import:
         self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
 
     def _asset(self, kind: str) -> Element:
-        """Return the element that the survey names for a kind, such as «scanner»."""
+        """Return the element of a kind, such as "scanner", that the survey refers to."""
         if not (reference := self._element.get(kind)):
             raise LidarError(f"its <survey> has no {kind}.")
         return self._assets.asset(reference, kind, self._home).element
@@ -188,7 +188,7 @@ class _Import:
         return trajectory
 
     def _interpolated_mount(self) -> Element | None:
-        """Return the <scannerMount> of an interpolated platform, or of its base platform."""
+        """Return the <scannerMount> of an interpolated platform or of its base platform."""
         mount = self._element.find("scannerMount")
         base = self._element.get("basePlatform")
         if mount is None and base:
@@ -212,7 +212,7 @@ class _Import:
         return kind in ("linearpath", "groundvehicle", "multicopter")
 
     def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
-        """Return the scanners of the legs that scan: {number of a leg: {channel: scanner}}."""
+        """Return the devices of each active leg, by leg number and channel."""
         devices = {}
         for leg in legs:
             with prefixed(f"leg {leg.number}"):
@@ -250,7 +250,10 @@ class _Import:
                 self._sensors[name] = self._sensor(mounted, segment, mount_rotation)
 
     def _sensor(self, mounted: Device, segment: LegSegment, mount: Floats) -> dict[str, Any]:
-        """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
+        """Return the `sensors` entry for a device during a segment.
+
+        `mount` is the rotation (3, 3) of its mount.
+        """
         step_deg, steps = mounted.steps(segment.seconds)
         min_range_m, max_range_m = mounted.range_m
         pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
@@ -268,10 +271,7 @@ class _Import:
         }
 
     def _file_of(self, data: dict[str, Any]) -> str:
-        """Return the name of a sensor's file.
-
-        Equal sensors share a file.
-        """
+        """Return the name of a sensor's data file, which identical sensors share."""
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
         name = f"{stem}.yaml"
         number = 1
@@ -281,7 +281,7 @@ class _Import:
         return name
 
     def files(self, folder: Path) -> dict[str, str]:
-        """Return the text files for the folder: {name: text}."""
+        """Return the text files for the folder by name."""
         trajectory, files = self._trajectory.section_and_files()
         light, range_m = self._light()
         names = [
@@ -309,7 +309,7 @@ class _Import:
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """Return the FWFSettings of the scanner, after the settings of the survey."""
+        """Return the FWFSettings of the scanner, overridden by those of the survey."""
         elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
         settings: dict[str, str] = {}
         for element in elements:
@@ -318,7 +318,7 @@ class _Import:
         return settings
 
     def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
-        """Return sections on light, and ranges that the survey sets for its scanner."""
+        """Return the sections that concern light, and the ranges that the survey sets."""
         scanner = self._first
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
@@ -332,7 +332,7 @@ class _Import:
                     read_number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
                 )
             },
-            # HELIOS++ has the visibility at a contrast of 2 %.
+            # HELIOS++ defines visibility at a contrast of 2 %.
             "weather": {
                 "visibility_km": rounded(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
             },
@@ -348,7 +348,7 @@ class _Import:
 def returns_section(
     settings: dict[str, str], max_returns: float, pulse_ns: float
 ) -> dict[str, Any]:
-    """Return the section `returns` by FWFSettings, maxNOR and the length of a pulse."""
+    """Return the `returns` section for FWFSettings, maxNOR, and the pulse length."""
     quality = read_number(settings, "beamSampleQuality", 3.0)
     return {
         "mode": "first" if max_returns == 1 else "all",
@@ -358,12 +358,10 @@ def returns_section(
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
-    """Return the fields of `returns` by FWFSettings.
+    """Return the waveform fields of `returns`, or none without waveform settings.
 
-    There are none without settings of waveforms.
-
-    The time of HELIOS++ is range over the speed of light: half of the time that light takes to a
-    surface and back.
+    Times in HELIOS++ are range divided by the speed of light, which is half of the time that light
+    takes to a surface and back.
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}

@@ -1,4 +1,4 @@
-"""Cars of a few hundred triangles: a body with recessed windows on four wheels."""
+"""Generate cars with a few hundred triangles: a body with recessed windows on four wheels."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from lidarsim.scene.scene_mesh import SceneMesh, stacked
 from .city_kinds import lay_down, loft, regular_polygon
 
 _RECESS_M = 0.03  # depth of a window
-_FRAME = 0.12  # share of a window's width that is frame
+_FRAME = 0.12  # width of the frame as a share of the window
 
 
 @dataclass(frozen=True)
 class CarModel:
-    """Outline of a car that faces x, from the front to the back, meters.
+    """The outline of a car that faces x, from front to back, in meters.
 
-    A station is (x, half width, height of the belt line, height of the roof); without a cabin the
-    two heights are nearly the same. Windows are beside and between the stations of the cabin.
+    Each station is (x, half width, height of the beltline, height of the roof). Without a cabin,
+    the two heights are nearly equal. Windows are beside and between the stations of the cabin.
     """
 
     name: str
     stations: tuple[tuple[float, float, float, float], ...]
-    glazed: range  # stations after which there are windows
+    glazed: range  # stations that are followed by windows
     axles: tuple[float, float]
     wheel_m: float = 0.33  # radius
 
@@ -66,7 +66,7 @@ MODELS = (
 
 
 def car(model: CarModel) -> SceneMesh:
-    """Return a car that stands on z = 0 around the origin.
+    """Return a car that stands on z = 0, centered at the origin.
 
     Examples
     --------
@@ -89,7 +89,10 @@ def all_cars() -> tuple[SceneMesh, ...]:
 
 
 def _body(model: CarModel) -> tuple[Floats, Ints]:
-    """Return vertices and faces of a body: rings of eight corners, joined by quadrangles."""
+    """Return the vertices and faces of a car body.
+
+    The body consists of rings with eight corners each, connected by quadrilaterals.
+    """
     rings = []
     for x, half, belt, roof in model.stations:
         top = half * (0.74 if roof - belt > 0.2 else 0.86)
@@ -102,7 +105,8 @@ def _body(model: CarModel) -> tuple[Floats, Ints]:
         for side in range(8):
             next_side = (side + 1) % 8
             quad = ring[[k, k + 1, k + 1, k], [next_side, next_side, side, side]]
-            # 2 and 4 are beside the belt line, 3 is the roof, or a windscreen if it slopes.
+            # Sides 2 and 4 are above the beltline. Side 3 is the roof or, if it slopes, a
+            # windshield.
             slopes = abs(ring[k, 3, 2] - ring[k + 1, 3, 2]) > 0.25
             glass = k in model.glazed and (side in (2, 4) or (side == 3 and slopes))
             quads += _window(quad) if glass else [quad]
@@ -114,7 +118,7 @@ def _body(model: CarModel) -> tuple[Floats, Ints]:
 
 
 def _window(quad: Floats) -> list[Floats]:
-    """Return the quadrangles of a window: a pane, the sides of its recess, and a frame."""
+    """Return the quadrilaterals of a window: a pane, the sides of its recess, and a frame."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
     hole = quad + _FRAME * (middle - quad)

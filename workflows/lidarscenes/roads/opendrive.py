@@ -1,6 +1,6 @@
-"""OpenDRIVE files, .xodr, after ASAM OpenDRIVE 1.4 to 1.8.
+"""Read OpenDRIVE files (.xodr), following ASAM OpenDRIVE 1.4 to 1.8.
 
-This is not libOpenDRIVE, which reads neither borders of lanes nor lateral shapes.
+libOpenDRIVE is not used, because it reads neither lane borders nor lateral shapes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, lane_material
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
-# Roads of a junction lie on each other. These lanes are lower by meters, so that lanes on which
-# vehicles drive are hit.
+# Roads in a junction overlap. Other lanes are lowered by these distances, so that rays hit the
+# lanes on which vehicles drive.
 _SINK_OF_NONE_M = 0.005
 _SINK_M = 0.002
 _SMALLER = "use a larger sag_m, or divide the file"
@@ -56,7 +56,7 @@ Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
 @dataclass(frozen=True)
 @checked_fields
 class RoadOptions:
-    """Options of roads."""
+    """Options for reading roads."""
 
     sag_m: Annotated[
         float,
@@ -67,8 +67,8 @@ class RoadOptions:
 
 
 def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the roads of a file: lanes, marks, objects and signals."""
-    # A comment before the declaration is not XML, and common.
+    """Read the roads in a file with their lanes, marks, objects, and signals."""
+    # Comments before the XML declaration are common, although they are invalid.
     root = xml_root(data[max(data.find(b"<?xml"), 0) :])
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -98,7 +98,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _RoadReader:
-    """Makes meshes of the roads of a file."""
+    """Converts the roads in a file to meshes."""
 
     def __init__(self, options: ReadOptions, allowance: Allowance, unread: UnreadElements) -> None:
         self._options = options
@@ -149,7 +149,7 @@ class _RoadReader:
             self._add(f"road mark {road.name}", piece)
 
     def _add(self, name: str, piece: Piece) -> None:
-        """Add triangles to an object, with colors and materials if asked for."""
+        """Add triangles to an object, with colors and materials if requested."""
         if not len(piece.faces):
             return
         colors = None
@@ -159,7 +159,7 @@ class _RoadReader:
         self._pieces[name].append(piece._replace(colors=colors, material=material))
 
     def _drop_degenerate(self) -> None:
-        """Drop triangles without an area, such as of lanes whose width shrinks to zero."""
+        """Remove triangles without an area, for example where a lane narrows to zero width."""
         pieces = [piece for pieces in self._pieces.values() for piece in pieces]
         corners = [piece.vertices[piece.faces[:, k]] for k in range(3) for piece in pieces]
         if not corners:
@@ -196,7 +196,7 @@ def _notes(
     meshes: Sequence[SceneMesh | SceneInstance],
     unread: UnreadElements,
 ) -> list[str]:
-    """Return notes on the coordinate system of a file, and on the elements that are not read."""
+    """Return notes on the coordinate system of a file, and on elements that are not read."""
     notes = []
     if header is not None:
         notes = _reference_notes(header, middle_of(meshes))
@@ -207,9 +207,9 @@ def _notes(
 
 
 def _reference_notes(header: Element, middle: Floats) -> list[str]:
-    """Return notes on the coordinate system and the offset that a header states.
+    """Return notes on the coordinate system and the offset in a header.
 
-    `middle` (2,) are x and y in the middle of the roads.
+    `middle` (2,) is the center of the roads.
     """
     text = " ".join((header.findtext("geoReference") or "").split())
     epsg = _epsg(text)
@@ -218,7 +218,7 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
     if offset is not None:
         shift = [read_number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
-    place = middle + shift[:2]  # a heading turns roads about their zero, which is near
+    place = middle + shift[:2]  # approximate if a heading rotates the roads about their origin
     problem = scale_problem(f"EPSG:{epsg}" if epsg else text, *place.tolist()) if text else ""
     if problem:
         system += f", {problem}"
@@ -243,7 +243,10 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
 
 
 def _epsg(text: str) -> int | None:
-    """Return the EPSG code of a definition of PROJ, or None: codes, and UTM zones of WGS 84."""
+    """Return the EPSG code in a PROJ definition, or None.
+
+    Explicit codes and UTM zones with WGS 84 are recognized.
+    """
     code = _EPSG.search(text)
     if code:
         return int(code[1])

@@ -1,4 +1,4 @@
-"""Objects beside and on roads: boxes, cylinders, outlines, rows of copies, markings and tunnels."""
+"""Convert road objects: boxes, cylinders, outlines, repeated copies, markings, and tunnels."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ from .solids import (
 
 TUNNEL_HEIGHT_M = 5.0
 TUNNEL_MARGIN_M = 0.5  # distance between the outermost lanes and the walls
-STRIPE_M = 0.5  # stripes and gaps of crosswalks that state no markings
+STRIPE_M = 0.5  # width of stripes and gaps in crosswalks without markings
 UNTYPED = "object"  # name of objects without a type, whose flat outlines may be lines or decals
 _FLAT = ("crosswalk", "roadMark", "parkingSpace")  # types that are paint if they have no height
 _BYTES_PER_COPY = 4000
-_BYTES_PER_POINT = 400  # peak memory of a point of a rail or tunnel
-_TOP = [3, 2]  # corners of a rail between which it is measured, from the right to the left
-_CEILING = [2, 1]  # ceiling of a tunnel, right to left
+_BYTES_PER_POINT = 400  # peak memory per point of a rail or tunnel
+_TOP = [3, 2]  # corners at the top of a rail, from right to left
+_CEILING = [2, 1]  # corners at the ceiling of a tunnel, from right to left
 _KNOWN_OBJECTS = ("object", "objectReference", "tunnel")
 _KNOWN = ("repeat", "outline", "outlines", "material", "parkingSpace", "markings")
 
 
 class ObjectBuilder:
-    """Builder of the objects of a file."""
+    """Builds the objects in a file."""
 
     def __init__(
         self, network: RoadNetwork, sag_m: float, allowance: Allowance, unread: UnreadElements
@@ -67,7 +67,7 @@ class ObjectBuilder:
         self._rails = _rail_pieces(network, sag_m, allowance)
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the objects of a road."""
+        """Yield the names and triangles of the objects on a road."""
         for group in road.element.iterfind("objects"):
             self._unread.check(group, _KNOWN_OBJECTS)
             for element in group.iterfind("object"):
@@ -79,7 +79,7 @@ class ObjectBuilder:
                     yield name, piece
 
     def _object(self, road: Road, element: Element) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of an object and of its copies."""
+        """Yield the names and triangles of an object and its copies."""
         kind = _kind(element)
         name = f"{kind[:MAX_SHOWN]} {road.name}/{(element.get('id') or '')[:MAX_SHOWN]}"
         repeats = element.findall("repeat")
@@ -115,8 +115,8 @@ class ObjectBuilder:
         size = placement.size
         has_walls = any(outline.heights.any() for outline in outlines)
         if kind in _FLAT and not has_walls:
-            # A marking on the road: its stripes, else its area. A type for markings that states a
-            # height and has no outline is a box, except a parking space.
+            # A marking on the road is drawn as its stripes or, without stripes, as its area. If it
+            # states a height and has no outline, it is a box, except for parking spaces.
             if not painted and (outlines or (min(size[:2]) > 0 and size[2] <= 0)):
                 yield from _flat_pieces(element, kind, frame, placement, outlines)
             elif not outlines and size[2] > 0 and kind != "parkingSpace":
@@ -177,7 +177,7 @@ class ObjectBuilder:
                 yield painted_strips(starts + lift, stops + lift, width, paint)
 
     def _dashed(self, line: Floats, marking: Element) -> tuple[Floats, Floats]:
-        """Return starts and stops (d, 3) of the dashes of a marking along a line (n, 3)."""
+        """Return the starts and stops (d, 3) of the dashes of a marking along a line (n, 3)."""
         dash = read_non_negative(marking, "lineLength", 0.0)
         space = read_non_negative(marking, "spaceLength", 0.0)
         starts = []
@@ -216,7 +216,7 @@ class ObjectBuilder:
     def _tunnel_part(
         self, road: Road, section: LaneSection, start: float, stop: float
     ) -> Iterator[Piece]:
-        """Yield the walls and the ceiling of a tunnel between two distances of a lane section."""
+        """Yield the walls and the ceiling of a tunnel in a part of a lane section."""
         intervals = section.intervals(road, start, stop)
         is_plain = section.is_plain and road.is_plain
         samples = intervals.sampled(
@@ -230,7 +230,7 @@ class ObjectBuilder:
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
     def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
-        """Return corners (k, 4, 3) of a tunnel, from lower left to lower right over the ceiling."""
+        """Return the corners (k, 4, 3) of a tunnel, counterclockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -243,7 +243,7 @@ class ObjectBuilder:
 
 
 class _Rail(NamedTuple):
-    """An object that is drawn along a road, such as a guard rail."""
+    """An object that extends along a road, such as a guard rail."""
 
     road: Road
     start: float  # m
@@ -276,7 +276,7 @@ class _Rail(NamedTuple):
         )
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
-        """Return cross sections (k, 4, 3), from the lower right corner to the upper left."""
+        """Return the cross sections (k, 4, 3), from the lower right to the upper right corner."""
         share = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
@@ -298,7 +298,7 @@ class _Rail(NamedTuple):
 
 
 def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> dict[Element, Piece]:
-    """Return the rails of a file by their <repeat>."""
+    """Return the rails in a file by their <repeat> elements."""
     rails: dict[Element, _Rail] = {}
     for road in network.roads:
         for element in road.element.iterfind("objects/object"):
@@ -322,7 +322,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
     ]
     placed = place_stations(surfaces, sag_m, allowance, _BYTES_PER_POINT)
     rings = _rings(network, rails.values(), [entry.stations for entry in placed])
-    # Where the road steps, one solid ends and another starts.
+    # Where the road steps, a solid ends and another one starts.
     return {
         repeat: merge_pieces(
             [extrude_sections(part, rail.material) for part in np.split(sections, entry.steps + 1)]
@@ -351,21 +351,22 @@ def _rings(
 
 
 class _Placement(NamedTuple):
-    """Place and size of an object or of a copy."""
+    """The position and the size of an object or a copy."""
 
-    s: float  # m
-    t: float  # m
-    z: float  # above the plane of the road, m
-    length: float  # m
-    width: float  # m
-    height: float  # m
-    radius: float  # m; 0 for a box
-    shift: float = 0.0  # distance of a copy along the road from the object, m
+    # All values are in meters.
+    s: float
+    t: float
+    z: float  # height above the plane of the road
+    length: float
+    width: float
+    height: float
+    radius: float  # 0 for a box
+    shift: float = 0.0  # distance along the road from the object to its copy
 
     @classmethod
     def from_element(cls, element: Element) -> _Placement:
         """Return the placement of an <object>."""
-        # A broken size of one object does not make a file unusable: it counts as no size.
+        # A negative size counts as zero, so that a single object does not make a file unusable.
         names = ("length", "width", "height", "radius")
         sizes = [max(0.0, read_number(element, name, 0.0)) for name in names]
         return cls(
@@ -377,16 +378,16 @@ class _Placement(NamedTuple):
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Length, width and height, m."""
+        """Length, width, and height in meters."""
         return self.length, self.width, self.height
 
     @property
     def wide(self) -> float:
-        """Width, or diameter of a round object, m."""
+        """Width in meters, which is the diameter of a round object."""
         return 2 * self.radius if self.radius > 0 else self.width
 
     def repeated(self, repeat: Element, share: float, s: float) -> _Placement:
-        """Return the placement of a copy at a share of the way along a <repeat>."""
+        """Return the placement of a copy at a fraction of the length of a <repeat>."""
         values = {}
         for name, field in (
             ("t", "t"), ("zOffset", "z"), ("length", "length"), ("width", "width"),
@@ -401,7 +402,7 @@ class _Placement(NamedTuple):
 
 
 class _ObjectFrame(NamedTuple):
-    """Frame of an object: its origin, and the directions of its axes."""
+    """The coordinate frame of an object."""
 
     origin: Floats  # (3,), m
     turn: Floats  # (3, 3)
@@ -411,7 +412,7 @@ class _ObjectFrame(NamedTuple):
     def from_element(
         cls, network: RoadNetwork, road: Road, element: Element, placement: _Placement
     ) -> _ObjectFrame:
-        """Return the frame of an object, which is upright whatever the slope of the road."""
+        """Return the frame of an object, which is upright regardless of the slope of the road."""
         frames = network.frames([road], [RoadStations.at(np.array([placement.s]))])
         origin = frames.origins + placement.t * frames.side + placement.z * frames.up
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
@@ -436,7 +437,7 @@ class _Outline(NamedTuple):
     def from_element(
         cls, network: RoadNetwork, road: Road, element: Element, frame: _ObjectFrame
     ) -> _Outline:
-        """Return the outline of an <outline>."""
+        """Read an <outline>."""
         points = []
         heights = []
         ids = {}
@@ -470,12 +471,12 @@ def _kind(element: Element) -> str:
 
 
 def _is_rail(element: Element, repeat: Element) -> bool:
-    """Return True if a <repeat> draws an object along a road, in place of copies."""
+    """Return True if a <repeat> extends an object along the road instead of copying it."""
     return read_non_negative(repeat, "distance", 0.0) == 0 and not _outlines(element)
 
 
 def _outlines(element: Element) -> list[Element]:
-    """Return the outlines of an object that have two corners or more."""
+    """Return the outlines of an object that have at least two corners."""
     outlines = [*element.iterfind("outline"), *element.iterfind("outlines/outline")]
     return [
         outline
@@ -487,7 +488,7 @@ def _outlines(element: Element) -> list[Element]:
 def _walls_and_roofs(outlines: Sequence[_Outline], material: str) -> Piece:
     """Return walls and roofs over outlines.
 
-    Inner outlines are holes of the first outer outline.
+    Inner outlines are holes in the first outer outline.
     """
     outer = [outline for outline in outlines if outline.outer]
     holes = [outline for outline in outlines if not outline.outer and outline.closed]
@@ -524,7 +525,7 @@ def _flat_pieces(
 
 
 def _rectangle(size: Sequence[float]) -> Floats:
-    """Return the corners (4, 3) of a length and a width, from the rear right corner to the left."""
+    """Return the counterclockwise corners (4, 3) of a rectangle, starting at the rear right."""
     half_length = size[0] / 2
     half_width = size[1] / 2
     return np.array(
@@ -554,11 +555,11 @@ def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
 
 
 def _paint_of(element: Element) -> str:
-    """Return the paint of an object that is a mark."""
+    """Return the paint of an object that is a road mark."""
     stated = element.find("material")
     return f"{PAINT} {_paint_color(None if stated is None else stated.get('roadMarkColor'))}"
 
 
 def _paint_color(color: str | None) -> str:
-    """Return the color of paint, by default the standard color white."""
+    """Return the color of paint; the standard color is white."""
     return "white" if color in (None, "", "standard") else color[:MAX_SHOWN]

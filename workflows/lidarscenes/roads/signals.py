@@ -1,4 +1,4 @@
-"""Signals of roads: plates of traffic signs and boxes of traffic lights, on poles."""
+"""Convert road signals: plates of traffic signs and boxes of traffic lights, on poles."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from .road import Road, RoadNetwork
 from .road_materials import CARRIAGEWAY, LAMP, METAL, SIGN
 from .solids import FRONT_FACES, box, cylinder, rotation_matrix
 
-SIZE_M = 0.6  # width and height of signs that state no size
-LIGHT_M = (0.3, 0.9)  # width and height of traffic lights that state no size
-BOTTOM_M = 2.2  # height of the lower edge of signs that state no height
+SIZE_M = 0.6  # default width and height of signs
+LIGHT_M = (0.3, 0.9)  # default width and height of traffic lights
+BOTTOM_M = 2.2  # default height of the lower edge of signs
 PLATE_M = 0.02  # thickness of signs
 LAMP_M = 0.25  # thickness of traffic lights
 POLE_M = 0.038  # radius of poles
-_MIN_POLE_M = 0.3  # a lower edge below this stands without a pole
+_MIN_POLE_M = 0.3  # signals with a lower bottom edge have no pole
 _POLE_SAG_M = 0.003
 # German signs that are paint on the road: lines, arrows and hatched areas.
 _PAINTED = ("293", "294", "295", "296", "297", "298", "299", "340", "341")
@@ -38,13 +38,13 @@ _KNOWN = (
 
 
 class SignalBuilder(NamedTuple):
-    """Builder of the signals of a file."""
+    """Builds the signals in a file."""
 
     network: RoadNetwork
     unread: UnreadElements
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the signals of a road."""
+        """Yield the names and triangles of the signals on a road."""
         for group in road.element.iterfind("signals"):
             self.unread.check(group, _KNOWN_SIGNALS)
             for element in group.iterfind("signal"):
@@ -61,7 +61,7 @@ class SignalBuilder(NamedTuple):
     def _signal(
         self, road: Road, sections: Sequence[LaneSection], element: Element, *, is_light: bool
     ) -> Iterator[Piece]:
-        """Yield plate or box, and pole, of a signal."""
+        """Yield the pole and the plate or box of a signal."""
         default_width, default_height = LIGHT_M if is_light else (SIZE_M, SIZE_M)
         width = read_non_negative(element, "width", 0.0) or default_width
         height = read_non_negative(element, "height", 0.0) or default_height
@@ -95,7 +95,7 @@ class SignalBuilder(NamedTuple):
         yield solid._replace(faces=solid.faces[is_front], material=SIGN)
 
     def _frame(self, road: Road, element: Element) -> _SignalFrame:
-        """Return the frame of a signal, which faces the traffic of its orientation."""
+        """Return the frame of a signal, which faces the traffic for which it is valid."""
         placement = element.find("positionRoad")
         if placement is None:
             placement = element.find("physicalPosition/positionRoad")
@@ -107,20 +107,20 @@ class SignalBuilder(NamedTuple):
             t = np.array([read_number(source, "t")])
             foot = foot + road.heights(at, t)[0] * frames.up[0]
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
-        if element.get("orientation", "+") != "-":  # traffic along the road sees the front
+        if element.get("orientation", "+") != "-":  # it faces traffic in the direction of the road
             heading += np.pi
         return _SignalFrame(foot, heading + read_number(source, "hOffset", 0.0))
 
 
 class _SignalFrame(NamedTuple):
-    """Foot and direction of a signal."""
+    """The foot and the direction of a signal."""
 
     foot: Floats  # (3,): on the plane of the road, m
     heading: float  # direction that the signal faces, rad
 
 
 def _position(element: Element) -> Element | None:
-    """Return the position of a signal in inertial coordinates, or None."""
+    """Return the inertial position element of a signal, or None."""
     position = element.find("positionInertial")
     return element.find("physicalPosition/positionInertial") if position is None else position
 

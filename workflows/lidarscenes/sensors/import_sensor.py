@@ -1,4 +1,4 @@
-"""Files with the rays of a sensor as scenarios: lists of rays, and OmniLidar prims."""
+"""Convert files with the rays of a sensor to scenarios: ray lists and OmniLidar prims."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ _RAYS_FILE = "rays.npz"
 
 
 def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a sensor's file as a scenario into a folder: `scenario.yaml`, and its rays.
+    """Write a sensor file as a scenario: `scenario.yaml`, and a file with the rays.
 
-    The scenario has the scene of `lidarpool demo`, with this sensor in place of the demo's.
+    The scenario has the scene of `lidarpool demo`, but with this sensor.
 
     Parameters
     ----------
     path
-        Livox's list of rays (.csv), a table of rays (.csv, .parquet), arrays of rays, of
-        MuJoCo-LiDAR or of RobotecGPULidar (.npz), or an OmniLidar prim (.usd, .usda, .usdc, .usdz).
+        A Livox ray list (.csv), a ray table (.csv, .parquet), ray arrays of MuJoCo-LiDAR or
+        RobotecGPULidar (.npz), or an OmniLidar prim (.usd, .usda, .usdc, .usdz).
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
-        None: the files name no others.
+        Must be empty, because sensor files do not refer to other files.
 
     Returns
     -------
-    What is not as in the file, a line each.
+    Differences from the file, one line each.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, or is not of a sensor.
+        If the file cannot be read or does not describe a sensor.
     """
     if assets:
         raise LidarError("it is a sensor file, for which `--assets` is not allowed.")
@@ -66,7 +66,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 
 
 def _section(rays: FiredRays) -> dict[str, float | str]:
-    """Return the section `sensor` of a scenario, whose ranges are for users to change."""
+    """Return the `sensor` section of a scenario, in which users can change the ranges."""
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}
     if min_range_m:
@@ -77,7 +77,7 @@ def _section(rays: FiredRays) -> dict[str, float | str]:
 
 
 def _read(path: Path) -> ImportedSensor:
-    """Return the sensor of a file.
+    """Read the sensor in a file.
 
     Raises LidarError if the file cannot be used.
     """
