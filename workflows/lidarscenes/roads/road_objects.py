@@ -230,7 +230,7 @@ class ObjectBuilder:
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
     def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
-        """Return the corners (k, 4, 3) of a tunnel, counterclockwise from the lower left."""
+        """Return the corners (k, 4, 3) of a tunnel, clockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -276,7 +276,7 @@ class _Rail(NamedTuple):
         )
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
-        """Return the cross sections (k, 4, 3), from the lower right to the upper right corner."""
+        """Return the cross sections (k, 4, 3), clockwise from the lower right."""
         share = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
