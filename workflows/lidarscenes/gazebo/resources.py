@@ -187,7 +187,7 @@ class Resources:
     def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
         """Yield the paths NAME/FILE in all folders."""
         name, _, file = location.lstrip("/").partition("/")
-        file = file.lstrip("/")  # else the file would be an absolute path
+        file = file.lstrip("/")  # otherwise, it would be an absolute path
         if name in ("", ".", ".."):
             return
         marks = (_CONFIGS[0], _PACKAGE) if scheme == "package" else _CONFIGS[:1]

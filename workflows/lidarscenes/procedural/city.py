@@ -41,7 +41,7 @@ _AVENUE_M = 24.0
 _AVENUE_EVERY = 4
 _BLOCK_M = ((60.0, 100.0), (46.0, 62.0))  # along x, along y
 _PAVEMENT_M = 3.5  # width
-_KERB_M = 0.15  # height
+_CURB_M = 0.15  # height of the pavement
 _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
@@ -113,7 +113,7 @@ def _furniture(
     lamp_starts = np.searchsorted(lamps["block"], pavement["block"][1:])
     lamps_by_block = np.split(lamps["place"][:, :2], lamp_starts)
     return [
-        *street_trees(blocks, boxes_by_block, lamps_by_block, _KERB_M, trees, seed),
+        *street_trees(blocks, boxes_by_block, lamps_by_block, _CURB_M, trees, seed),
         *parked_cars(blocks, cars, seed),
     ]
 
@@ -191,22 +191,22 @@ def _names(objects: AnyArray) -> list[str]:
 class _Lots(NamedTuple):
     """Lots in the blocks without parks, in two rows along x, back to back."""
 
-    block: Ints  # (n,): number of the block
-    size: Floats  # (n, 2): meters
-    side: Floats  # (n,): -1 if the street is to the south, 1 if it is to the north
-    x: Floats  # (n,): of the middle, meters
-    edge: Floats  # (n,): y of the edge at the pavement
-    yaw: Floats  # (n,): of buildings
-    centrality: Floats  # (n,): 1 at the center of the city, falling to 0
+    block: Ints  # (n,) number of the block
+    size: Floats  # (n, 2) meters
+    side: Floats  # (n,) -1 if the street is to the south, 1 if it is to the north
+    x: Floats  # (n,) x of the center in meters
+    edge: Floats  # (n,) y of the edge at the pavement
+    yaw: Floats  # (n,) yaw of buildings
+    centrality: Floats  # (n,) 1 at the center of the city, falling to 0
 
 
 class _StreetPositions(NamedTuple):
     """Positions along the edges of blocks."""
 
-    block: Ints  # (n,): number of the block
-    xy: Floats  # (n, 2): meters
-    yaw: Floats  # (n,): outwards over the edge
-    along_edge: Floats  # (n, 2): unit vectors along the edge, to the left of outwards
+    block: Ints  # (n,) number of the block
+    xy: Floats  # (n, 2) meters
+    yaw: Floats  # (n,) direction from the block to the street
+    along_edge: Floats  # (n, 2) unit vectors along the edge, to the left of that direction
 
 
 class _CityBlocks:
@@ -270,9 +270,9 @@ class _CityBlocks:
                 ),
                 *self._lots(),
                 self._park_trees(),
-                self._along_streets(TREE, inwards=1.6, spacing=9.0, chance=0.55),
-                self._along_streets(CAR, inwards=-1.3, spacing=6.5, chance=0.35),
-                self._along_streets(LAMP, inwards=0.6, spacing=26.0, chance=0.95),
+                self._along_streets(TREE, inward=1.6, spacing=9.0, chance=0.55),
+                self._along_streets(CAR, inward=-1.3, spacing=6.5, chance=0.35),
+                self._along_streets(LAMP, inward=0.6, spacing=26.0, chance=0.95),
             ]
         )
         order = np.where(objects["owner"] == PAVEMENT, -1.0, self._rng.random(len(objects)))
@@ -288,7 +288,7 @@ class _CityBlocks:
         yaw: Floats | float,
         scale: Floats | float,
         *,
-        z: float = _KERB_M,
+        z: float = _CURB_M,
     ) -> AnyArray:
         """Return rows for objects of a class.
 
@@ -422,11 +422,11 @@ class _CityBlocks:
         )
 
     def _along_streets(
-        self, owner: int, *, inwards: float, spacing: float, chance: float
+        self, owner: int, *, inward: float, spacing: float, chance: float
     ) -> AnyArray:
         """Return objects of a class along all four edges of each block, with gaps."""
         rng = self._rng
-        positions = self._street_positions(inwards, spacing, chance)
+        positions = self._street_positions(inward, spacing, chance)
         block = positions.block
         xy = positions.xy
         if owner == TREE:
@@ -442,15 +442,15 @@ class _CityBlocks:
         xy = xy + positions.along_edge * rng.uniform(-0.5, 0.5, (n, 1))
         return self._rows(CAR, "car", kind=kind, block=block, xy=xy, yaw=yaw, scale=scale, z=0.0)
 
-    def _street_positions(self, inwards: float, spacing: float, chance: float) -> _StreetPositions:
+    def _street_positions(self, inward: float, spacing: float, chance: float) -> _StreetPositions:
         """Return positions along all four edges of each block, each kept with a probability."""
         n = len(self._middle)
         block = np.tile(np.arange(n), 4)
-        yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # outwards over the edge
+        yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # from the block to the street
         along_x = np.repeat([True, False, True, False], n)
         size = self._size[block]
         length = np.where(along_x, size[:, 0], size[:, 1]) - 8
-        distance = np.where(along_x, size[:, 1], size[:, 0]) / 2 - inwards
+        distance = np.where(along_x, size[:, 1], size[:, 0]) / 2 - inward
         count = (length / spacing).astype(np.int64) + 1
         edge = np.repeat(np.arange(4 * n), count)
         step = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)

@@ -18,13 +18,13 @@ MAX_CARS = 50_000
 # Along the edges of a block, in meters: distance between positions, inward offset from the edge,
 # and free space at corners.
 _TREE_APART_M = 7.0
-_TREE_INWARDS_M = 1.3
+_TREE_INWARD_M = 1.3
 _TREE_CORNER_M = 5.0
 _CAR_APART_M = 6.5
-_CAR_INWARDS_M = -1.3
+_CAR_INWARD_M = -1.3
 _CAR_CORNER_M = 8.0
 _CAR_SHIFT_M = 0.5  # maximum, along the street
-_KERB_AT_RIGHT = 0.9  # share of cars with the curb on their right
+_CURB_ON_RIGHT = 0.9  # share of cars with the curb on their right
 _STREET_REACH_M = 3.5  # maximum crown radius at streets, which keeps the center of the road free
 # Yards and parks have at most one tree per cell, in its central part.
 _YARD_M = 6.0
@@ -81,8 +81,8 @@ def street_trees(
 class _TreeSites(NamedTuple):
     """Positions for trees in a block."""
 
-    xy: Floats  # (n, 2): meters
-    room: Floats  # (n,): distance to the nearest building, or the limit at streets
+    xy: Floats  # (n, 2) meters
+    room: Floats  # (n,) distance to the nearest building, or the limit at streets
     at_street: Bools  # (n,)
 
 
@@ -95,7 +95,7 @@ def _tree_sites(
     its buildings, and `lamps` (m, 2) the positions of its street lamps.
     """
     middle, size = block
-    street, _ = _street_positions(size, _TREE_APART_M, _TREE_INWARDS_M, _TREE_CORNER_M)
+    street, _ = _street_positions(size, _TREE_APART_M, _TREE_INWARD_M, _TREE_CORNER_M)
     yard = _yard_positions(size, rng)
     xy = middle + np.concatenate([street, yard])
     at_street = np.arange(len(xy)) < len(street)
@@ -119,7 +119,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
     positions = []
     directions = []
     for middle, size in blocks:
-        xy, yaw = _street_positions(size, _CAR_APART_M, _CAR_INWARDS_M, _CAR_CORNER_M)
+        xy, yaw = _street_positions(size, _CAR_APART_M, _CAR_INWARD_M, _CAR_CORNER_M)
         positions.append(middle + xy)
         directions.append(yaw)
     xy = np.concatenate(positions)
@@ -128,7 +128,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
     direction = direction[chosen]
     ahead = np.column_stack([np.cos(direction), np.sin(direction)])
     xy = xy[chosen] + ahead * rng.uniform(-_CAR_SHIFT_M, _CAR_SHIFT_M, (count, 1))
-    yaw = direction + np.pi * (rng.random(count) > _KERB_AT_RIGHT)
+    yaw = direction + np.pi * (rng.random(count) > _CURB_ON_RIGHT)
     meshes = all_cars()
     kind = rng.integers(len(meshes), size=count)
     return place_instances(
@@ -151,7 +151,7 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
 
 
 def _street_positions(
-    size: Floats, spacing: float, inwards: float, corner: float
+    size: Floats, spacing: float, inward: float, corner: float
 ) -> tuple[Floats, Floats]:
     """Return positions (n, 2) along the edges of a block centered at the origin, and yaws (n,).
 
@@ -161,7 +161,7 @@ def _street_positions(
     yaws = []
     for quarter in range(4):
         length = size[quarter % 2]
-        distance = size[1 - quarter % 2] / 2 - inwards
+        distance = size[1 - quarter % 2] / 2 - inward
         n = int((length - 2 * corner) / spacing) + 1
         shift = (np.arange(n) - (n - 1) / 2) * spacing
         cos = np.cos(quarter * np.pi / 2)
@@ -176,7 +176,7 @@ def _street_positions(
 
 def _yard_positions(size: Floats, rng: np.random.Generator) -> Floats:
     """Return positions (n, 2) in a block centered at the origin, behind its street trees."""
-    inner = size - 2 * (_TREE_INWARDS_M + _YARD_M / 2)
+    inner = size - 2 * (_TREE_INWARD_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)
     cells = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij"), axis=-1)
     inside = 0.5 + _YARD_MIDDLE * rng.uniform(-0.5, 0.5, (n[0] * n[1], 2))

@@ -51,15 +51,17 @@ def _towers() -> list[Solid]:
         tower
         for floors in TOWER_FLOORS
         for tower in (
-            _with_plant_room(loft(rectangle(18, 16), _storeys(floors)), floors),
+            _with_plant_room(loft(rectangle(18, 16), _facade_profile(floors)), floors),
             _stepped(floors),
-            _with_plant_room(loft(regular_polygon(14, 8.5), _storeys(floors)), floors),
-            loft(corner, _storeys(floors)),
+            _with_plant_room(loft(regular_polygon(14, 8.5), _facade_profile(floors)), floors),
+            loft(corner, _facade_profile(floors)),
         )
     ]
 
 
-def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[float, float]]:
+def _facade_profile(
+    floors: int, base: float = 0.0, inset: float = 0.0
+) -> list[tuple[float, float]]:
     """Return the profile of a facade with recessed windows on each floor, and a parapet.
 
     The profile consists of (height, inset) pairs in meters.
@@ -90,7 +92,7 @@ def _stepped(floors: int) -> Solid:
     parts = []
     base = 0.0
     for step, count in enumerate(counts):
-        parts.append(loft(rectangle(18, 16), _storeys(count, base, 2.0 * step)))
+        parts.append(loft(rectangle(18, 16), _facade_profile(count, base, 2.0 * step)))
         base += count * FLOOR_M
     return join_solids([*parts, box(4, 4, 3).translated(0, 0, base)])
 
@@ -101,45 +103,45 @@ def _houses() -> list[Solid]:
     Each house exists with and without a wing.
     """
     houses = []
-    for storeys in (1, 2, 3):
+    for stories in (1, 2, 3):
         for hip in (0.0, 3.0):
-            body = _dwelling(11, 8.5, storeys, hip)
+            body = _dwelling(11, 8.5, stories, hip)
             houses.append(
                 join_solids(
-                    [body, *_front(storeys), box(0.8, 0.8, 2.6).translated(2.6, 1, _eaves(storeys))]
+                    [body, *_front(stories), box(0.8, 0.8, 2.6).translated(2.6, 1, _eaves(stories))]
                 )
             )
-            wing = _dwelling(6, 5, max(1, storeys - 1), 0.0)
+            wing = _dwelling(6, 5, max(1, stories - 1), 0.0)
             turned = Solid(wing.vertices[:, [1, 0, 2]] * [-1, 1, 1], wing.faces)
-            houses.append(join_solids([body, *_front(storeys), turned.translated(2.4, -6, 0)]))
+            houses.append(join_solids([body, *_front(stories), turned.translated(2.4, -6, 0)]))
     return houses
 
 
-def _eaves(storeys: int) -> float:
+def _eaves(stories: int) -> float:
     """Return the height of the eaves of a house in meters."""
-    return 0.4 + 2.8 * storeys
+    return 0.4 + 2.8 * stories
 
 
-def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
+def _dwelling(width: float, depth: float, stories: int, hip: float) -> Solid:
     """Return the walls and the roof of a house.
 
     `hip` is the inset of both ends of the ridge.
     """
-    eaves = _eaves(storeys)
+    eaves = _eaves(stories)
     walls = loft(rectangle(width, depth), [(0, -0.15), (0.4, -0.15), (0.4, 0), (eaves, 0)])
     roof = gable(width + 1, depth + 1, eaves - 0.05, 0.42 * depth, hip)
     return join_solids([walls, roof])
 
 
-def _front(storeys: int) -> list[Solid]:
+def _front(stories: int) -> list[Solid]:
     """Return slightly protruding windows on the long sides, and a door with a step."""
     door = [
         box(1.1, 0.3, 2.1).translated(-1.2, -4.3, 0.3),
         box(1.8, 1.2, 0.3).translated(-1.2, -4.8, 0),
     ]
     window = box(1.3, 0.25, 1.4)
-    positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(storeys))
-    return [*door, *(window.translated(x, y, 1.3 + 2.8 * storey) for x, y, storey in positions)]
+    positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(stories))
+    return [*door, *(window.translated(x, y, 1.3 + 2.8 * story) for x, y, story in positions)]
 
 
 def _trees(seed: int) -> list[Solid]:

@@ -71,8 +71,8 @@ def paint_scene(scene: Scene) -> Scene:
 class _FaceGeometry(NamedTuple):
     """Slopes and heights of the faces in a scene."""
 
-    up: Floats32  # (f,): z of the unit normal
-    height: Floats32  # (f,): of the lowest corner above the lowest point of the object, meters
+    up: Floats32  # (f,) z of the unit normal
+    height: Floats32  # (f,) height of the lowest corner above the base of the object, in meters
 
 
 def _face_geometry(scene: Scene) -> _FaceGeometry:

@@ -87,7 +87,7 @@ class EnclosingBody:
     """The object that surrounds a position."""
 
     name: str
-    bounds: Floats  # (2, 3): lower and upper corner, local coordinates in meters
+    bounds: Floats  # (2, 3) lower and upper corner, local coordinates in meters
     is_whole_scene: bool  # whether the scene contains hardly anything else
 
 
@@ -110,10 +110,10 @@ class PlacementChecker:
         """Cast rays at the scene from all directions."""
         lower, upper = self._scene.bounds
         across = float(np.linalg.norm(upper - lower))
-        towards = -sphere_directions(RAYS)
+        toward = -sphere_directions(RAYS)
         # Aim at a grid of points in the box, because parallel rays would rarely hit thin objects.
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
-        return self.cast(lower + shares * (upper - lower) - 2 * across * towards, towards)
+        return self.cast(lower + shares * (upper - lower) - 2 * across * toward, toward)
 
     def is_object(self, views: Views) -> bool:
         """Return whether a scene is an object, given the views from sensor positions inside it.

@@ -320,9 +320,9 @@ class _Columns(NamedTuple):
     """The columns of points of several surfaces in intervals, and the cells between them."""
 
     size: int  # number of intervals
-    intervals: Ints  # (r,): interval of each column
-    right: Ints  # (q,): columns on the right of cells
-    left: Ints  # (q,): columns on the left of cells
+    intervals: Ints  # (r,) interval of each column
+    right: Ints  # (q,) columns on the right of cells
+    left: Ints  # (q,) columns on the left of cells
 
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[SampledSurface]) -> _Columns:

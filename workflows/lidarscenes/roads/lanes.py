@@ -36,7 +36,7 @@ from .elements import MAX_SHOWN, UnreadElements, read_number
 from .road import Road, RoadFrames, RoadNetwork
 
 _ACROSS_SHARE = 0.3  # share of the height tolerance that is used for curved cross sections
-_KERB_M = 1e-3  # minimum height of a curb
+_CURB_M = 1e-3  # minimum height of a curb
 _MIN_COLUMNS = 2  # minimum number of point columns in a section with lanes
 _BYTES_PER_POINT = 400  # peak memory per point of a lane
 _HALVINGS = 30  # bisection steps for finding where two borders cross
@@ -327,7 +327,7 @@ class Strip(NamedTuple):
     t: Floats  # (c, k) t coordinates of the point columns in meters
     points: Floats  # (c, k, 3) in meters
     steps: Ints  # (j,) stations before a step, where the next station has the same distance
-    is_kerb: bool = False
+    is_curb: bool = False
 
     @property
     def faces(self) -> Ints:
@@ -404,9 +404,9 @@ class SectionSurface:
         self.strips = [*[*self._strips(-1)][::-1], *self._strips(1)]
 
     @cached_property
-    def kerbs(self) -> list[Strip]:
+    def curbs(self) -> list[Strip]:
         """Vertical surfaces between lanes with different heights."""
-        return [*self._kerbs()]
+        return [*self._curbs()]
 
     def sampled(self, intervals: Intervals) -> SampledSurface:
         """Return the sampled surface from which stations are placed.
@@ -500,7 +500,7 @@ class SectionSurface:
         frames = self.frames
         inner_t = self.borders[0]
         middle = len(self.section.lanes[-1])
-        level_points: Floats | None = None  # (k, 3): inner border of level lanes
+        level_points: Floats | None = None  # (k, 3) inner border of level lanes
         for k, lane in enumerate(self.section.lanes[side]):
             t = np.stack([inner_t, self.borders[lane.number]])
             inner_t = t[1]
@@ -550,7 +550,7 @@ class SectionSurface:
             base += self._road.heights(self.stations, t, inside)[..., None] * frames.up
         return np.asarray(base)
 
-    def _kerbs(self) -> Iterator[Strip]:
+    def _curbs(self) -> Iterator[Strip]:
         """Yield vertical strips between lanes with different heights.
 
         They are parts of the higher lanes.
@@ -561,9 +561,9 @@ class SectionSurface:
             right_points = right.points[right_row]
             left_points = left.points[left_row]
             heights = ((left_points - right_points) * self.frames.up).sum(axis=1)
-            if np.abs(heights).max() < _KERB_M:
+            if np.abs(heights).max() < _CURB_M:
                 continue
             is_left_higher = heights.sum() > 0
             lane = left.lane if is_left_higher else right.lane
             points = np.stack([right_points, left_points])
-            yield Strip(lane, np.zeros(points.shape[:2]), points, self.steps, is_kerb=True)
+            yield Strip(lane, np.zeros(points.shape[:2]), points, self.steps, is_curb=True)

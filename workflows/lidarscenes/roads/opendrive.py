@@ -135,11 +135,11 @@ class _RoadReader:
 
     def _add_section(self, road: Road, surface: SectionSurface) -> None:
         """Add the lanes and marks of a lane section."""
-        for strip in (*surface.strips, *surface.kerbs):
+        for strip in (*surface.strips, *surface.curbs):
             lane = strip.lane
-            material = CONCRETE if strip.is_kerb else _material(lane)
+            material = CONCRETE if strip.is_curb else _material(lane)
             points = strip.points.reshape(-1, 3)
-            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_kerb:
+            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_curb:
                 sink_m = _SINK_OF_NONE_M if lane.type == "none" else _SINK_M
                 points = points - np.array([0, 0, sink_m])
             piece = Piece(points, strip.faces, material=material)

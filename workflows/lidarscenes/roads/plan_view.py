@@ -39,8 +39,8 @@ _WEIGHTS = np.append(_WEIGHTS, _WEIGHTS[1::-1])
 class PlanPoints(NamedTuple):
     """Points on reference lines in plan."""
 
-    x: Floats  # (k,), m
-    y: Floats  # (k,), m
+    x: Floats  # (k,) in meters
+    y: Floats  # (k,) in meters
     cosines: Floats  # (k,) cosines of the headings
     sines: Floats  # (k,) sines of the headings
 
@@ -48,7 +48,7 @@ class PlanPoints(NamedTuple):
 class _Clothoid(NamedTuple):
     """A piece of a line, an arc, or a spiral."""
 
-    start: float  # distance of the table, m
+    start: float  # distance in the table, in meters
     x: float
     y: float
     heading: float  # rad
@@ -59,15 +59,15 @@ class _Clothoid(NamedTuple):
 class _Cubic(NamedTuple):
     """A poly3 or paramPoly3 geometry, sampled by arc length."""
 
-    start: float  # distance of the table, m
+    start: float  # distance in the table, in meters
     x: float
     y: float
     cosine: float  # cosine of the heading at the start
     sine: float
-    distances: Floats  # (m,): of the samples from the start, m
-    parameters: Floats  # (m,): of the samples
-    u: Floats  # (4,): coefficients along the heading
-    v: Floats  # (4,): coefficients to the left
+    distances: Floats  # (m,) distances of the samples from the start, in meters
+    parameters: Floats  # (m,) parameters of the samples
+    u: Floats  # (4,) coefficients along the heading
+    v: Floats  # (4,) coefficients to the left
 
 
 class PlanTable:
@@ -82,8 +82,8 @@ class PlanTable:
         self._cubics: list[_Cubic] = []
         self._bends: list[tuple[float, float]] = []  # start and largest curvature of each piece
         self._table = np.zeros((0, 6))
-        self._starts = np.zeros(0)  # (p,): of all pieces
-        self._kinds = np.zeros(0, np.int64)  # (p,): row of `_cubics`; -1 for a clothoid
+        self._starts = np.zeros(0)  # (p,) starts of all pieces
+        self._kinds = np.zeros(0, np.int64)  # (p,) row of `_cubics`; -1 for a clothoid
         self._bend_table = np.zeros((0, 2))
 
     def add(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:

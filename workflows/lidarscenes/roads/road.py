@@ -202,7 +202,7 @@ class LateralShapes:
         table[..., 0] = np.inf
         for profile, s in zip(table, self.stations.tolist(), strict=True):
             profile[: len(groups[s])] = sorted(groups[s], key=itemgetter(0))
-        self._starts: Floats = table[..., 0]  # (m, r), m
+        self._starts: Floats = table[..., 0]  # (m, r) in meters
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:

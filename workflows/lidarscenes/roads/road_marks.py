@@ -49,7 +49,7 @@ class PaintedQuads(NamedTuple):
     """The road marks with a certain color."""
 
     color: str
-    points: Floats  # (v, 3), m
+    points: Floats  # (v, 3) in meters
     faces: Ints  # (f, 3)
 
 

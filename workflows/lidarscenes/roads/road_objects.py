@@ -404,9 +404,9 @@ class _Placement(NamedTuple):
 class _ObjectFrame(NamedTuple):
     """The coordinate frame of an object."""
 
-    origin: Floats  # (3,), m
+    origin: Floats  # (3,) in meters
     turn: Floats  # (3, 3)
-    shift: float  # distance of a copy along the road, m
+    shift: float  # distance of a copy along the road, in meters
 
     @classmethod
     def from_element(
@@ -427,8 +427,8 @@ class _ObjectFrame(NamedTuple):
 class _Outline(NamedTuple):
     """An outline of an object."""
 
-    corners: Floats  # (n, 3), m
-    heights: Floats  # (n,), m
+    corners: Floats  # (n, 3) in meters
+    heights: Floats  # (n,) in meters
     ids: dict[str, Floats]  # {id of a corner: its point}
     closed: bool
     outer: bool

@@ -76,7 +76,7 @@ class SignalBuilder(NamedTuple):
             origin = frame.foot + np.array([0, 0, bottom])
             heading = frame.heading
             if bottom > _MIN_POLE_M and not _hangs(road, sections, element):
-                # Poles stand behind their signs.
+                # The pole is behind the sign.
                 turn = rotation_matrix(heading)
                 behind = (PLATE_M + LAMP_M * is_light) / 2 + POLE_M
                 foot = frame.foot - behind * turn[:, 0]
@@ -115,7 +115,7 @@ class SignalBuilder(NamedTuple):
 class _SignalFrame(NamedTuple):
     """The foot and the direction of a signal."""
 
-    foot: Floats  # (3,): on the plane of the road, m
+    foot: Floats  # (3,) point on the plane of the road, in meters
     heading: float  # direction that the signal faces, rad
 
 

@@ -523,11 +523,11 @@ class LinkPath:
 class _LinkMotion(NamedTuple):
     """Poses and velocities of a robot frame at k times, in the scene frame."""
 
-    positions: Floats  # (3, k): meters
+    positions: Floats  # (3, k) meters
     rotations: Floats  # (3, 3, k)
-    anchors: Floats  # (3, k): points of the frame that have the velocities
-    velocities: Floats  # (3, k): m/s
-    rates: Floats  # (3, k): angular velocities, rad/s
+    anchors: Floats  # (3, k) points to which the velocities refer
+    velocities: Floats  # (3, k) m/s
+    rates: Floats  # (3, k) angular velocities, rad/s
 
     def transformed(self, matrix: Floats) -> _LinkMotion:
         """Return the motion of a frame with a constant pose (4, 4) in this frame."""

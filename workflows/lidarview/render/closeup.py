@@ -98,8 +98,8 @@ class ScenePart:
     """A part of a scene, with the origin of each triangle in the scene."""
 
     scene: Scene
-    parents: Ints  # (f,): the triangle of the uncut scene that each triangle is cut from
-    shares: Floats  # (f,): share of the parent's area
+    parents: Ints  # (f,) triangle of the uncut scene from which each triangle is cut
+    shares: Floats  # (f,) share of the parent's area
 
     @classmethod
     def from_scene(cls, scene: Scene) -> ScenePart:

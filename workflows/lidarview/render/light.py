@@ -34,7 +34,7 @@ class LightMap:
     """The light at a grid of pixels, and the surfaces in these pixels."""
 
     camera: Camera
-    sun: Floats  # (3,) unit vector towards the sun
+    sun: Floats  # (3,) unit vector toward the sun
     openness: Floats32  # (rows, columns) unblocked share of the light, from 0 to 1
     position: Floats32  # (rows, columns, 3) meters; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
@@ -137,10 +137,10 @@ def make_light_map(
     total_light = np.full(len(origins), 1e-9)
     open_light = np.full(len(origins), 1e-9)
     for direction, strength, rotation in zip(*_lights(sun), strict=True):
-        towards = _rotated(direction, rotation)[quarter]
-        light = strength * np.clip(dot(facing, towards), 0, None)
+        toward = _rotated(direction, rotation)[quarter]
+        light = strength * np.clip(dot(facing, toward), 0, None)
         lit = np.flatnonzero(light)
-        free = lit[~is_blocked(surface, cutaway, origins[lit], towards[lit], reach)]
+        free = lit[~is_blocked(surface, cutaway, origins[lit], toward[lit], reach)]
         total_light += light
         open_light[free] += light[free]
     openness = np.ones(has_surface.shape, np.float32)

@@ -37,11 +37,11 @@ class RenderMesh:
         caster = RayCaster(scene.vertices, scene.faces, backend=backend)
         return cls(scene, caster, normalize(doubled), normalize(at_vertices))
 
-    def normals(self, triangle: Ints, u: Floats, v: Floats, towards: Floats) -> Floats:
+    def normals(self, triangle: Ints, u: Floats, v: Floats, toward: Floats) -> Floats:
         """Return the shading normals (n, 3) at hits, on the side that the ray comes from.
 
         The normals are interpolated between the corners (Phong 1975). At creases, the normal of the
-        face replaces that of the corner. `towards` (n, 3) are the directions of the rays.
+        face replaces that of the corner. `toward` (n, 3) are the directions of the rays.
         """
         flat = self.face_normals[triangle]
         corners = self.scene.faces[triangle]
@@ -51,7 +51,7 @@ class RenderMesh:
             creased = dot(normal, flat) < CREASE_COSINE
             smooth += weight[:, None] * np.where(creased[:, None], flat, normal)
         smooth = normalize(smooth)
-        smooth[dot(flat, towards) > 0] *= -1
+        smooth[dot(flat, toward) > 0] *= -1
         return smooth
 
 
@@ -70,7 +70,7 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
     count = int(corner_index.max(initial=-1)) + 1
     mean = np.zeros((count, 3))
     total_angle = np.full(count, 1e-30)
-    inwards = np.zeros(count)
+    inward = np.zeros(count)
     corners = zip((a, b, c), (b, c, a), (c, a, b), corner_index[scene.faces].T, strict=True)
     for position, next_position, previous_position, corner in corners:
         angle = np.arccos(
@@ -83,10 +83,10 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
         total_angle += np.bincount(corner, angle, count)
         for k in range(3):
             mean[:, k] += np.bincount(corner, angle * normals[:, k], count)
-        inwards[corner] = step * (1 + objects % _DEPTH_LEVELS / 2)
+        inward[corner] = step * (1 + objects % _DEPTH_LEVELS / 2)
     mean /= total_angle[:, None]
-    inwards /= np.maximum(dot(mean, mean), _MIN_SQUARE)
-    return replace(scene, vertices=vertices - (inwards[:, None] * mean)[corner_index])
+    inward /= np.maximum(dot(mean, mean), _MIN_SQUARE)
+    return replace(scene, vertices=vertices - (inward[:, None] * mean)[corner_index])
 
 
 def _shared_corners(scene: Scene, objects: Integers) -> Ints:
