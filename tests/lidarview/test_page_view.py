@@ -608,7 +608,7 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
     assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
     first = scene.face_object == 0  # of six objects, far from each other
-    arrays, legend = surface.colored("hits", np.where(first, 3, 0), NOWHERE)
+    arrays, legend = surface.color_by("hits", np.where(first, 3, 0), NOWHERE)
     corners = arrays["corners"]
     colors = arrays["colors"]
     middles = corners.mean(axis=1)
@@ -657,7 +657,7 @@ def test_a_scene_is_colored_by_the_reflectance_of_its_objects():
     share = np.array([1.0, 0.0])
     assert available_colorings(scene, share) == ("gray", "hits", "object", "normals", "reflectance")
     assert available_colorings(scene, np.array([0.5, 0.5])) == ("gray", "hits", "object", "normals")
-    arrays, legend = DisplayMesh(scene, share).colored("reflectance", share, NOWHERE)
+    arrays, legend = DisplayMesh(scene, share).color_by("reflectance", share, NOWHERE)
     colors = arrays["colors"]
     assert np.unique(colors[scene.face_object == 0]).tolist() == [255]
     assert colors[scene.face_object == 1].max() < 40

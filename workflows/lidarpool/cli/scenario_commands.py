@@ -161,7 +161,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     elif survey.suffix.lower() in ENDINGS:
         left_out = import_whole(import_sensor, survey, folder, assets, check)
     else:
-        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).left_out
+        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
     own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())

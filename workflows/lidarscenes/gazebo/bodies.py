@@ -223,7 +223,7 @@ class BodyReader:
             return None
         name = short_name(uri).rpartition("/")[2].lower()
         try:
-            file = self.resources.model(uri, source)
+            file = self.resources.find_model(uri, source)
         except ResourceNotFoundError as error:
             if name in _GROUND_PLANES:
                 return _Included(self._ground_plane(), source)

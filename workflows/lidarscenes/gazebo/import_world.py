@@ -50,7 +50,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         raise LidarError("it is a Gazebo world, for which only one `--assets` folder is allowed.")
     loaded = _loaded(world, assets)
     lidars = [*find_lidars(loaded)]
-    left_out = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
+    unsupported = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
     if not lidars:
         reason = "".join(f" It contains {line}." for line in loaded.notes.remote_lines())
         reason += "".join(f" {line}" for line in unknown_sensors(loaded))
@@ -61,7 +61,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     entry = {"file": world, **({"assets": assets[0]} if assets else {})}
     unseen = _unseen_objects(loaded, [lidar.mask for lidar in lidars], _folders(world, assets))
     seeing = [lidar.lidar._replace(unseen=tuple(unseen.get(lidar.mask, ()))) for lidar in lidars]
-    return write_scenario(folder, "Gazebo", entry, seeing, _materials(loaded), left_out)
+    return write_scenario(folder, "Gazebo", entry, seeing, _materials(loaded), unsupported)
 
 
 def _unseen_objects(

@@ -31,7 +31,7 @@ _OTHER_SENSORS = (
     *("thermal_camera", "wide_angle_camera", "wideanglecamera"),
 )
 _SCANS = ("horizontal", "vertical")
-_NOISE_LEFT_OUT = {
+_NOISE_UNSUPPORTED = {
     "mean": "the mean of the noise",
     "bias_mean": "the mean of the noise bias",
     "bias_stddev": "the standard deviation of the noise bias",
@@ -96,11 +96,11 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     matrix = pose.matrix
     if pose.frame and pose.frame != link.link.name:
         matrix = matmul(link.body.frames.transform_between(pose.frame, link.link.name), matrix)
-    left_out = [*_unknown_elements(element, figures)]
+    unsupported = [*_unknown_elements(element, figures)]
     rate_hz = child_numbers(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
-        left_out.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
+        unsupported.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
@@ -111,9 +111,9 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     resolution_m = 0.0 if ranges is None else child_numbers(ranges, "resolution", 1, "0").item()
     if resolution_m > 0:
         data["optics"] = {"resolution_m": rounded(resolution_m)}
-    data |= _noise(element, figures, left_out)
+    data |= _noise(element, figures, unsupported)
     if element.get("type") in _COLLISION_LIDARS:
-        left_out.append(
+        unsupported.append(
             "rays that hit collision shapes (to include them, set geometry: collision in "
             "scene.files)"
         )
@@ -125,7 +125,7 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
         range_m=_range_m(ranges),
         matrix=matmul(link.matrix, matrix),
         model_matrix=link.model,
-        left_out=tuple(left_out),
+        unsupported=tuple(unsupported),
     )
 
 
@@ -192,19 +192,19 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
     return child_numbers(ranges, "min", 1, "0", at_least=0).item(), max_range_m
 
 
-def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
-    """Return the data file fields for noise, and add differences from Gazebo to `left_out`."""
+def _noise(element: Element, figures: Element, unsupported: list[str]) -> dict[str, Any]:
+    """Return the data file fields for noise, and add differences from Gazebo to `unsupported`."""
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:
         return {}
     kind = (noise.findtext("type") or noise.get("type") or "gaussian").strip()
     if kind not in ("gaussian", "gaussian_quantized", "none"):
-        left_out.append(f"noise of type {printable(kind)[:30]!r}")
+        unsupported.append(f"noise of type {printable(kind)[:30]!r}")
         return {}
-    for name, words in _NOISE_LEFT_OUT.items():
+    for name, words in _NOISE_UNSUPPORTED.items():
         is_used = name != "precision" or kind == "gaussian_quantized"
         if is_used and child_numbers(noise, name, 1, "0").item():
-            left_out.append(words)
+            unsupported.append(words)
     sigma_m = child_numbers(noise, "stddev", 1, "0", at_least=0).item()
     return {"performance": {"range_m": rounded(sigma_m)}} if sigma_m and kind != "none" else {}

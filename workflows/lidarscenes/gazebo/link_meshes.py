@@ -307,7 +307,7 @@ class LinkMeshes:
     def _file(self, uri: str, source: Source) -> Source | None:
         """Return the file at a URI, or add a note and return None if it is missing."""
         try:
-            return self.resources.file(uri, source)
+            return self.resources.find_file(uri, source)
         except ResourceNotFoundError as error:
             self.notes.missing_files[str(error) or "a mesh without <uri>"] += 1
             return None

@@ -111,7 +111,7 @@ class Resources:
             caches=tuple(caches),
         )
 
-    def model(self, uri: str, source: Source) -> Source:
+    def find_model(self, uri: str, source: Source) -> Source:
         """Return the SDFormat file of a model, in the newest version that its model.config lists.
 
         Raises
@@ -128,10 +128,10 @@ class Resources:
                 return Source(target.path, target.root)
         raise ResourceNotFoundError(short_name(uri))
 
-    def file(self, uri: str, source: Source) -> Source:
+    def find_file(self, uri: str, source: Source) -> Source:
         """Return a mesh or image file.
 
-        Raises ResourceNotFoundError and LidarError as `model` does.
+        Raises ResourceNotFoundError and LidarError as `find_model` does.
         """
         for target in self._targets(uri, source):
             if target.path.is_file():

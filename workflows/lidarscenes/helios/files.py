@@ -51,7 +51,7 @@ class Assets:
         self._allowed = [folder.resolve() for folder in self.folders]
         self.root = cache(_root)
 
-    def check(self, file: Path, name: str) -> None:
+    def check_allowed(self, file: Path, name: str) -> None:
         """Check that the survey may refer to a file.
 
         Raises LidarError if the file is outside all folders.
@@ -65,33 +65,33 @@ class Assets:
                 "--assets DIR."
             )
 
-    def file(self, name: str) -> Path:
+    def find_file(self, name: str) -> Path:
         """Return the path of a file, given its name.
 
         Raises LidarError if no folder contains the file, or if the survey may not refer to it.
         """
         for folder in self.folders:
             if (folder / name).is_file():
-                self.check(folder / name, name)
+                self.check_allowed(folder / name, name)
                 return folder / name
         raise LidarError(
             f"the file {name!r} is neither in the folder of the survey nor in a parent folder. "
             "Pass the folder to which its path is relative with --assets DIR."
         )
 
-    def asset(self, reference: str, kind: str, home: Path) -> Asset:
+    def find_element(self, reference: str, kind: str, home: Path) -> Asset:
         """Return the element of a kind for a reference such as FILE.xml#ID.
 
         A reference without a file refers to the file `home`.
         """
         file, _, name = reference.rpartition("#")
-        path = self.file(file) if file else home
+        path = self.find_file(file) if file else home
         elements = {element.get("id", ""): element for element in self.root(path).findall(kind)}
         if name not in elements:
             raise LidarError(f"{path} has no <{kind}> {name!r}.{did_you_mean(name, elements)}")
         return Asset(elements[name], path)
 
-    def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
+    def read_settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
         """Return the attributes of a settings element, with defaults from its template."""
         if element is None:
             return {}
@@ -102,8 +102,8 @@ class Assets:
             raise LidarError(
                 f"the template {template!r} refers to itself or to too many other templates."
             )
-        defaults = self.asset(template, element.tag, home)
-        return self.settings(*defaults, depth + 1) | attributes
+        defaults = self.find_element(template, element.tag, home)
+        return self.read_settings(*defaults, depth + 1) | attributes
 
 
 def _root(path: Path) -> Element:

@@ -133,7 +133,7 @@ def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | N
     fitting = [e for e in elements if e.get("id") == scanner.get("id")]
     if not fitting and len(files.root(home).findall("scanner")) == 1 and len(elements) == 1:
         fitting = elements
-    return files.settings(fitting[0], home) if fitting else None
+    return files.read_settings(fitting[0], home) if fitting else None
 
 
 def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:

@@ -90,8 +90,8 @@ def read_legs(
     legs = []
     for index, element in enumerate(survey.findall("leg")):
         with prefixed(f"leg {index}"):
-            platform = assets.settings(element.find("platformSettings"), home)
-            scanner = assets.settings(element.find("scannerSettings"), home)
+            platform = assets.read_settings(element.find("platformSettings"), home)
+            scanner = assets.read_settings(element.find("scannerSettings"), home)
             position = read_vector(platform)
             if read_flag(platform, "onGround", False) and "trajectory" not in platform:
                 position[2] = height(position[0], position[1])
@@ -168,7 +168,7 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarError("all legs of an interpolated platform must name the same trajectory.")
-    path = assets.file(files.pop())
+    path = assets.find_file(files.pop())
     settings: dict[str, str] = {}
     for leg in reversed(legs):
         settings |= leg.platform

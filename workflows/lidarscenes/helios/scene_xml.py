@@ -61,7 +61,7 @@ class HeliosPart:
         names = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in names]
         for name, library in zip(names, libraries, strict=True):
-            self.assets.check(library, name)
+            self.assets.check_allowed(library, name)
         libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
@@ -189,7 +189,7 @@ class HeliosScene:
             draft.up_axis = text.get("up")
         else:
             draft.material = text.get("matname", "")
-            draft.library = self._assets.file(text["matfile"]) if "matfile" in text else None
+            draft.library = self._assets.find_file(text["matfile"]) if "matfile" in text else None
         if kind == "xyzloader":
             draft.surfels = [self._surfels(file, *_points(file, text)) for file in draft.files]
             number_of_part = name.split()[-1]
@@ -242,7 +242,7 @@ class HeliosScene:
         """
         for root in self._assets.folders:
             for folder in (root / "spectra", root / "data" / "spectra"):
-                self._assets.check(folder / f"{name}.txt", name)
+                self._assets.check_allowed(folder / f"{name}.txt", name)
                 text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
                 if rows:  # micrometers and percent
@@ -253,7 +253,7 @@ class HeliosScene:
         )
         return None
 
-    def left_out(self) -> list[str]:
+    def unsupported_features(self) -> list[str]:
         """Describe the unsupported features of the scene, after all parts have been read."""
         lines = []
         for tag, parts in self._moving.items():
@@ -345,7 +345,7 @@ def _entries(
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
     """Return the files of a loader, given by name or by a folder and a regular expression."""
     if "efilepath" not in text:
-        return [assets.file(text.get("filepath", ""))]
+        return [assets.find_file(text.get("filepath", ""))]
     folder, _, names = text["efilepath"].rpartition("/")
     try:
         fits = re.compile(names)
@@ -357,7 +357,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
         if (root / folder).is_dir():
             paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
             for path in paths:
-                assets.check(path, text["efilepath"])
+                assets.check_allowed(path, text["efilepath"])
             if paths:
                 return paths
     raise LidarError(f"no file matches the efilepath {text['efilepath']!r}.")

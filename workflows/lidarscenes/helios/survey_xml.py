@@ -51,7 +51,7 @@ class ImportedSurvey:
     """The path of a converted scenario, and the unsupported features of its survey."""
 
     path: Path
-    left_out: list[str]
+    unsupported: list[str]
 
 
 def import_survey(
@@ -114,7 +114,7 @@ def import_survey(
         raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return ImportedSurvey(folder / SCENARIO_FILE, survey_import.left_out)
+    return ImportedSurvey(folder / SCENARIO_FILE, survey_import.unsupported)
 
 
 class _Import:
@@ -154,13 +154,15 @@ class _Import:
         unsupported = (
             line for scanner in self._scanners.values() for line in unsupported_features(scanner)
         )
-        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
+        self.unsupported = list(
+            dict.fromkeys([*self._notes, *unsupported, *self.scene.unsupported_features()])
+        )
 
     def _asset(self, kind: str) -> Element:
         """Return the element of a kind, such as "scanner", that the survey refers to."""
         if not (reference := self._element.get(kind)):
             raise LidarError(f"its <survey> has no {kind}.")
-        return self._assets.asset(reference, kind, self._home).element
+        return self._assets.find_element(reference, kind, self._home).element
 
     def _read_legs(self) -> HeliosTrajectory:
         """Read the legs and the platform, fill `_sensors`, and return the trajectory."""
@@ -192,7 +194,7 @@ class _Import:
         mount = self._element.find("scannerMount")
         base = self._element.get("basePlatform")
         if mount is None and base:
-            platform = self._assets.asset(base, "platform", self._home).element
+            platform = self._assets.find_element(base, "platform", self._home).element
             return platform.find("scannerMount")
         return mount
 
@@ -302,7 +304,7 @@ class _Import:
         }
         head = [
             f"Created from the HELIOS++ survey {self._name!r} by lidarpool import.",
-            *(f"Not supported: {line}." for line in self.left_out),
+            *(f"Not supported: {line}." for line in self.unsupported),
         ]
         text = "".join(f"# {line}\n" for line in head) + _dumped(data)
         sensors = {name: _dumped(sensor) for name, sensor in self._files.items()}

@@ -71,10 +71,10 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
         raise LidarError("it is a MuJoCo model, for which only one `--assets` folder is allowed.")
     model = _loaded(path, assets)
     groups = _groups(model)
-    left_out = _differences(model, groups)
+    unsupported = _differences(model, groups)
     groups = {group: sites for group, sites in groups.items() if not _unusable(model, group.camera)}
     if not groups:
-        reason = "".join(f" Not supported: {line}." for line in left_out)
+        reason = "".join(f" Not supported: {line}." for line in unsupported)
         raise LidarError(
             "it has no rangefinder that can become a sensor. To use another sensor, create a "
             f"scenario with `lidarpool init --mesh {path.name}`.{reason}"
@@ -94,7 +94,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     if excluded := [body for body in carriers if body not in objects]:
         bodies = names_of(model, "body")
         entry["exclude"] = [bodies[body] for body in excluded]
-    return write_scenario(folder, "MuJoCo", entry, lidars, {}, left_out)
+    return write_scenario(folder, "MuJoCo", entry, lidars, {}, unsupported)
 
 
 def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:

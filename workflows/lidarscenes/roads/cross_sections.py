@@ -132,7 +132,7 @@ class Intervals:
             has_lead=True,
         )
 
-    def sampled(self, *, are_planes: bool) -> SurfaceSamples:
+    def surface_samples(self, *, are_planes: bool) -> SurfaceSamples:
         """Return the stations at which to measure the surface, possibly in shorter intervals.
 
         In planes, two samples per interval are enough to detect steps.
@@ -177,7 +177,7 @@ class Intervals:
         pieces[:, -1] = self.pieces[:, 1]
         return RoadStations(s.ravel(), pieces.ravel())
 
-    def placed(self, counts: Ints, steps: Bools) -> PlacedStations:
+    def place(self, counts: Ints, steps: Bools) -> PlacedStations:
         """Return stations that divide each interval into a number of parts.
 
         `steps` (n,) marks intervals with a step of the surface at their stop.
@@ -266,7 +266,7 @@ def place_stations(
             columns = len(surface.points) + 2
             allowance.take((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
         placed.append(
-            surface.intervals.placed(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
+            surface.intervals.place(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
         )
     return placed
 

@@ -167,7 +167,7 @@ class LaneSection:
         """Return the stations at which to measure the surface of the section."""
         intervals = self.intervals(road, self.start, self.stop).with_lead(road.breaks)
         are_planes = self.is_plain and road.is_plain and network.is_straight(road, intervals)
-        return intervals.sampled(are_planes=are_planes)
+        return intervals.surface_samples(are_planes=are_planes)
 
     @cached_property
     def is_plain(self) -> bool:
@@ -300,7 +300,7 @@ def section_surfaces(
     )
     placed = place_stations(
         [
-            surface.sampled(entry.intervals)
+            surface.to_sampled(entry.intervals)
             for surface, entry in zip(surfaces, samples, strict=True)
         ],
         sag_m,
@@ -309,7 +309,7 @@ def section_surfaces(
     )
     recomputed_indices = []  # sections with stations that are not among the samples
     for k, (surface, entry) in enumerate(zip(surfaces, placed, strict=True)):
-        part = surface.part_at(entry)
+        part = surface.select_stations(entry)
         if part is None:
             recomputed_indices.append(k)
         else:
@@ -408,7 +408,7 @@ class SectionSurface:
         """Vertical surfaces between lanes with different heights."""
         return [*self._curbs()]
 
-    def sampled(self, intervals: Intervals) -> SampledSurface:
+    def to_sampled(self, intervals: Intervals) -> SampledSurface:
         """Return the sampled surface from which stations are placed.
 
         The stations of this surface must be the samples of `intervals`.
@@ -426,7 +426,7 @@ class SectionSurface:
         is_cell[ends[:-1] - 1] = False
         return SampledSurface(intervals, self._points, is_cell, height_m)
 
-    def part_at(self, placed: PlacedStations) -> SectionSurface | None:
+    def select_stations(self, placed: PlacedStations) -> SectionSurface | None:
         """Return the surface at a subset of the stations, or None if a station is missing."""
         station_indices = np.searchsorted(self.stations.pieces, placed.stations.pieces)
         station_indices = np.minimum(station_indices, len(self.stations) - 1)
@@ -486,7 +486,7 @@ class SectionSurface:
         if not self._road.curved_across:
             return np.zeros(0)
         borders = np.stack([*self.borders.values()])
-        lines = self._road.lines(
+        lines = self._road.points_across(
             self.section.start,
             self.section.stop,
             np.array([borders.min(), borders.max()]),

@@ -73,7 +73,7 @@ class _Cubic(NamedTuple):
 class PlanTable:
     """The reference lines of all roads in a file, one after another along a common distance.
 
-    Roads are added with `add`. After `finish`, they can be evaluated together.
+    Roads are added with `add_road`. After `finish`, they can be evaluated together.
     """
 
     def __init__(self, allowance: Allowance) -> None:
@@ -86,7 +86,7 @@ class PlanTable:
         self._kinds = np.zeros(0, np.int64)  # (p,) row of `_cubics`; -1 for a clothoid
         self._bend_table = np.zeros((0, 2))
 
-    def add(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
+    def add_road(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
         """Add the geometries of a road that starts at `offset` in the table.
 
         Returns the starts of the geometries on the road. The last geometry ends with the road,

@@ -91,7 +91,7 @@ class Road:
         for profile in element.iterfind("lateralProfile"):
             unread.check(profile, ("superelevation", "crossfall", "shape"))
 
-    def place(self, table: PlanTable, offset: float) -> float:
+    def add_to_table(self, table: PlanTable, offset: float) -> float:
         """Add the reference line to a table at an offset, and return the offset of the next road.
 
         Raises MeshFileError if the geometry is shorter than the road.
@@ -108,7 +108,7 @@ class Road:
                 f"geometry ends at {end:,.9g} m. Correct its length or add geometry"
             )
         self.offset = offset
-        self.geometry_starts = table.add(geometries, offset, self.length)
+        self.geometry_starts = table.add_road(geometries, offset, self.length)
         if not len(self.geometry_starts) and self.length > 0:
             raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
         return offset + self.length + _GAP_M
@@ -164,7 +164,7 @@ class Road:
             kinks.append(self.shapes.kinks(start, stop))
         return np.unique(np.concatenate(kinks))
 
-    def lines(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
+    def points_across(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
         """Return the ascending t coordinates (j,) at which cross sections need points.
 
         `t` (2,) are the lower and the upper limit. Straight lines between the points are within
@@ -289,7 +289,7 @@ class RoadNetwork:
         self.roads = [Road(element, unread) for element in elements]
         offset = 0.0
         for road in self.roads:
-            offset = road.place(self._table, offset)
+            offset = road.add_to_table(self._table, offset)
         self._table.finish()
 
     def is_straight(self, road: Road, intervals: Intervals) -> bool:

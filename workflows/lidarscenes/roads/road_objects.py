@@ -219,7 +219,7 @@ class ObjectBuilder:
         """Yield the walls and the ceiling of a tunnel in a part of a lane section."""
         intervals = section.intervals(road, start, stop)
         is_plain = section.is_plain and road.is_plain
-        samples = intervals.sampled(
+        samples = intervals.surface_samples(
             are_planes=is_plain and self._network.is_straight(road, intervals)
         )
         rings = self._tunnel_rings(road, section, samples.stations)
@@ -309,7 +309,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
                 if rail is not None:
                     rails[repeat] = rail
     samples = [
-        rail.intervals.sampled(
+        rail.intervals.surface_samples(
             are_planes=rail.road.is_plain and network.is_straight(rail.road, rail.intervals)
         )
         for rail in rails.values()

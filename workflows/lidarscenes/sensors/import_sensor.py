@@ -48,7 +48,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     if assets:
         raise LidarError("it is a sensor file, for which `--assets` is not allowed.")
     sensor = _read(path)
-    lines = list(sensor.left_out)
+    lines = list(sensor.unsupported)
     rays = sensor.rays
     if rays.times_ns is None:
         lines.append(

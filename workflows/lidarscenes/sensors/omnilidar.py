@@ -67,12 +67,12 @@ class ImportedSensor(NamedTuple):
     ----------
     rays
         Rays of the sensor.
-    left_out
+    unsupported
         Differences from the other program, one clause each.
     """
 
     rays: FiredRays
-    left_out: list[str]
+    unsupported: list[str]
 
 
 def read_omnilidar(path: Path) -> ImportedSensor:

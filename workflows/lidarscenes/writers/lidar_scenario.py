@@ -40,7 +40,7 @@ class Lidar(NamedTuple):
         Minimum and maximum range in meters. The maximum may be infinite.
     matrix, model_matrix
         Transforms from the frames of the lidar and of the model to the world. Shape (4, 4).
-    left_out
+    unsupported
         Differences from the other program, as one clause each.
     unseen
         Name patterns of the objects that the lidar does not see.
@@ -53,7 +53,7 @@ class Lidar(NamedTuple):
     range_m: tuple[float, float]
     matrix: Floats
     model_matrix: Floats
-    left_out: tuple[str, ...] = ()
+    unsupported: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
 
 
@@ -63,7 +63,7 @@ def write_scenario(
     entry: Mapping[str, Any],
     lidars: Sequence[Lidar],
     sections: Mapping[str, Any],
-    left_out: Sequence[str] = (),
+    unsupported: Sequence[str] = (),
 ) -> list[str]:
     """Write a scenario with lidars to a folder, with a data file for each distinct lidar.
 
@@ -80,7 +80,7 @@ def write_scenario(
         One or more lidars.
     sections
         Additional sections of the scenario.
-    left_out
+    unsupported
         Differences from the other program, in addition to those that the lidars state.
 
     Returns
@@ -96,7 +96,10 @@ def write_scenario(
         raise LidarError(
             f"it has {len(lidars)} lidars, but a scenario can have at most {MAX_SENSORS} sensors."
         )
-    lines = [*left_out, *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.left_out)]
+    lines = [
+        *unsupported,
+        *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.unsupported),
+    ]
     files = _Files()
     data = {
         "scene": {"files": [_relative(entry, folder)]},

@@ -79,7 +79,7 @@ class DisplayMesh:
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
-    def colored(
+    def color_by(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
         """Return the arrays for a coloring, and its legend.
@@ -105,7 +105,7 @@ class DisplayMesh:
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
         if by == "hits":
-            return self._colored_by_hits(hit_counts, points)
+            return self._color_by_hits(hit_counts, points)
         if by == "object":
             coloring = make_coloring(self._objects, OBJECT, self.coarse.names)
             colors = coloring.paint(self._objects)
@@ -131,13 +131,13 @@ class DisplayMesh:
         corners = as_bytes(colors).repeat(3, axis=0).reshape(-1, 3, 3)
         return arrays | {"colors": corners}, legend
 
-    def _colored_by_hits(
+    def _color_by_hits(
         self, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays and the legend of `colored` for hits per square meter.
+        """Return the arrays and the legend of `color_by` for hits per square meter.
 
         Large triangles are divided, so that the colors show where the hits are. The parameters are
-        the same as in `colored`.
+        the same as in `color_by`.
         """
         is_shown = self._replacements >= 0
         hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
@@ -158,7 +158,7 @@ class DisplayMesh:
 def available_colorings(
     scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
 ) -> tuple[str, ...]:
-    """Return the names that `DisplayMesh.colored` accepts for a scene.
+    """Return the names that `DisplayMesh.color_by` accepts for a scene.
 
     "reflectance" is available if the objects have different values, "material" if the faces have
     materials, and "color" if the scene has colors.

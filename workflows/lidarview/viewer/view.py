@@ -658,7 +658,7 @@ class View:
             hit_points = (read_positions(self._finder.points, rows) - self.origin).astype(
                 np.float32
             )
-        arrays, legend = surface.colored(color, hit_counts, hit_points)
+        arrays, legend = surface.color_by(color, hit_counts, hit_points)
         return {"legend": legend} | self._floor_and_roof_cut, arrays
 
     @cached_property
