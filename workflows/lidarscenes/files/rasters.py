@@ -418,7 +418,7 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
     target = crs_of_code(epsg)
     place = middle
     if target is not None and crs is not None:
-        with suppress(Exception):  # errors of GDAL have classes that rasterio keeps private
+        with suppress(Exception):  # the classes of GDAL errors are private in rasterio
             place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
     if problem := target_problem(epsg, *place.tolist()):
         raise MeshFileError(f"cannot be reprojected to world.epsg {problem}")
@@ -466,7 +466,7 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
     if source.crs is not None and source.crs != target:
         try:
             corners = transformed(source.crs, horizontal_part(target)[0], corners)
-        except Exception:  # errors of GDAL have classes that rasterio keeps private
+        except Exception:  # the classes of GDAL errors are private in rasterio
             return 0.0
     horizontal, _ = horizontal_part(target)
     scales = [ground_scale(horizontal, x, y) for x, y in corners.tolist()]

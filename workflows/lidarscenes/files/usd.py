@@ -240,7 +240,7 @@ def _content(
         name, mesh, children, instanced = nodes[key]
         for copied, array in instanced:
             inner = nodes[copied]
-            alone = inner[1] is not None and not (inner[2] or inner[3])  # a mesh, and no more
+            alone = inner[1] is not None and not (inner[2] or inner[3])  # only a mesh
             rows = [None] if alone else range(len(copies[array]))
             children += [(copied, array, row) for row in rows]
         return Node(name, matrices[key], meshes.get(mesh, ()), children)

@@ -618,9 +618,9 @@ def _has_surface(prim: Any) -> bool:
 class _Animation(NamedTuple):
     """The motion of a stage, and the times of its poses."""
 
-    animations: list[dict[str, str]]  # names of the animations of skeletons
+    animations: list[dict[str, str]]  # names of the skeleton animations
     attributes: list[Any]  # moving attributes
-    codes: list[float]  # time codes of the poses: one if no animation is asked for
+    codes: list[float]  # time codes of the poses, only one if no animation is requested
 
 
 def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:

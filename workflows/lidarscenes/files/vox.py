@@ -69,9 +69,9 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
 class _Grid(NamedTuple):
     """The grid in a voxel file."""
 
-    counts: Floats  # (3,), voxels along x, y and z
-    min_corner: Floats  # (3,), meters: start of the first voxel
-    edges_m: Floats  # (3,), edges of a voxel
+    counts: Floats  # (3,) number of voxels along x, y, and z
+    min_corner: Floats  # (3,) start of the first voxel in meters
+    edges_m: Floats  # (3,) edge lengths of a voxel in meters
 
 
 class _Table(NamedTuple):
@@ -80,8 +80,8 @@ class _Table(NamedTuple):
     header: dict[str, str]
     grid: _Grid
     density_name: str
-    indices: Floats  # (n, 3), of the voxels in the grid
-    densities: Floats  # (n,), m²/m³
+    indices: Floats  # (n, 3) indices of the voxels in the grid
+    densities: Floats  # (n,) in m²/m³
 
 
 def _read_table(data: bytes) -> _Table:
@@ -114,7 +114,7 @@ def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line:
     """
     try:
         return np.asarray(np.loadtxt(io.BytesIO(text), usecols=used, ndmin=2), np.float64)
-    except ValueError:  # read cell by cell, which names the line
+    except ValueError:  # read again cell by cell to find the invalid line
         lines = io.TextIOWrapper(io.BytesIO(text), "utf-8", "replace")
         return RowReader(columns, used, used=used).read(lines, first_line)
 

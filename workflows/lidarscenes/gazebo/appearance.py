@@ -16,7 +16,7 @@ from .frames import child_numbers
 
 FULL_RETRO = 255.0  # value of <laser_retro> that is as bright as white
 
-# Diffuse colors of the plain materials that Gazebo brings, sRGB.
+# Diffuse sRGB colors of the plain materials that are part of Gazebo.
 _NAMED: dict[str, tuple[float, float, float]] = {
     "black": (0.0, 0.0, 0.0),
     "blue": (0.0, 0.0, 1.0),

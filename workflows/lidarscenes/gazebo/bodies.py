@@ -22,7 +22,7 @@ from .frames import FrameGraph, RelativePose, placement_matrix, read_pose
 from .notes import Notes
 from .resources import ResourceNotFoundError, Resources, Source, short_name
 
-_MAX_NESTED = 30  # models within each other
+_MAX_NESTED = 30  # maximum depth of nested models
 _MODEL_FRAME = "__model__"
 WORLD_FRAME = "world"
 _SEPARATOR = "::"
@@ -44,7 +44,7 @@ class Link(NamedTuple):
 
     name: str
     element: Element
-    source: Source  # file that the link is in
+    source: Source  # file that contains the link
 
 
 class PlacedModel(NamedTuple):
@@ -52,7 +52,7 @@ class PlacedModel(NamedTuple):
 
     name: str
     body: GazeboBody
-    matrix: Floats  # (4, 4), to the frame of the world or model
+    matrix: Floats  # (4, 4) matrix to the frame of the world or model
 
 
 @dataclass(eq=False)

@@ -23,8 +23,8 @@ _MIN_NORM = 1e-6  # smallest norm of a quaternion
 class RelativePose(NamedTuple):
     """A pose in a named frame."""
 
-    matrix: Floats  # (4, 4), from the posed frame to the named frame
-    frame: str  # empty for the default of the element
+    matrix: Floats  # (4, 4) matrix from the posed frame to the named frame
+    frame: str  # empty for the default frame of the element
 
 
 def child_numbers(
@@ -114,7 +114,7 @@ class FrameGraph:
     def __init__(self, root: str) -> None:
         self.root = root
         self.nested: dict[str, FrameGraph] = {}  # {name of a nested model: its frames}
-        self._matrices: dict[str, Floats] = {root: np.eye(4)}  # (4, 4), to the root
+        self._matrices: dict[str, Floats] = {root: np.eye(4)}  # matrices (4, 4) to the root
         self._poses: dict[str, RelativePose] = {}
 
     def define(self, name: str, pose: RelativePose, default: str) -> str:

@@ -42,7 +42,7 @@ class LinkMesh(NamedTuple):
 
     mesh: SceneMesh
     flags: int  # <visibility_flags> of the first shape
-    suffix: str  # end of the object's name: empty for the first mesh of a link
+    suffix: str  # suffix of the object's name, empty for the first mesh of a link
 
 
 @dataclass(eq=False)
@@ -267,7 +267,7 @@ class LinkMeshes:
         """
         if file.path.suffix.lower() not in MESHES:
             raise LidarError(f"Gazebo supports only meshes in {', '.join(MESHES)} files.")
-        # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
+        # Gazebo ignores the up axis in COLLADA and glTF files, but not the unit in COLLADA files.
         meshes = load_meshes(
             file.path,
             up_axis="z",

@@ -95,7 +95,7 @@ def _plane(shape: Element) -> SceneMesh | None:
 def _from_z(normal: Floats) -> Floats:
     """Return the shortest rotation (3, 3) from the z axis to a unit vector (3,)."""
     x, y, z = normal.tolist()
-    if 1 + z < _PARALLEL:  # half a turn, about x
+    if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
     cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
     return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + z))

@@ -70,8 +70,8 @@ class PlacedLink(NamedTuple):
     path: tuple[str, ...]  # names of the enclosing models and of the link
     body: GazeboBody
     link: Link
-    matrix: Floats  # (4, 4), to the world
-    model: Floats  # (4, 4), of the outermost model
+    matrix: Floats  # (4, 4) matrix to the world
+    model: Floats  # (4, 4) matrix of the outermost model
     scale: tuple[float, ...]
 
 

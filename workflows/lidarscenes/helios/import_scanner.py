@@ -35,7 +35,7 @@ class _Reference(NamedTuple):
     """A reference to a scanner: FILE.xml#ID, or FILE.xml if the file has a single scanner."""
 
     file: Path
-    scanner: str  # its id; empty without one
+    scanner: str  # ID of the scanner, or empty
 
     @classmethod
     def from_path(cls, survey: Path) -> _Reference:

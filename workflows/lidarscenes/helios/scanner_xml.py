@@ -30,7 +30,7 @@ _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
 _HEAD_STEP_DEG = 10.0  # maximum rotation per scan with a head; without, it is a full cycle
 _FRAME_HZ = 10.0  # arbitrary, because prism patterns do not repeat
-_SLACK = 1e-9  # slack for divisions whose exact quotients are whole numbers
+_SLACK = 1e-9  # tolerance for divisions whose exact results are integers
 
 # A data file without name and optics, and the rotation from the sensor frame to HELIOS++'s frame.
 ScannerSection = tuple[dict[str, Any], Floats]

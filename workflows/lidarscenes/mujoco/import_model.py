@@ -32,7 +32,7 @@ from .model_file import MujocoOptions, body_matrix, body_object_names, load_mode
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
 _ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC, of cam_projection
-_MAX_RAYS = 65_536  # rays of a camera
+_MAX_RAYS = 65_536  # maximum number of rays of a camera
 _MAX_RATE_HZ = 1e6
 
 
@@ -216,7 +216,7 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
     sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
     row, column = np.divmod(np.arange(width * height), width)
     if sensor_m[1] > 0:
-        # The rays of MuJoCo 4.0 take the principal point from the upper left corner.
+        # MuJoCo 4.0 measures the principal point from the upper left corner.
         focal_x, focal_y, principal_x, principal_y = model.cam_intrinsic[camera].tolist()
         right = ((column + 0.5) / width * sensor_m[0] - principal_x) / focal_x
         down = ((row + 0.5) / height * sensor_m[1] - principal_y) / focal_y

@@ -23,7 +23,7 @@ MAX_WAIT_S = 120  # invalid files may never finish
 # Memory for the simulation. Each ray of a camera needs 24 bytes.
 _ARENA_BYTES = 128 * 2**20
 
-# Prefixes of the names of arrays, and the names after the prefix.
+# Prefixes of array names, and the names that follow each prefix.
 _OF_MODEL = {
     "name": ("s", "_bodyadr", "_geomadr", "_matadr", "_siteadr", "_camadr"),
     "body": ("_parentid", "_rootid", "_weldid", "_mocapid", "_pos", "_quat"),

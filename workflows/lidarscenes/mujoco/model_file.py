@@ -132,7 +132,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         hint = name_hint(keyframe, frame["names"])
         raise LidarError(f"the model has no keyframe {keyframe!r}.{hint}")
     fields = dict(zip(frame.pop("names"), arrays, strict=True))
-    if not options.colors:  # without the pixels of textures
+    if not options.colors:  # the pixels of textures were not read
         fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)
     return SimpleNamespace(**frame, **fields)
 

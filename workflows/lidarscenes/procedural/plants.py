@@ -36,15 +36,15 @@ class Species:
     name: str
     height_m: float
     trunk_m: float  # radius above the roots
-    bare: float  # share of the height without branches
-    crown: tuple[float, ...]  # lengths of branches, meters, at equal steps up the crown
-    angle_deg: tuple[float, float]  # angles of the lowest and the highest branch with the vertical
-    rise_deg: float  # angle between the foot of a branch and its end, upwards
+    bare: float  # fraction of the height without branches
+    crown: tuple[float, ...]  # branch lengths in meters at equal steps up the crown
+    angle_deg: tuple[float, float]  # angles between the vertical and the lowest and highest branch
+    rise_deg: float  # upward turn of a branch between its base and its end
     branches: int
     twigs: int  # twigs per branch
     leaves: int  # leaves per twig
     leaf_m: tuple[float, float]  # length and width of a triangle
-    hang: float = 0.0  # downward part of the directions of twigs and leaves
+    hang: float = 0.0  # downward component of twig and leaf directions
     conifer: bool = False
 
 

@@ -64,11 +64,11 @@ def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
 class Views:
     """Hits of rays in all directions from a list of positions."""
 
-    directions: Floats  # (n, 3), unit vectors
-    distance: Floats  # (n,), meters; infinite without a hit
-    back: Bools  # (n,), whether the back of a triangle was hit
-    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 without a hit
-    heights: Floats  # (n,), local z of the hits
+    directions: Floats  # (n, 3) unit vectors
+    distance: Floats  # (n,) in meters, infinite without a hit
+    back: Bools  # (n,) whether the back of a triangle was hit
+    normals: Floats  # (n, 3) unit normals of the triangles hit, 0 without a hit
+    heights: Floats  # (n,) local z of the hits
 
     @property
     def hit(self) -> Bools:

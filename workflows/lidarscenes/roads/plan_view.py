@@ -52,8 +52,8 @@ class _Clothoid(NamedTuple):
     x: float
     y: float
     heading: float  # rad
-    curvature: float  # at the start, 1/m
-    growth: float  # growth of the curvature, 1/m²
+    curvature: float  # curvature at the start in 1/m
+    growth: float  # change of the curvature per meter, in 1/m²
 
 
 class _Cubic(NamedTuple):
@@ -263,7 +263,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
     speed = hypot(du, dv)
     cosines = (du * cubic.cosine - dv * cubic.sine) / speed
     sines = (du * cubic.sine + dv * cubic.cosine) / speed
-    beyond = np.maximum(along - cubic.distances[-1], 0)  # straight on after the end
+    beyond = np.maximum(along - cubic.distances[-1], 0)  # continue straight after the end
     x = cubic.x + u * cubic.cosine - v * cubic.sine + beyond * cosines
     y = cubic.y + u * cubic.sine + v * cubic.cosine + beyond * sines
     return PlanPoints(x, y, cosines, sines)

@@ -116,7 +116,7 @@ class _SignalFrame(NamedTuple):
     """The foot and the direction of a signal."""
 
     foot: Floats  # (3,) point on the plane of the road, in meters
-    heading: float  # direction that the signal faces, rad
+    heading: float  # direction that the signal faces, in radians
 
 
 def _position(element: Element) -> Element | None:

@@ -40,7 +40,7 @@ from lidarsim.scene.transform import affine
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot
 
-_MAX_LINKS = 1000  # humanoids with hands have 150
+_MAX_LINKS = 1000  # humanoid robots with hands have about 150
 _MAX_FOLDERS_UP = 5  # folders above a robot's file that are searched for its packages
 _MAX_NUMBER = 1e8  # largest number in a file
 _NO_FOLDERS = ("", ".", "..")  # parts of a path that are not names of folders
@@ -301,7 +301,7 @@ class _LinkMeshes:
 
     path: Path
     root: Element
-    size: int  # size of the file, bytes
+    size: int  # file size in bytes
     opacity: OpacityMode
     colors: bool
     materials: bool
@@ -367,7 +367,7 @@ class _LinkMeshes:
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
         """Return scale factors (3,), which may be zero, and the meshes to be scaled."""
         if shape.tag == "mesh":
-            if len(factors := shape.get("scale", "").split()) == 4:  # public files have four
+            if len(factors := shape.get("scale", "").split()) == 4:  # some public files have four
                 shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []

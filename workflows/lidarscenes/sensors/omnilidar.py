@@ -159,7 +159,7 @@ class _State(NamedTuple):
 
     azimuths_deg: Floats  # (n,)
     elevations_deg: Floats  # (n,)
-    times_ns: Ints  # (n,), since the tick
+    times_ns: Ints  # (n,) relative to the tick
 
 
 class _Pattern(NamedTuple):

@@ -19,7 +19,7 @@ class Camera:
     """
 
     eye: Floats  # (3,) meters
-    axes: Floats  # (3, 3), rows: unit vectors to the right, up and forward
+    axes: Floats  # (3, 3) unit vectors to the right, up, and forward as rows
     focal: float  # length in pixels
     center: Floats  # (2,) principal point in pixels; it may lie outside the image
     size: tuple[int, int]  # width and height in pixels

@@ -48,7 +48,7 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 class Coloring:
     """Colors for the values of a column, with a scale between two limits or with labels."""
 
-    # Returns colors (n, 3) in 0 to 1 of values (n,).
+    # Returns the colors (n, 3), from 0 to 1, of values (n,)
     paint: Callable[[AnyArray], Floats]
     name: str  # name of the column
     unit: str  # unit of the limits

@@ -104,7 +104,9 @@ class Film:
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
     box: Floats  # (2, 3) box that the camera circles if there is no platform
-    platform_trajectory: tuple[Floats, Floats] | None = None  # times (w,), ns, and positions (w, 3)
+    platform_trajectory: tuple[Floats, Floats] | None = (
+        None  # times (w,) in ns, and positions (w, 3)
+    )
     range_m: float = 1.0  # typical range of the platform's points
 
     def frames(self) -> Iterator[Bytes]:

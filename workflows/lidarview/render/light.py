@@ -13,7 +13,7 @@ from .camera import Camera
 from .cutaway import Cutaway, is_blocked
 from .surface import RenderMesh, dot, golden_spiral
 
-STRIDE = 2  # shadows are computed at every second pixel of every second row
+STRIDE = 2  # shadows are computed at every second pixel in every second row
 SKY_LIGHTS = 24
 SUN_LIGHTS = 4
 ROTATIONS = (

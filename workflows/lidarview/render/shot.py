@@ -46,12 +46,12 @@ class RaySamples:
     Every array has a row for each ray.
     """
 
-    triangle: Ints  # (n,) or SKY, GROUND
-    distance: Floats32  # (n,) meters, infinite for the sky
-    position: Floats32  # (n, 3) meters, NaN for the sky
+    triangle: Ints  # (n,) triangle index, SKY, or GROUND
+    distance: Floats32  # (n,) in meters, infinite for the sky
+    position: Floats32  # (n, 3) in meters, NaN for the sky
     normal: Floats32  # (n, 3) unit length, NaN for the sky
-    light: Floats32  # (n,) brightness: 1 on open ground
-    weights: Floats32  # (n, 3) of the triangle's corners
+    light: Floats32  # (n,) brightness, 1 on open ground
+    weights: Floats32  # (n, 3) weights of the triangle's corners
 
     def scatter(self, which: Ints, count: int) -> RaySamples:
         """Return `count` samples of the sky in which these samples replace those at given indices.
@@ -96,7 +96,7 @@ class SurfaceView:
 
     part: ScenePart
     uncut: Scene  # the part before it was cut open
-    sensors: Floats  # (p, 3) meters, local coordinates
+    sensors: Floats  # (p, 3) local, in meters
     paths: tuple[Floats, ...]  # paths of moving sensors, (k, 3) each
     actors: int  # number of actors, which are the last objects of the scene
     caption: str  # number of sensors, and the time
@@ -295,7 +295,7 @@ class _OpenScene(NamedTuple):
     part: ScenePart
     surface: RenderMesh  # surface of the part
     uncut: Scene  # the part before it was cut open
-    bounds: Floats  # (2, 3) of the part
+    bounds: Floats  # (2, 3) bounds of the part
     box: Floats | None  # (2, 3) around trajectories; None if all of the scene is shown
     cut_height: float | None  # None if the part is not cut open
 

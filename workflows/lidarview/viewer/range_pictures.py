@@ -73,7 +73,7 @@ def range_image(
     width = int(np.clip(_COLUMN_SHARE * field_rad / max(spacing_rad, 1e-9), 32, _IMAGE_WIDTH))
     column = ((left_rad - azimuth) * (width / max(field_rad, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
-    order = np.argsort(-ranges, kind="stable")  # the nearest is written last
+    order = np.argsort(-ranges, kind="stable")  # the nearest point is written last
     image[row[order], np.minimum(column, width - 1)[order]] = _range_colors(ranges, limits)[order]
     return image
 

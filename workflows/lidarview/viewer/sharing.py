@@ -88,7 +88,9 @@ def export_view(
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} has an unsupported extension. Use {' or '.join(suffixes)}.")
-        if file and not file.parent.is_dir():  # films take seconds to draw
+        if (
+            file and not file.parent.is_dir()
+        ):  # fail before the film is rendered, which takes seconds
             raise LidarError(
                 f"{file} cannot be written, because the folder {file.parent} does not exist."
             )
