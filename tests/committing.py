@@ -34,4 +34,4 @@ def commit(store, first, counts, triangles, hits, job=None, offset=0):
     store.storage.prepare()
     store.storage.write(name, data)
     receipt = Receipt.from_part(part, job.number, name, len(data))
-    return bool(store.db.commit([(store.under_way[job.number], receipt)]))
+    return bool(store.db.commit([(store.in_flight[job.number].committed, receipt)]))

@@ -38,7 +38,7 @@ import lidarpool
 from lidarpool import Campaign, LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.storage import Storage
 
@@ -132,7 +132,7 @@ class Resumed:
 
     def survey(self, place: Path) -> str:
         """Resume a survey."""
-        job = build(Scenario.load(self._source / "base.yaml")).job()
+        job = prepare(Scenario.load(self._source / "base.yaml")).job
         result = lidarpool.simulate(
             job.scene, job.survey, client=self._client, backend="numpy", folder=place / "run",
             resume=True, batch_mb=1,
@@ -269,7 +269,7 @@ def targets(folder: Path, client: Client) -> list[Target]:
     campaign.run(wholes["set"], client=client, overwrite=True)
     for number in (1, 2):
         campaign.run(wholes["shards"] / f"part-{number}", client=client, shard=(number, 2))
-    job = build(Scenario.load(folder / "base.yaml")).job()
+    job = prepare(Scenario.load(folder / "base.yaml")).job
     lidarpool.simulate(
         job.scene, job.survey, client=client, backend="numpy", folder=wholes["run"] / "run",
         batch_mb=1,

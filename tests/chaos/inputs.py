@@ -25,7 +25,7 @@ from lidarpool import (
 )
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.recordings.opening import open_sensors
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.playback.pcap_recording import PcapRecording
 from raybeam.compiled import compiled
@@ -125,7 +125,7 @@ def read_recordings(place: Path) -> str:
 def read_traces(place: Path) -> str:
     """Build scenarios with the traffic of each trace."""
     for path in sorted(place.glob("*.yaml")):
-        build(Scenario.load(path))
+        prepare(Scenario.load(path))
     return ""
 
 

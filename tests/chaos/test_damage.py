@@ -23,7 +23,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 
 from lidarpool import LidarError
 from lidarpool.columns.parts import part_name
-from lidarpool.run.pipeline.committed_job import CommittedJob
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
@@ -70,14 +70,14 @@ def test_a_damaged_database_is_refused_or_the_same(tmp_path):
     copy = tmp_path / "copy.db"
 
     def content(database: RunDatabase) -> object:
-        job = CommittedJob(0, range(100))
+        job = CommittedResults(0, range(100))
         database.read(job)
         summaries = [*map(database.summaries, job.parts.ordered)]
         rows = [*database.job_rows()]
         return job.parts.ordered, summaries, job.trials, rows, database.meta
 
     with closing(RunDatabase(path)) as db:
-        job = CommittedJob(0, range(100))
+        job = CommittedResults(0, range(100))
         mark = db.meta["mark"]
         for first in range(0, 100, 5):
             name = part_name(mark, 0, first, first + 5)

@@ -9,7 +9,7 @@ from tests.shapes import quad
 
 from lidarpool import LidarError, Pose, Scene, SceneMesh
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.media.materials import MaterialTable
@@ -40,7 +40,7 @@ def made(folder):
 
     def make(*copies, scene=None, **others):
         data = {"scene": {"files": "land.glb", **(scene or {}), "copies": [*copies]}, **others}
-        return build(Scenario.from_data(data, folder=folder))
+        return prepare(Scenario.from_data(data, folder=folder))
 
     return make
 

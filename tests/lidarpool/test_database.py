@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from lidarpool import LidarError, Planning
 from lidarpool.columns.parts import part_name
 from lidarpool.plan import run_trial
-from lidarpool.run.pipeline.committed_job import CommittedJob
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
 
@@ -57,14 +57,14 @@ def job(db):
 
 def read(db, number=JOB):
     """Read what is committed of a job."""
-    job = CommittedJob(number, range(SCANS))
+    job = CommittedResults(number, range(SCANS))
     db.read(job)
     return job
 
 
 def commit(db, job, *receipts):
     """Commit receipts of a job; returns those that were new."""
-    return [part for _, part in db.commit((job, receipt) for receipt in receipts)]
+    return db.commit((job, receipt) for receipt in receipts)
 
 
 def reopened(db):
@@ -108,8 +108,7 @@ def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, co
     jobs = [read(db, number) for number in range(2)]
     for spans in commits:
         receipts = [(jobs[job], receipt(first, stop, job=job)) for job, first, stop in spans]
-        for job, part in db.commit(receipts):
-            assert job.number == part.job
+        for part in db.commit(receipts):
             for scan in range(part.first, part.stop):
                 assert scan not in owners[part.job]
                 owners[part.job][scan] = part.name
@@ -151,7 +150,7 @@ def test_parts_that_are_dropped_are_missing_again(db, job):
     assert found.parts.missing(0, SCANS) == [] and found.scans_complete
     found.has_frames = True
     assert not found.scans_complete
-    found.frames = SCANS
+    found.advance_frames(SCANS)
     assert found.scans_complete
     again.close()
 
@@ -159,19 +158,19 @@ def test_parts_that_are_dropped_are_missing_again(db, job):
 def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db, job):
     commit(db, job, receipt(0, 4), receipt(4, 8), receipt(12, 16))
     for scan, firsts in ((4, [4, 12]), (3, [4, 12]), (7, [12])):
-        job.frames = scan + 1
-        assert [p.first for p in job.unframed()] == firsts
+        job.advance_frames(scan + 1)
+        assert [p.first for p in job.parts.reaching_past(job.frames)] == firsts
     commit(db, job, receipt(8, 12))
-    job.frames = 10
+    job.advance_frames(10)
     again = reopened(db)
     job = read(again)
     assert job.frames == 8, "those since are handed out once more"
-    job.frames = 10
+    job.advance_frames(10)
     again.save_frames([job])
     last = reopened(again)
     job = read(last)
     assert job.frames == 10
-    assert [part.first for part in job.unframed()] == [8, 12]
+    assert [part.first for part in job.parts.reaching_past(job.frames)] == [8, 12]
     assert job.parts.part_of(12).summaries == b"", "nobody needs them in memory"
     assert [last.summaries(part) for part in job.parts.ordered] == [b"summary"] * 4
     last.close()
@@ -235,7 +234,7 @@ def test_jobs_that_are_forgotten_are_done_again(db):
 
 def test_a_job_that_is_restarted_has_nothing(db, job):
     commit(db, job, receipt(0, 5))
-    job.frames = 5
+    job.advance_frames(5)
     db.save_frames([job])
     db.restart(job)
     assert (job.missing_count, job.frames, job.parts.ordered) == (

@@ -18,9 +18,9 @@ from trimesh import creation
 from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
 from lidarpool.scenario.default_poses import place_sensor, poses_around
 from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.floor import floor_and_ceiling
@@ -106,7 +106,7 @@ LONG.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0
 )
 def test_the_default_grid_is_narrowed_to_an_object(tmp_path, mesh, points, rays):
     mesh.export(tmp_path / "a.stl")
-    built = build(Scenario.load(tmp_path / "a.stl"))
+    built = prepare(Scenario.load(tmp_path / "a.stl"))
     survey = built.survey
     assert 0.6 * rays < survey.ray_count <= rays
     rig = Rig(built.scene, survey, "auto")
@@ -132,7 +132,7 @@ def test_a_sensor_of_the_users_stays_as_it_is(tmp_path):
     creation.torus(1, 0.3).export(tmp_path / "a.stl")
     for data in ({"sensor": {"layers": 40}}, {"mount": {"pitch_deg": 5}}):
         scenario = Scenario.from_data({"scene": "a.stl", **data}, folder=tmp_path)
-        built = build(scenario)
+        built = prepare(scenario)
         assert built.placing.surrounds_object and not built.placing.grid
         assert built.survey.ray_count == 200_000
 
@@ -223,11 +223,11 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     (tmp_path / "b.stl").write_bytes(creation.icosphere(3, 5.0).export(file_type="stl"))
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
-    [warning] = implausibilities(build(given))
+    [warning] = implausibilities(prepare(given))
     assert "only the back faces of surfaces" in warning
     assert "To view the scene from outside, use poses: [{position: [" in warning
     data["poses"] = [[0, 0, 9]]
-    assert implausibilities(build(Scenario.from_data(data, folder=tmp_path))) == []
+    assert implausibilities(prepare(Scenario.from_data(data, folder=tmp_path))) == []
 
 
 @pytest.mark.parametrize("far", [0.2, 5.0])
@@ -252,7 +252,7 @@ def test_a_card_seen_from_behind_is_no_body(far):
 def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     capsule = creation.capsule(length * 0.8, length * 0.1)
     (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
-    built = build(Scenario.load(tmp_path / file))
+    built = prepare(Scenario.load(tmp_path / file))
     notes = " ".join(advice(built))
     assert "was recognized as an object" in notes and ("possibly mm), or pass" in notes) == noted
 
@@ -262,7 +262,7 @@ def test_files_of_our_own_need_no_unit_and_no_axes(tmp_path, suffix):
     scene = terrain(2_000, 0, 1000.0)
     write_scene(tmp_path / f"own{suffix}", scene)
     read = Scenario.load(tmp_path / f"own{suffix}")
-    assert [note for note in advice(build(read)) if "default poses" not in note] == []
+    assert [note for note in advice(prepare(read)) if "default poses" not in note] == []
 
 
 def test_default_poses_are_listed_to_the_millimeter(tmp_path):
@@ -271,7 +271,7 @@ def test_default_poses_are_listed_to_the_millimeter(tmp_path):
     (tmp_path / "hall.stl").write_bytes(hall.export(file_type="stl"))
     scenario = Scenario.load(tmp_path / "hall.stl")
     poses = [[0.333, 0.0, 0.893], [0.333, 0.0, 1.643], [0.333, 0.0, 2.393]]
-    built = build(scenario)
+    built = prepare(scenario)
     assert advice(built)[-1] == f"no poses are set, so the default poses are {poses}"
     assert built.placing.entries == poses
     assert init_poses(tmp_path) == poses

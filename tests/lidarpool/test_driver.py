@@ -18,10 +18,10 @@ from lidarpool.run.pipeline import batches as job_state
 from lidarpool.run.pipeline import dispatch, pipeline_job, policies
 from lidarpool.run.pipeline import pipeline as driver
 from lidarpool.run.pipeline.batches import BatchState, Outcome
+from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.dispatch import PIECES
 from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
-from lidarpool.run.pipeline.pipeline_job import PipelineJob
 from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
 from lidarpool.run.pipeline.stage_messages import (
     ColumnsLost,
@@ -70,7 +70,7 @@ class Workers:
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
         return TaskLocations(frozenset(self.slots), frozenset(self.silent), free)
 
-    def look(self):
+    def refresh(self):
         return self.seen
 
     def add(self, job, scene, survey):
@@ -80,7 +80,7 @@ class Workers:
     def remove(self, job):
         del self.jobs[job]
 
-    def want(self, slots):
+    def request_slots(self, slots):
         self.wanted.append(slots)
 
     def submit(self, batches, worker):
@@ -139,7 +139,8 @@ class Stages:
         self.collectors = {"collect-0": "tcp://a:2", "collect-1": "tcp://c:2"}
         self.orders = {name: deque() for name in self.collectors}  # what collectors have to do
         self.unsorted = []
-        self.inbox = []
+        self.inbox = []  # messages for the driver
+        self.ranges = []  # of stage 1, which the driver takes when it has room
         self.advice = 5  # scans in a batch
         self.seconds = 0.1  # that a batch takes to cast
         self.held = {}  # {name: part that is not in storage}
@@ -156,7 +157,7 @@ class Stages:
     def open(self):
         self._storage.prepare()
 
-    def look(self, progress):
+    def refresh(self, progress):
         changes = self.changes
         self.changes = ({}, [])
         if "generate" in changes[1]:
@@ -169,6 +170,10 @@ class Stages:
     def wait(self, seconds, keys, *, scans, linger_s=0.0):
         self.wanted = scans
         self.linger_s = linger_s
+        messages = [*self.inbox, *(self.ranges if scans else ())]
+        self.inbox = []
+        self.ranges = [] if scans else self.ranges
+        return messages
 
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
@@ -196,10 +201,10 @@ class Stages:
 
     def generate(self):
         """Describe some scans of the first survey that is left."""
-        if self.wanted and self.described:
+        if self.described and len(self.ranges) < 20:
             one = self.described.popleft()
             stop = min(one.stop, one.first + self.advice)
-            self.inbox.append(ScanRange(one.job, one.first, stop))
+            self.ranges.append(ScanRange(one.job, one.first, stop))
             if stop < one.stop:
                 self.described.appendleft(replace(one, first=stop))
 
@@ -246,22 +251,15 @@ class Stages:
 SUMMARY = summary_type(samples_of_scan(SCANS))
 
 
-class ReadableJob(PipelineJob):
-    """A job of whose scans there are no points."""
-
-    def points_of_scan(self, scan):
-        return str(scan)
-
-
 class Run:
     """A driver with what it talks to."""
 
     def __init__(self, folder):
         self.storage = Storage.at(folder / "parts", durable=False)
         self.db = RunDatabase(folder / "run.db", durable=False)
-        self.frames = {}  # {job: its frames}
+        self.frames = {}  # {job: scan and hits of each of its frames}
         self.committed = {}  # {job: its parts}
-        self.under_way = {}  # {number: job}
+        self.begun = {}  # {number: job}
         self.ended = {}  # {job: why it has failed, None if it has not}
         self.restart()
 
@@ -273,19 +271,25 @@ class Run:
         self.driver.open()
 
     def begin(self, number=0, survey=SURVEY, scene=SCENE, *, frames=True, fit=SCANS):
-        parts = self.committed.setdefault(number, [])
-        framed = self.frames.setdefault(number, [])
-        job = ReadableJob(number, scene, survey, range(survey.scan_count))
-        self.db.read(job)
-        self.under_way[number] = job
-        on_frame = framed.append if frames else None
-        self.driver.begin(job, scans_per_task=fit, on_frame=on_frame, on_parts=parts.extend)
-        return job
+        self.committed.setdefault(number, [])
+        self.frames.setdefault(number, [])
+        committed = CommittedResults(number, range(survey.scan_count), has_frames=frames)
+        self.db.read(committed)
+        self.begun[number] = self.driver.begin(committed, scene, survey, scans_per_task=fit)
+        return self.begun[number]
 
     def step(self):
-        self.driver.step()
-        self.ended |= {job.number: error for job, error in self.driver.take_ended()}
-        self.driver.wait(0.0)
+        self.driver.wait()
+        news = self.driver.step()
+        for part in news.parts:
+            self.committed[part.job].append(part)
+        for job, summaries in news.frames:
+            hits = np.frombuffer(summaries.data, SUMMARY)["hits"].tolist()
+            for scan, count in zip(summaries.scans, hits, strict=True):
+                if scan >= job.committed.frames:
+                    self.frames[job.number].append((scan, count))
+                    job.committed.advance_frames(scan + 1)
+        self.ended |= {job.number: error for job, error in news.ended}
 
     def until(self, condition, *, idle=""):
         """Let everybody work, but for those who are idle, until something is so."""
@@ -316,11 +320,10 @@ class Run:
         self.driver.finish()
         done = [number for number, error in self.ended.items() if error is None]
         for number in done:
-            job = self.under_way[number]
+            job = self.begun[number]
             scans = list(job.scans)
-            if job.has_frames:
-                assert [frame.scan for frame in self.frames[number]] == scans
-                assert [frame.hit_count for frame in self.frames[number]] == scans
+            if job.committed.has_frames:
+                assert self.frames[number] == [(scan, scan) for scan in scans]
             spans = sorted((part.first, part.stop) for part in self.committed[number])
             assert [scan for span in spans for scan in range(*span)] == scans
             for part in self.committed[number]:
@@ -364,18 +367,18 @@ def clock(monkeypatch):
 def test_the_driver_waits_for_more_news_only_while_much_is_under_way(empty):
     for number in range(10):
         empty.begin(number, TINY)
-    empty.driver.wait(0.0)
+    empty.driver.wait()
     alone = empty.stages.linger_s
     dispatcher = empty.driver.dispatcher
     empty.until(lambda: 2 * len(dispatcher.batches) > dispatcher.max_weight, idle="cast")
-    empty.driver.wait(0.0)
+    empty.driver.wait()
     assert alone == driver.LINGER_S < empty.stages.linger_s <= 10 * driver.LINGER_S
     empty.end()
 
 
 def test_undisturbed_each_batch_is_cast_once(run):
     run.end()
-    assert set(run.workers.tried.values()) == {1} and run.job.offered_again == 0
+    assert set(run.workers.tried.values()) == {1}
     assert run.job.cast == run.job.generated == SCANS
     assert run.driver.book.stages["intersect"].items == SCANS
     assert run.job.seconds == pytest.approx(0.1 * len(run.committed[0]))
@@ -386,7 +389,7 @@ def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
     run.until(lambda: len(run.committed[0]) >= 4)
     done = [(0, part.first, part.stop) for part in run.committed[0]]
     framed = len(run.frames[0])
-    run.db.save_frames([run.job])
+    run.db.save_frames([run.job.committed])
     run.db.close()
     run.db = RunDatabase(run.db.path, durable=False)
     run.restart()
@@ -431,14 +434,14 @@ def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(
         orders.clear()
     clock.now += LATE_S + 1
     run.step()
-    run.until(lambda: not run.job.parts.missing(*span))
+    run.until(lambda: not run.job.committed.parts.missing(*span))
     assert run.workers.tried[0, *span] == 2
     before = len(run.committed[0])
     written = run.storage.read(name)
     run.storage.write(name, written)  # as its collector does when it wakes up
     run.stages.inbox += [*first, *first, ColumnsLost(order.key)]
     run.step()
-    assert len(run.committed[0]) == before and run.job.parts.part_of(span[0]).name == name
+    assert len(run.committed[0]) == before and run.job.committed.parts.part_of(span[0]).name == name
     run.end()
     assert len(run.storage.sizes()) == len(run.committed[0])
 
@@ -452,7 +455,7 @@ def test_what_is_lost_on_its_way_is_cast_again(run, how):
     run.stages.held.clear()  # the worker has died
     run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key)]
     run.step()
-    assert run.job.parts.missing(*span) == [span]
+    assert run.job.committed.parts.missing(*span) == [span]
     run.end()
     assert run.workers.tried[0, *span] == 2
 
@@ -469,7 +472,7 @@ def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driv
 def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):
     frames = run.frames[0]
     run.until(lambda: len(frames) >= 10)
-    run.until(lambda: run.job.parts.scans_done >= len(frames) + 20, idle="sort")
+    run.until(lambda: run.job.committed.parts.scans_done >= len(frames) + 20, idle="sort")
     run.stages.die("sort")
     run.step()
     handed_out = len(frames)
@@ -487,7 +490,9 @@ def test_a_sorter_that_says_nothing_gets_all_again(run, clock):
     run.stages.unsorted.clear()
     clock.now += STALL_S + 1
     run.step()
-    assert [s.first for s in run.stages.unsorted] == [p.first for p in run.job.parts.ordered]
+    assert [s.first for s in run.stages.unsorted] == [
+        p.first for p in run.job.committed.parts.ordered
+    ]
     run.end()
 
 
@@ -536,8 +541,8 @@ def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
     # Twice with the whole batch, once alone, once with its piece, and three times by itself.
     pieces = 20 // -(-20 // PIECES)
     assert pieces == 10 and sum(deaths) == 2 + 1 + 1 + 3
-    assert run.job.parts.missing(0, SCANS) == [(poison, poison + 1)]
-    assert [frame.scan for frame in run.frames[0]] == list(range(poison))
+    assert run.job.committed.parts.missing(0, SCANS) == [(poison, poison + 1)]
+    assert run.frames[0] == [(scan, scan) for scan in range(poison)]
     run.end()  # nothing is left of it
 
 
@@ -717,7 +722,7 @@ def test_a_job_that_is_committed_ends_at_once(empty):
     empty.begin(frames=False)
     empty.until(lambda: empty.ended)
     empty.begin(frames=False)
-    assert [error for _, error in empty.driver.take_ended()] == [None]
+    assert [error for _, error in empty.driver.step().ended] == [None]
     assert not empty.stages.described
 
 

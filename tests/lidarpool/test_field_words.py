@@ -8,7 +8,7 @@ import pytest
 from lidarpool import Planning
 from lidarpool.base.field_words import differences, fields_in_words
 from lidarpool.run.job_source import fields_of
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.words import rounded
 
@@ -17,8 +17,8 @@ POSES = [[x, 0, 1] for x in range(30)]
 
 def words(**sections):
     """Return the fields of the survey of a scenario."""
-    built = build(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]]} | sections))
-    return fields_of(built.scene, built.survey, built.planning)
+    built = prepare(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]]} | sections))
+    return fields_of(built.scene, built.survey, built.job.planning)
 
 
 @pytest.mark.extended(every=3)

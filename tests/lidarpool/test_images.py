@@ -27,7 +27,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.base.model_names import model_names
@@ -254,7 +254,7 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
 
 @pytest.mark.parametrize("entry", ["images", "{format: mcap, layout: images}"])
 def test_a_scenario_keeps_every_return(entry):
-    survey = build(
+    survey = prepare(
         Scenario.from_data(load_yaml(f"scene: seed\noutput: {{write: [{entry}]}}"))
     ).survey
     assert survey.keep_every == 1
@@ -263,7 +263,7 @@ def test_a_scenario_keeps_every_return(entry):
         load_yaml(f"{{scene: seed, output: {{write: [{entry}]}}, cloud: {{keep_every: 5}}}}")
     )
     with pytest.raises(LidarError, match=r"Set `cloud\.keep_every"):
-        build(thinned)
+        prepare(thinned)
 
 
 @pytest.mark.parametrize("name", ["dual", "all, noise, moving, two sensors"])

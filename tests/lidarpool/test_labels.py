@@ -12,7 +12,7 @@ from tests.drives import points_of, the_scene, the_sweeps
 from lidarpool.clouds.format_table import FORMATS, format_named
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.preview import first_sweeps
 from lidarscenes.procedural.city import city as city_scene
@@ -78,11 +78,12 @@ def test_classes_without_a_name_are_noted_if_others_have_names(tmp_path):
         "scene": "scene.glb",
         "poses": [[0, 0, 1]],
         "materials": [{"objects": "*", "class": 4}],
+        "cloud": {"precision_m": 0.01},
         "actors": [{"name": "Cart", "box": [1, 1, 1], "at": [4, 0, 0.5], "class": 30}],
     }
     for classes, noted in (({4: "stone"}, ["30"]), ({4: "stone", 30: "cart"}, []), ({}, [])):
         read = Scenario.from_data(scenario | {"classes": classes}, folder=tmp_path)
-        notes = [note for note in advice(build(read)) if "has no name" in note]
+        notes = [note for note in advice(prepare(read)) if "has no name" in note]
         assert notes == [
             f"class {n} of materials or actors has no name. Add `{{{n}: …}}` to `classes`"
             for n in noted
@@ -91,7 +92,7 @@ def test_classes_without_a_name_are_noted_if_others_have_names(tmp_path):
 
 def test_the_scenario_of_the_page_labels_its_points():
     code = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1]
-    job = build(Scenario.from_data(yaml.safe_load(code))).job()
+    job = prepare(Scenario.from_data(yaml.safe_load(code))).job
     (cloud,) = first_sweeps(job)
     assert {*cloud["class"].tolist()} == {40, 70}
     assert job.survey.classes == {40: "road", 70: "vegetation"}
@@ -118,10 +119,10 @@ def test_the_scenario_of_the_page_labels_its_points():
 def test_classes_of_points_without_classes_of_objects_are_noted(materials, note, stored):
     cart = {"name": "Cart", "box": [1, 1, 1], "at": [4, 0, 0.5]}
     data = {"scene": "seed", "poses": [[0, 0, 1]], "actors": [cart], "materials": materials}
-    told = [one for one in advice(build(Scenario.from_data(data | stored))) if "class" in one]
+    told = [one for one in advice(prepare(Scenario.from_data(data | stored))) if "class" in one]
     assert len(told) == bool(note and stored)
     assert all(one.startswith(f"points are labeled by class, but {note}") for one in told)
-    named = build(Scenario.from_data(data | stored | {"classes": {0: "background", 4: "thing"}}))
+    named = prepare(Scenario.from_data(data | stored | {"classes": {0: "background", 4: "thing"}}))
     assert not [one for one in advice(named) if "labeled by class" in one]
 
 

@@ -6,8 +6,7 @@ from click.testing import CliRunner
 from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.scenario import build as build_module
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 
@@ -20,12 +19,11 @@ def unread(monkeypatch):
         raise AssertionError("read before names were checked")
 
     for place in (
-        "lidarpool.scenario.build.read_static_scene",
+        "lidarpool.scenario.prepare.read_static_scene",
         "lidarpool.comparing.fit.fitting.open_recording",
         "lidarpool.places.building.RecordedSweeps.open",
     ):
         monkeypatch.setattr(place, read)
-    return build_module
 
 
 @pytest.mark.parametrize(
@@ -42,7 +40,7 @@ def unread(monkeypatch):
 )
 def test_a_scenario(unread, sections, message):
     with pytest.raises(LidarError, match=message):
-        build(Scenario.from_data({"scene": "seed", **sections}), plans=False)
+        prepare(Scenario.from_data({"scene": "seed", **sections}), plans=False)
 
 
 def test_models_of_fits_and_twins(unread, tmp_path):

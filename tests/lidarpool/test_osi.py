@@ -21,7 +21,7 @@ from lidarpool import (
     box,
     save_cloud,
 )
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -212,7 +212,7 @@ def test_moving_objects_of_ground_truth_are_actors(tmp_path, name):
             for truth in messages
         ]
     written(tmp_path / name, messages)
-    built = build(scenario(tmp_path, name))
+    built = prepare(scenario(tmp_path, name))
     names = [actor.name for actor in built.scene.actors]
     assert names == ["car (0)", "bus (7)", "pedestrian (9)"]
     host, bus, person = built.scene.actors
@@ -234,9 +234,9 @@ def test_timestamps_that_cannot_be_seconds_need_their_unit(tmp_path):
         truth.timestamp.seconds = 1_790_000_000_000 + 1000 * second
     written(tmp_path / "town.osi", messages)
     with pytest.raises(LidarError, match=r"They are probably milliseconds. Set `time_unit: ms`"):
-        build(scenario(tmp_path, "town.osi"))
+        prepare(scenario(tmp_path, "town.osi"))
     timed = {"time_unit": "ms", "offset_s": -1_790_000_000}
-    built = build(scenario(tmp_path, "town.osi", **timed))
+    built = prepare(scenario(tmp_path, "town.osi", **timed))
     positions, _ = built.scene.actors[0].trajectory.poses(0, np.array([1.5e9]))
     np.testing.assert_allclose(positions + built.scene.origin, [[15, 0, 0]], atol=1e-9)
 
@@ -244,7 +244,7 @@ def test_timestamps_that_cannot_be_seconds_need_their_unit(tmp_path):
 def test_shapes_of_traffic_and_the_host_are_a_choice(tmp_path):
     written(tmp_path / "town.osi", truths())
     vehicles = [{"types": "b*", "name": "Bus", "box": [10, 3, 4], "class": 13}]
-    built = build(
+    built = prepare(
         scenario(
             tmp_path, "town.osi", vehicles=vehicles, host=False, offset_s=-1,
             translation=[100, 0, 0.75],
@@ -260,7 +260,7 @@ def test_shapes_of_traffic_and_the_host_are_a_choice(tmp_path):
 def test_actors_of_a_survey_come_back_from_its_trace(drive, tmp_path):
     save_cloud(drive, tmp_path / "cloud.mcap", format="osi_mcap")
     read = scenario(tmp_path, "cloud.mcap", offset_s=-START_NS / 1e9)
-    built = build(read)
+    built = prepare(read)
     assert [actor.name for actor in built.scene.actors] == ["car (1)"]
     note = "was skipped because of missing dimensions (vehicle)"
     assert any(note in line for line in built.findings.notes)
@@ -286,7 +286,7 @@ def test_traces_that_are_no_ground_truth_are_refused_in_a_line(drive, tmp_path):
     written(tmp_path / "back_gt.osi", backwards)
     for name in [*contents, "cloud_sd.osi", "data.mcap", "back_gt.osi", "none_gt.osi"]:
         with pytest.raises(LidarError) as caught:
-            build(scenario(tmp_path, name))
+            prepare(scenario(tmp_path, name))
         assert name in str(caught.value) and "\n" not in str(caught.value), name
 
 
@@ -299,7 +299,7 @@ def test_garbled_traces_are_read_or_refused(tmp_path):
             data[position] = random.integers(256)
         (tmp_path / "a_gt.osi").write_bytes(data)
         try:
-            build(scenario(tmp_path, "a_gt.osi"))
+            prepare(scenario(tmp_path, "a_gt.osi"))
         except LidarError as error:
             assert "\n" not in str(error)
 
@@ -314,7 +314,7 @@ def carried(folder, file, vehicle, **traffic):
         "mount": [0, 0, 2],
         "traffic": {"file": file, **traffic},
     }  # fmt: skip
-    return build(Scenario.from_data(data, folder=folder))
+    return prepare(Scenario.from_data(data, folder=folder))
 
 
 @pytest.mark.parametrize("vehicle", ["host", 0])

@@ -23,7 +23,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.clouds.writing import ExportSpec, with_format_columns
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN, TABLE
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -123,7 +123,7 @@ def scenario_of(**sections):
 
 def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     write = {"write": ["pcap"]}
-    survey = build(scenario_of(sensor="velodyne/vlp16", output=write)).survey
+    survey = prepare(scenario_of(sensor="velodyne/vlp16", output=write)).survey
     assert {"ray", "range", "reflectivity"} <= {column.name for column in survey.stored_columns}
     assert survey.keep_every == 1
     for sections, says in (
@@ -134,5 +134,5 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
         ),
     ):
         with pytest.raises(LidarError, match=says):
-            build(scenario_of(output=write, **sections))
+            prepare(scenario_of(output=write, **sections))
     assert with_format_columns(survey, [ExportSpec("laz")]) is survey

@@ -13,10 +13,10 @@ from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
 from lidarpool import Scene, SceneMesh
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_sections import is_campaign
 from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.paint import paint_scene
@@ -77,7 +77,7 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
     if meshes:
         write_scene(folder / "scene.glb", Scene.from_meshes(meshes))
         scenario["scene"] = "scene.glb"
-    return implausibilities(build(Scenario.from_data(scenario, folder=folder), plans=False))
+    return implausibilities(prepare(Scenario.from_data(scenario, folder=folder), plans=False))
 
 
 @pytest.mark.parametrize(
@@ -301,4 +301,4 @@ def test_examples_have_no_warnings(with_city, name):
     path = with_city / f"{name}.yaml"
     scenario = CampaignSpec.load(path).scenario(0) if is_campaign(path) else Scenario.load(path)
     assert scenario is not None
-    assert implausibilities(build(scenario, plans=False)) == []
+    assert implausibilities(prepare(scenario, plans=False)) == []

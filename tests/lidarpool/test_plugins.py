@@ -14,9 +14,9 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import scenario_schema
 from lidarsim.base.plugins import find_plugin, plugins_of
@@ -97,7 +97,7 @@ def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
 
     def scene(entry):
         data = {"scene": [entry], "poses": [[0, 0, 1]]}
-        return build(Scenario.from_data(data, folder=tmp_path)).scene
+        return prepare(Scenario.from_data(data, folder=tmp_path)).scene
 
     assert scene({"file": "a.sized", "size_m": 3.0}).vertices.max() == 3
     told = refused(scene, {"file": "a.sized", "size_m": 0})

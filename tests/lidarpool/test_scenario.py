@@ -28,8 +28,8 @@ from lidarpool import (
 )
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
 from lidarpool.scenario.demo import demo_scenario
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.static_scene import SceneCache
 from lidarsim.media.materials import MaterialTable, SurfaceKinds
@@ -60,8 +60,8 @@ def crate(tmp_path):
 
 def everything(loaded):
     """Build all that a scenario describes."""
-    built = build(loaded)
-    return built.scene, built.survey, built.planning
+    built = prepare(loaded)
+    return built.scene, built.survey, built.job.planning
 
 
 @pytest.mark.parametrize("source", ["python", "file"])
@@ -85,9 +85,13 @@ def test_the_survey_of_the_demo(source):
 
 @pytest.mark.parametrize("scene", ["seed", {"preset": "seed"}, {"preset": "seed", "files": []}])
 def test_the_objects_of_the_demo_come_without_its_thinning_and_planning(scene):
-    built = build(Scenario.from_data({"scene": scene}))
+    built = prepare(Scenario.from_data({"scene": scene}))
     assert built.scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Bowl")
-    assert (built.survey.keep_every, built.survey.precision_m, built.planning) == (1, 0.001, None)
+    assert (built.survey.keep_every, built.survey.precision_m, built.job.planning) == (
+        1,
+        0.001,
+        None,
+    )
     assert [pose.position[2] for pose in built.survey.poses] == [1, 2, 3]
 
 
@@ -95,14 +99,14 @@ def test_the_objects_of_the_demo_come_without_its_thinning_and_planning(scene):
 def test_without_a_scene_nothing_is_made_up(scenario, tmp_path, scene):
     text = f"{scene}\nposes: [[0, 0, 1]]\n"
     with pytest.raises(LidarError) as raised:
-        build(scenario(text))
+        prepare(scenario(text))
     assert str(raised.value) == (
         f"{tmp_path / 's.yaml'}: The scenario has no scene. Add mesh files as `scene.files`, or "
         "`scene: seed` for the six objects of `lidarpool demo`."
     )
     actors = "actors: [{name: Crate, box: [2, 2, 2], at: [6, 0, 0]}]"
     with pytest.raises(LidarError, match=r"has actors, but no stationary object\. Add"):
-        build(scenario(text + actors))
+        prepare(scenario(text + actors))
 
 
 LANE = "{points: [{time_s: 0, position: [-8, 0, 1]}, {time_s: 9, position: [40, 0, 1]}]%s}"
@@ -128,15 +132,15 @@ LANE = "{points: [{time_s: 0, position: [-8, 0, 1]}, {time_s: 9, position: [40, 
     ],
 )
 def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rectangle):
-    built = build(scenario(f"scene: {{ground: {{height_m: -1}}}}\n{text}"))
+    built = prepare(scenario(f"scene: {{ground: {{height_m: -1}}}}\n{text}"))
     scene = built.scene
     assert scene.names == ("Ground",)
     (bounds,) = scene.object_bounds + scene.origin
     assert [*bounds[0], *bounds[1]] == pytest.approx([*rectangle[:2], -1, *rectangle[2:], -1])
-    assert (built.survey.keep_every, built.planning) == (1, None)
+    assert (built.survey.keep_every, built.job.planning) == (1, None)
     wide = text.replace("poses", "scene: {ground: {margin_m: 50}}\nposes")
     if wide != text:
-        scene = build(scenario(wide)).scene
+        scene = prepare(scenario(wide)).scene
         assert np.ptp(scene.bounds, axis=0)[:2] == pytest.approx(
             np.add([rectangle[2] - rectangle[0], rectangle[3] - rectangle[1]], 90)
         )
@@ -144,7 +148,7 @@ def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rec
 
 def test_a_ground_under_nothing_is_refused(scenario):
     with pytest.raises(LidarError, match=r"s\.yaml: The extent of `scene\.ground` .* Add `poses`"):
-        build(scenario("scene: {ground: {}}"))
+        prepare(scenario("scene: {ground: {}}"))
 
 
 def test_scenarios_share_a_scene_if_their_ground_is_the_same():
@@ -152,7 +156,7 @@ def test_scenarios_share_a_scene_if_their_ground_is_the_same():
     cache = SceneCache()
     scene = {"preset": "seed", "ground": {}}
     scenarios = [Scenario.from_data({"scene": scene, "poses": [[x, 0, 1]]}) for x in (0, 3, 30, 0)]
-    inside, beside, outside, again = (build(one, cache=cache).scene for one in scenarios)
+    inside, beside, outside, again = (prepare(one, cache=cache).scene for one in scenarios)
     assert inside is beside is again
     assert outside.names == inside.names and outside.vertices.shape == inside.vertices.shape
     ends = [(scene.bounds + scene.origin)[1, 0] for scene in (inside, outside)]
@@ -167,7 +171,7 @@ def test_a_model_and_a_unit_of_it(tmp_path):
         "scene: seed\nsensor: {calibration: unit.csv, rate_hz: 20, max_range_m: 60, step_deg: 30}\n"
         "steps: 12\n"
     )
-    survey = build(Scenario.load(tmp_path / "s.yaml")).survey
+    survey = prepare(Scenario.load(tmp_path / "s.yaml")).survey
     sensor = survey.sensor
     assert (sensor.name, sensor.max_range_m) == ("Hesai PandarXT-32, unit.csv", 60)
     assert survey.ray_count == 3 * 32 * 1000, "one turn from each pose"
@@ -175,7 +179,7 @@ def test_a_model_and_a_unit_of_it(tmp_path):
         "{name: Mine, sources: {}, firings_per_turn: 90, beams: {elevation_deg: [0]}}"
     )
     mine = Scenario.from_data({"scene": "seed", "sensor": {"model": "mine.yaml"}}, folder=tmp_path)
-    assert build(mine).survey.ray_count == 3 * 90
+    assert prepare(mine).survey.ray_count == 3 * 90
 
 
 def test_mesh_files_are_placed(scenario, crate):
@@ -193,13 +197,13 @@ def test_mesh_files_are_placed(scenario, crate):
           ground: {height_m: -4, margin_m: 1}
         """
     )
-    built = build(loaded)
+    built = prepare(loaded)
     assert built.scene.names == ("crate", "crate.2", "crate.3", "crate.4", "Ground")
     sizes = np.ptp(built.scene.object_bounds, axis=1)
     np.testing.assert_allclose(sizes[:4], [[2, 4, 6], [0.02, 0.06, 0.04], [2, 6, 8], [2, 4, 6]])
     np.testing.assert_allclose(built.scene.object_bounds[3].mean(axis=0), [7, 8, 9])
     np.testing.assert_allclose(built.scene.object_bounds[4], [[-2, -4, -4], [11.01, 11, -4]])
-    assert built.planning is None
+    assert built.job.planning is None
 
 
 def test_georeferenced_poses_and_plans_are_local(scenario, crate):
@@ -249,11 +253,11 @@ def test_short_forms_say_the_same(scenario):
         "mount: {position: [0, 0, 1]}}}\nnavigation: {imu: {mount: {position: [1, 0, 0]}}}\n"
         "poses: [[0, 0, 1]]\n"
     )
-    one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
+    one, other = (fingerprint(prepare(scenario(text)).survey) for text in (short, long))
     assert one == other
     short = "scene: seed\nsensor: vlp16\nmount: [0, 0, 2]"
     long = "scene: seed\nsensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"
-    one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
+    one, other = (fingerprint(prepare(scenario(text)).survey) for text in (short, long))
     assert one == other
 
 
@@ -262,13 +266,13 @@ def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
     (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
     made = scenario("scene: seed\nsensor: mine.yaml")
     assert made.files == (tmp_path / "mine.yaml",)
-    assert build(made).survey.carried[0].sensor.name == "Velodyne Mine"
+    assert prepare(made).survey.carried[0].sensor.name == "Velodyne Mine"
 
 
 def test_actors_that_stand(scenario):
     text = "scene: seed\nactors:\n  - {name: A, box: [2, 1, 1], at: [9, 8, 1]}\n"
     text += "  - {name: B, box: [2, 1, 1], at: {position: [9, 8, 1], yaw_deg: 90}}\n"
-    straight, turned = build(scenario(text)).scene.actors
+    straight, turned = prepare(scenario(text)).scene.actors
     for time in (0, 1e9, 1e12):
         low, high = (corner(straight.placed(time).vertices, 0) for corner in (np.min, np.max))
         np.testing.assert_allclose([low, high], [[8, 7.5, 1], [10, 8.5, 2]], atol=1e-12)
@@ -460,7 +464,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
 
 def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     with pytest.raises(LidarError) as raised:
-        build(scenario("scene: [no.glb, nor.stl]"))
+        prepare(scenario("scene: [no.glb, nor.stl]"))
     assert str(raised.value).count("does not exist") == 2
 
 
@@ -490,7 +494,7 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
 )
 def test_a_file_that_is_lost_is_told_with_scenario_and_field(scenario, tmp_path, text, field, file):
     with pytest.raises(LidarError) as raised:
-        build(scenario(text))
+        prepare(scenario(text))
     (line,) = str(raised.value).splitlines()
     assert line.endswith(f"s.yaml: {field}: {tmp_path / file} does not exist.")
 
@@ -498,12 +502,12 @@ def test_a_file_that_is_lost_is_told_with_scenario_and_field(scenario, tmp_path,
 def test_a_file_that_is_lost_is_told_beside_other_faults_and_a_similar_name(scenario, tmp_path):
     (tmp_path / "hall.glb").write_bytes(b"")
     with pytest.raises(LidarError) as raised:
-        build(scenario("scene: [hal.glb, hall.glb]"))
+        prepare(scenario("scene: [hal.glb, hall.glb]"))
     lost, empty = str(raised.value).splitlines()
     assert "scene.files[0].file: " in lost and lost.endswith(" Did you mean 'hall.glb'?")
     assert "hall.glb is empty" in empty
     with pytest.raises(LidarError) as raised:
-        build(Scenario.load(tmp_path / "no.obj"))
+        prepare(Scenario.load(tmp_path / "no.obj"))
     assert str(raised.value).startswith(f"{tmp_path / 'no.obj'} does not exist.")
 
 
@@ -511,13 +515,13 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     read = scenario(
         "scene: seed\ncloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}"
     )
-    las, kitti = (note for note in advice(build(read)) if "class" not in note)
+    las, kitti = (note for note in advice(prepare(read)) if "class" not in note)
     assert (
         "expect all points in a single coordinate system" in las
         and "Set `cloud.coordinates: world`" in las
     )
     assert "KITTI stores motion-compensated points" in kitti
-    assert advice(build(scenario("scene: seed\noutput: {write: [laz, pcd]}"))) == []
+    assert advice(prepare(scenario("scene: seed\noutput: {write: [laz, pcd]}"))) == []
 
 
 @pytest.mark.parametrize(
@@ -533,7 +537,7 @@ def test_a_trajectory_since_1970_is_told_that_its_date_is_not_kept(scenario, sec
     read = scenario(
         f"scene: seed\ntrajectory: {json.dumps({'points': points})}\nsteps: 36\n{start}"
     )
-    notes = [note for note in advice(build(read)) if "since 1970" in note]
+    notes = [note for note in advice(prepare(read)) if "since 1970" in note]
     assert len(notes) == bool(noted)
     assert all(noted in note for note in notes)
 
@@ -563,14 +567,14 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
     ):  # fmt: skip
         data = {"trajectory": {"points": points}, "actors": actors, "steps": 36}
         read = scenario(json.dumps({"scene": {"preset": "seed"}} | data))
-        assert [note for note in advice(build(read)) if "angles" in note] == notes
+        assert [note for note in advice(prepare(read)) if "angles" in note] == notes
 
 
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "scene: seed\nsensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
-    (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
+    (note,) = advice(prepare(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
     assert note.startswith("nuScenes expects the first sensor to be named 'LIDAR_TOP'")
-    assert advice(build(scenario("scene: seed\noutput: {write: [nuscenes]}"))) == []
+    assert advice(prepare(scenario("scene: seed\noutput: {write: [nuscenes]}"))) == []
 
 
 @pytest.mark.parametrize(
@@ -588,7 +592,7 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     ],
 )
 def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, noted):
-    built = build(scenario(f"scene: seed\nweather: {{{weather}}}\nnoise: {{{noise}}}"))
+    built = prepare(scenario(f"scene: seed\nweather: {{{weather}}}\nnoise: {{{noise}}}"))
     notes = [note for note in advice(built) if "fog" in note]
     assert len(notes) == (noted is not None)
     assert all(noted in note for note in notes)
@@ -623,7 +627,7 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
         "performance: {mode: dual}\n"
     )
     notes = [
-        note for note in advice(build(scenario(f"scene: seed\n{text}"))) if "returns mode" in note
+        note for note in advice(prepare(scenario(f"scene: seed\n{text}"))) if "returns mode" in note
     ]
     assert len(notes) == (noted is not None)
     assert all(re.search(noted, note) for note in notes)
@@ -647,10 +651,10 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
 )
 def test_settings_without_effect_are_in_the_advice(scenario, idle, used):
     read = scenario(f"scene: seed\n{idle}")
-    (note,) = advice(build(read))
+    (note,) = advice(prepare(read))
     assert idle.split("{")[1].split(": ")[-2].split(", ")[-1] in note
     both = scenario("scene: seed\n" + (used if used[:5] == idle[:5] else f"{idle}\n{used}"))
-    assert advice(build(both)) == []
+    assert advice(prepare(both)) == []
 
 
 YAML_VALUES = st.recursive(
@@ -704,7 +708,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
             "weather": {"visibility_km": 2},
         }
     )
-    survey = build(scenario).survey
+    survey = prepare(scenario).survey
     assert survey.returns == Returns("dual", 7)
     assert survey.noise == Noise(0.02, seed=3)
     assert survey.visibility_km == 2
@@ -736,15 +740,15 @@ def mesh_file(path, size, height, **asset):
 )
 def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, expected):
     made = Scenario.load(mesh_file(tmp_path / "hall.stl", (8, 6, height), height / 2))
-    survey = build(made).survey
+    survey = prepare(made).survey
     assert [pose.position[2] for pose in survey.poses] == pytest.approx(expected)
     assert (survey.keep_every, survey.precision_m) == (1, 0.001)
     listed = Scenario.from_data({"scene": "hall.stl"}, folder=tmp_path)
-    assert fingerprint(build(listed).survey) == fingerprint(survey)
+    assert fingerprint(prepare(listed).survey) == fingerprint(survey)
     coarse = Scenario.from_data(
         {"scene": "hall.stl", "sensor": {"model": "velodyne/vlp16"}}, folder=tmp_path
     )
-    assert build(coarse).survey.precision_m == 0.002, "the sensor's resolution"
+    assert prepare(coarse).survey.precision_m == 0.002, "the sensor's resolution"
 
 
 @pytest.mark.parametrize(
@@ -764,7 +768,7 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     depth = size[2]
     mesh_file(tmp_path / "hall.glb", (width, height, depth), 0, generator=generator, version="2.0")
     made = Scenario.from_data({"scene": {"files": [entry]}}, folder=tmp_path)
-    told = [note for note in advice(build(made)) if "up_axis" in note]
+    told = [note for note in advice(prepare(made)) if "up_axis" in note]
     assert len(told) == bool(says)
     if says:
         assert says in told[0] and "set {file: …, up_axis: z}. To silence" in told[0]
@@ -773,7 +777,7 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
 def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
     mesh_file(tmp_path / "hall.glb", (8, 6, 2), 0, generator="Blender", version="2.0")
     made = Scenario.from_data({"scene": {"files": ["hall.glb"]}}, folder=tmp_path)
-    assert any("set {file: …, up_axis: z}. To silence" in note for note in advice(build(made)))
+    assert any("set {file: …, up_axis: z}. To silence" in note for note in advice(prepare(made)))
     assert not caplog.messages
     Scene.load(tmp_path / "hall.glb")
     assert 'Scene.load(path, up_axis="z"). To silence' in caplog.messages[0]
@@ -781,7 +785,7 @@ def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
-        survey = build(
+        survey = prepare(
             scenario(f"scene: seed\nworld: {{epsg: 25832}}\ncloud: {{start: {text}}}")
         ).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
@@ -811,10 +815,10 @@ def test_the_coordinate_system_has_true_meters(tmp_path, epsg, place, words):
     data = {"scene": {"files": entries}, "world": {"epsg": epsg}}
     scenario = Scenario.from_data(data, folder=tmp_path)
     if not words:
-        assert build(scenario).survey.epsg == epsg
+        assert prepare(scenario).survey.epsg == epsg
         return
     with pytest.raises(LidarError, match=rf"EPSG:{epsg}") as refused:
-        build(scenario)
+        prepare(scenario)
     assert re.search(words, str(refused.value))
     if epsg == 2056:
         with pytest.raises(LidarError, match="EPSG:2056"):
@@ -835,9 +839,9 @@ WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in r
     ],
 )
 def test_what_would_disappoint_is_in_the_advice(scenario, text, words):
-    assert words in " ".join(advice(build(scenario(f"scene: seed\n{text}"))))
+    assert words in " ".join(advice(prepare(scenario(f"scene: seed\n{text}"))))
     calm = text.replace("red", "range").replace("linear", "smooth")
-    assert words not in " ".join(advice(build(scenario(f"scene: seed\n{calm}"))))
+    assert words not in " ".join(advice(prepare(scenario(f"scene: seed\n{calm}"))))
 
 
 def test_an_object_far_from_all_others_is_named_where_points_would_be_too_coarse():
@@ -856,4 +860,4 @@ def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):
     (tmp_path / "m.obj").write_text(walls)
     ends = "scene: m.obj\nplanning: {start: [-9, 0], target: [9, 0], obstacles: "
     for names, count in (('["Wall[1]"]', 1), ('["Wall[12]"]', 1), ('["Wall*"]', 2)):  # 1 or 2
-        assert len(build(scenario(ends + names + "}")).planning.radii) == count
+        assert len(prepare(scenario(ends + names + "}")).job.planning.radii) == count

@@ -13,9 +13,9 @@ from jsonschema import Draft202012Validator
 
 from lidarpool import LidarError
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_sections import is_campaign
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import (
     campaign_schema,
@@ -222,8 +222,8 @@ def test_a_short_one_has_the_defaults_and_its_examples_are_valid(tmp_path):
     text = short_scenario({}, "")
     assert len(text.splitlines()) < 15
     (tmp_path / "scenario.yaml").write_text(text)
-    made = build(Scenario.load(tmp_path / "scenario.yaml"))
-    assert fingerprint(made.survey) == fingerprint(build(SEED).survey)
+    made = prepare(Scenario.load(tmp_path / "scenario.yaml"))
+    assert fingerprint(made.survey) == fingerprint(prepare(SEED).survey)
     on = [OFF.sub(r"\1\2", line) for line in text.splitlines() if "$schema" not in line]
     scenario = Scenario.from_data(yaml.safe_load("\n".join(on)))
     given = {"scene", "sensor", "poses", "cloud", "output"}

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.opened import growing_view, open_view
 from lidarscenes.writers.scene_file import write_scene
@@ -286,7 +286,7 @@ def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
     def built(entry=file.name, **world):
         pose = [*(scene.bounds.mean(axis=0) + scene.origin + (0, 0, 2)).tolist()]
         data = {"scene": {"files": [entry]}, "poses": [pose], "world": world}
-        return build(Scenario.from_data(data, folder=tmp_path), plans=False)
+        return prepare(Scenario.from_data(data, folder=tmp_path), plans=False)
 
     assert built().survey.epsg == 25832
     with pytest.raises(LidarError, match=rf"`world.origin` would also be added to {file.name}"):

@@ -82,7 +82,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     add(store, 2, 6)
     assert store.committed_in_words == "4 of 6 scans" and store.only_job.progress().points == 12
     add(store, 0, 2)
-    store.only_job.frames = 6
+    store.only_job.committed.advance_frames(6)
     assert store.only_job.complete
     cloud = store.only_job.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
@@ -178,7 +178,7 @@ def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
 def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
     store = opened(folder, job=job)
-    store.db.add_trials(store.only_job, [run_trial(PLANNING, 1)])
+    store.db.add_trials(store.only_job.committed, [run_trial(PLANNING, 1)])
     assert store.committed_in_words == "1 of 2 planning trials"
     store.db.close()
     again = opened(folder, resume=True, job=job)
@@ -307,13 +307,13 @@ def test_places_that_cannot_be(tmp_path):
 def test_an_error_tells_how_to_go_on(anywhere):
     store = opened(anywhere)
     add(store, 0, 2)
-    store.only_job.frames = 1
+    store.only_job.committed.advance_frames(1)
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__
     assert note.startswith(f"2 of 6 scans are stored in {anywhere}. Continue with `--resume`")
     again = opened(anywhere, resume=True)
-    assert (again.only_job.resumed, again.only_job.frames) == (2, 1)
+    assert (again.only_job.resumed, again.only_job.committed.frames) == (2, 1)
 
 
 def test_an_error_before_anything_was_kept_leaves_nothing(anywhere):
@@ -610,7 +610,7 @@ def test_it_goes_on_from_the_last_copy(remote_run):
         "parts say what is not in the copy"
     )
     assert add(store, 2, 3) and add(store, 5, 6)
-    store.only_job.frames = 6
+    store.only_job.committed.advance_frames(6)
     store.save(force=True)
     store.tidy()
     mark = mark_name(store.db.meta["mark"])

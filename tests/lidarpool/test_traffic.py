@@ -27,7 +27,7 @@ from lidarpool import (
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base import allowance
 from lidarsim.simulator.casting.surfaces import Surfaces
@@ -162,7 +162,7 @@ def scenario(folder, text=FCD, traffic=(), **sections):
 @pytest.mark.extended
 def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     read = scenario(tmp_path)
-    built = build(read)
+    built = prepare(read)
     assert [actor.name for actor in built.scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
     assert built.scene.object_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
     first, person, again = (actor.trajectory for actor in built.scene.actors)
@@ -180,7 +180,7 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     summary = built.findings.sources["fcd.xml"]
     assert summary.startswith("3 actors during the survey, out of 3 vehicles")
 
-    job = build(read).job()
+    job = prepare(read).job
     found = made(job.survey, job.scene, "tiles")
     for number, semantic_class, (begin, end) in ((2, 10, (0, 1)), (3, 7, (1, 2)), (4, 10, (3, 4))):
         own = found["object"] == number
@@ -195,7 +195,7 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
     # What comes after the survey is not read: here the end of the file is missing.
     text = FCD.replace("</fcd-export>", f"<!--{'x' * 3_000_000}--><")
     read = scenario(tmp_path, text, traffic, steps=36)
-    (car,) = build(read).scene.actors
+    (car,) = prepare(read).scene.actors
     assert car.trajectory.presence_ns == pytest.approx((-0.2e9, 0.8e9))
     assert car.trajectory.positions[0].tolist() == pytest.approx(
         [140 - 2 * 0.5**0.5, 5 - 2 * 0.5**0.5, 7]
@@ -203,7 +203,7 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
 
     (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(FCD.encode()))
     packed = scenario(tmp_path, traffic={"file": "fcd.xml.gz"})
-    assert len(build(packed).scene.actors) == 3
+    assert len(prepare(packed).scene.actors) == 3
 
 
 def in_unit(count, start=0):
@@ -224,11 +224,11 @@ def test_times_of_traffic_that_cannot_be_seconds_need_their_unit(
 ):
     text = in_unit(count, start_s * count)
     with pytest.raises(LidarError, match=f"They are probably {name}. Set `time_unit: {unit}"):
-        build(scenario(tmp_path, text))
+        prepare(scenario(tmp_path, text))
     timed = {"time_unit": unit, "offset_s": -start_s}
-    expected = [actor.trajectory for actor in build(scenario(tmp_path)).scene.actors]
+    expected = [actor.trajectory for actor in prepare(scenario(tmp_path)).scene.actors]
     for actor, track in zip(
-        build(scenario(tmp_path, text, timed)).scene.actors, expected, strict=True
+        prepare(scenario(tmp_path, text, timed)).scene.actors, expected, strict=True
     ):
         assert actor.trajectory.times_s.tolist() == track.times_s.tolist()
         assert np.allclose(actor.trajectory.positions, track.positions)
@@ -241,13 +241,13 @@ def test_human_readable_times_of_sumo(tmp_path, shown):
         return f'time="{shown.format(*divmod(minutes, 60), seconds)}"'
 
     text = re.sub(r'time="(\d+)\.00"', readable, FCD)
-    plain = build(scenario(tmp_path)).scene
-    read = build(scenario(tmp_path, text, {"offset_s": -3598})).scene
+    plain = prepare(scenario(tmp_path)).scene
+    read = prepare(scenario(tmp_path, text, {"offset_s": -3598})).scene
     assert len(plain.actors) == 3 and fingerprint(read) == fingerprint(plain)
     with pytest.raises(
         LidarError, match="hours, minutes and seconds, so `time_unit` cannot be set"
     ):
-        build(scenario(tmp_path, text, {"time_unit": "s"}))
+        prepare(scenario(tmp_path, text, {"time_unit": "s"}))
 
 
 def test_days_and_times_before_zero_of_sumo(tmp_path):
@@ -257,10 +257,10 @@ def test_days_and_times_before_zero_of_sumo(tmp_path):
         f'<timestep time="{time}">{rows.format(x)}</timestep>' for x, time in enumerate(times)
     )
     read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", steps=36)
-    (car,) = build(read).scene.actors
+    (car,) = prepare(read).scene.actors
     assert car.trajectory.times_s.tolist() == [-1.5, 2.25]
     read = scenario(tmp_path, f"<fcd-export>{steps}</fcd-export>", {"offset_s": -90_000}, steps=36)
-    (car,) = build(read).scene.actors
+    (car,) = prepare(read).scene.actors
     assert car.trajectory.times_s.tolist() == [2.25 - 90_000, 61.0]
 
 
@@ -279,7 +279,7 @@ def test_traffic_stands_on_surfaces_and_is_absent_beside_them(tmp_path):
         tmp_path, f"<fcd-export>{steps}</fcd-export>", {"surfaces": "Ramp"},
         scene={"files": "ramp.obj"}, steps=36 * 140,
     )  # fmt: skip
-    (car,) = build(read).scene.actors
+    (car,) = prepare(read).scene.actors
     # Its middle is 2 m behind the front, and on the ramp until x is 18.5.
     np.testing.assert_allclose(car.trajectory.presence_ns, (1e9, 10.25e9), atol=0.26e9)
     places, turns = car.trajectory.poses(0, np.array([3.1e9]))
@@ -301,7 +301,7 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
         )
 
     downhill = read(points)
-    built = build(downhill)
+    built = prepare(downhill)
     scene = built.scene
     path = built.survey.path
     assert path.duration_ns == 8e9
@@ -311,22 +311,22 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-6)
     stops = ((0, 18), (3, 10), (5, 10), (8, 2))
     stop = [{"time_s": t, "position": [x + at, y + 5, 0.3]} for t, at in stops]
-    path = build(read(stop, interpolation="smooth")).survey.path
+    path = prepare(read(stop, interpolation="smooth")).survey.path
     poses = path.times_s[1:-1, None] * 1e9 + [-10, 10]
     speeds = path.velocities(0, poses.ravel())[0].reshape(-1, 2, 3)
     np.testing.assert_allclose(speeds[:, 0], speeds[:, 1], atol=1e-5)
     assert not path.velocities(0, np.linspace(3e9, 4.9e9, 20))[0].any()
     points[1]["position"] = [x + 30, y + 5, 0]
     points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
-    assert build(read(points, duration_s=3)).survey.path.duration_ns == 3e9
+    assert prepare(read(points, duration_s=3)).survey.path.duration_ns == 3e9
     with pytest.raises(LidarError, match=r"leaves the surfaces that it follows \(Ramp\)"):
-        build(read(points))
+        prepare(read(points))
     with pytest.raises(LidarError, match=r"`trajectory\.beyond` is only allowed for actors"):
         read(points, beyond="hold")
 
 
 def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):
-    built = build(scenario(tmp_path))
+    built = prepare(scenario(tmp_path))
     first, _, again = (actor.mesh for actor in built.scene.actors)
     assert first.vertices is again.vertices
     survey = built.survey
@@ -367,7 +367,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
 )
 def test_unusable_data_is_refused(tmp_path, text, told):
     with pytest.raises(LidarError, match=rf"fcd\.xml cannot be read as floating .*{told}"):
-        build(scenario(tmp_path, text))
+        prepare(scenario(tmp_path, text))
 
 
 @pytest.mark.extended
@@ -395,17 +395,17 @@ def test_packed_data_that_unpacks_to_far_more_is_refused(
     text = f'<fcd-export><timestep time="0">{vehicles}</timestep></fcd-export>'
     (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(text.encode()))
     with pytest.raises(LidarError) as raised:
-        build(scenario(tmp_path, traffic={"file": "fcd.xml.gz"}))
+        prepare(scenario(tmp_path, traffic={"file": "fcd.xml.gz"}))
     message = str(raised.value)
     assert "fcd.xml.gz" in message and told in message and "\n" not in message
 
 
 def test_attributes_that_sumo_defines_or_the_user_ignores(tmp_path):
-    plain = build(scenario(tmp_path)).scene
+    plain = prepare(scenario(tmp_path)).scene
     text = FCD.replace('x="40"', 'x="40" lane="e_0" pos="3" speed="1" odometer="4"')
-    known = build(scenario(tmp_path, text)).scene
+    known = prepare(scenario(tmp_path, text)).scene
     text = text.replace('x="40"', 'x="40" battery.level="3" batteryMode="1"')
-    ignoring = build(scenario(tmp_path, text, {"ignore": "battery*"})).scene
+    ignoring = prepare(scenario(tmp_path, text, {"ignore": "battery*"})).scene
     assert fingerprint(plain) == fingerprint(known) == fingerprint(ignoring)
 
 
@@ -420,7 +420,7 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
             {"objects": "*", "reflectance": 0.3, "class": 2},
         ],
     )
-    job = build(read).job()
+    job = prepare(read).job
     names = job.scene.object_names
     assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
     table = Surfaces(job.scene, tuple(job.survey.materials)).materials
@@ -435,23 +435,23 @@ def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
         '<person id="w" x="9" y="9" angle="90" type="walker"/></timestep>'
         for k in range(3)
     )
-    actors = build(scenario(tmp_path, f"<fcd-export>{rows}</fcd-export>")).scene.actors
+    actors = prepare(scenario(tmp_path, f"<fcd-export>{rows}</fcd-export>")).scene.actors
     assert [actor.name for actor in actors] == ["car (b)", "Person (w)"]
 
 
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
     nobody = scenario(tmp_path, traffic={"offset_s": 300})
-    assert any("has no vehicle or person in the" in n for n in advice(build(nobody)))
+    assert any("has no vehicle or person in the" in n for n in advice(prepare(nobody)))
     with pytest.raises(LidarError, match=r"traffic\.surfaces"):
         scenario(tmp_path, traffic={"surfaces": []})
     with pytest.raises(LidarError, match=r"type 'car', but no entry .* Add one, such as"):
-        build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
+        prepare(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
     with pytest.raises(LidarError, match="Set exactly one of file and box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
     with pytest.raises(LidarError, match=r"traffic\.file: .*no\.xml does not exist"):
-        build(scenario(tmp_path, traffic={"file": "no.xml"}))
+        prepare(scenario(tmp_path, traffic={"file": "no.xml"}))
     with pytest.raises(LidarError, match="`surfaces` contains 'Street'"):
-        build(scenario(tmp_path, traffic={"surfaces": "Street"}))
+        prepare(scenario(tmp_path, traffic={"surfaces": "Street"}))
 
 
 def carried(folder, trajectory, text=FCD, **traffic):
@@ -471,7 +471,7 @@ def carried(folder, trajectory, text=FCD, **traffic):
 def test_a_vehicle_of_the_traffic_carries_the_sensors(tmp_path):
     rider = '<vehicle id="r" x="9" y="9" angle="0" type="car"/><person id="p" x="0"'
     text = FCD.replace('<person id="p" x="0"', rider)
-    built = build(carried(tmp_path, {"vehicle": "p"}, text, offset_s=10))
+    built = prepare(carried(tmp_path, {"vehicle": "p"}, text, offset_s=10))
     assert [actor.name for actor in built.scene.actors] == ["car (r)"]
     survey = built.survey
     assert survey.trajectory.start_s == 11 and survey.duration_ns == pytest.approx(1e9, rel=0.11)
@@ -480,7 +480,7 @@ def test_a_vehicle_of_the_traffic_carries_the_sensors(tmp_path):
     np.testing.assert_allclose(position + built.scene.origin, [[0, 0.5 - 0.2, 0.5]], atol=1e-9)
     np.testing.assert_allclose(rotation[0, :, 0], [0, 1, 0], atol=1e-9)
 
-    second = build(carried(tmp_path, {"vehicle": "a.1", "start_s": 3.25, "duration_s": 0.5}))
+    second = prepare(carried(tmp_path, {"vehicle": "a.1", "start_s": 3.25, "duration_s": 0.5}))
     assert [actor.name for actor in second.scene.actors] == []
     position, _ = second.survey.trajectory.poses(0, np.zeros(1))
     front = position + second.scene.origin + [2 * 0.5**0.5, 2 * 0.5**0.5, 0]
@@ -502,7 +502,7 @@ def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
         ({"vehicle": ""}, "vehicle"),
     ):
         with pytest.raises(LidarError, match=message) as caught:
-            build(carried(tmp_path, trajectory))
+            prepare(carried(tmp_path, trajectory))
         assert "\n" not in str(caught.value)
     with pytest.raises(LidarError, match=r"Set `traffic\.file`"):
         Scenario.from_data({"trajectory": {"vehicle": "p"}}, folder=tmp_path)

@@ -39,7 +39,7 @@ from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import find_poses
 from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
@@ -261,12 +261,12 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
         "place.glb", "trajectory.csv", "sensor.yaml", "scenario.yaml", "twin.json", "report.html",
     }  # fmt: skip
     path = tmp_path / "twin" / "scenario.yaml"
-    job = build(Scenario.load(path))
+    job = prepare(Scenario.load(path))
     middle = 5
     pose = job.survey.path.pose(0, 1e9 * place.times_s[middle])
     np.testing.assert_allclose(pose.position, place.poses[middle, :3, 3], atol=1e-5)
     np.testing.assert_allclose(pose.rotation_matrix, place.poses[middle, :3, :3], atol=1e-5)
-    other = build(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
+    other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.carried[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
     assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(
@@ -308,7 +308,7 @@ def test_a_twin_simulates_all_sweeps_with_energies_as_recorded(bag):
     rows = found.figures["held_out"]["by_range"]
     errors = [row["mean_intensity_difference"] for row in rows if row["to_m"]]
     assert max(map(abs, errors)) < 0.2
-    job = build(Scenario.load(folder / "twin" / "scenario.yaml"))
+    job = prepare(Scenario.load(folder / "twin" / "scenario.yaml"))
     assert job.survey.scan_count == 36 * SWEEPS
     names = [getattr(column, "name", column) for column in job.survey.columns]
     assert names == ["time", "intensity", "reflectivity", "class"]
@@ -533,7 +533,7 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
 
     found = twin(replace(opened, read=read))
     found.save(tmp_path / "twin")
-    job = build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
     scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, 36)))
     cloud = scan.cloud((SCAN, *job.survey.stored_columns[3:]), 1e-4, job.scene.origin)
     height = cloud.positions[:, 2]
@@ -545,7 +545,7 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
 
 def scanned(folder):
     """Return the scan of a twin that was saved, and the names of its objects."""
-    job = build(Scenario.load(folder / "scenario.yaml"))
+    job = prepare(Scenario.load(folder / "scenario.yaml"))
     scans = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
     table = (SCAN, *job.survey.stored_columns[3:])
     cloud = scans.cloud(table, job.survey.precision_m, job.scene.origin)
@@ -625,7 +625,7 @@ def test_a_window_returns_nothing_in_the_place(street, survey, tmp_path):
     assert found.figures["dark_surfels"] > 50
     assert found.figures["held_out"]["no_return"]["f1"] > 0.85
     found.save(tmp_path / "twin")
-    job = build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
     scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
     names = (SCAN, *job.survey.stored_columns[3:])
     again = scan.cloud(names, job.survey.precision_m, job.scene.origin).positions
@@ -660,7 +660,7 @@ def test_recordings_of_sensors_in_their_formats(model, options, file, choice, ha
     # Packets have no poses, and their first sweep is a part of one.
     assert found.figures["length_m"] == pytest.approx(6.6, abs=0.8 if file == "packets" else 0.1)
     found.save(tmp_path / "twin")
-    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 
 
 @pytest.mark.extended
@@ -719,7 +719,7 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
     assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
     assert any("the sensor noise is unknown: " in note for note in found.figures["notes"])
     found.save(tmp_path / "twin")
-    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 
 
 @pytest.mark.extended
@@ -749,7 +749,7 @@ def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place
     found.save(tmp_path / "twin")
     scenario = yaml.safe_load((tmp_path / "twin" / "scenario.yaml").read_text())
     np.testing.assert_allclose(scenario["world"]["origin"], far, atol=10)
-    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 
 
 def test_another_sensor_is_for_a_scenario_of_one_sensor(tmp_path):

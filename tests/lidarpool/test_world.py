@@ -18,9 +18,9 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.las_header import las_system
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
 from lidarpool.scenario.empty_cloud import empty_cloud_reason
 from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.preview import first_sweeps
 from lidarsim.scene.files.stated_system import StatedSystem
@@ -31,7 +31,7 @@ PLAN = {"scene": ROOM, "poses": [[0, 0, 1], [1.5, -1, 1]], "sensor": "velodyne/v
 
 
 def job_of(**sections):
-    return build(Scenario.from_data({**PLAN, **sections})).job()
+    return prepare(Scenario.from_data({**PLAN, **sections})).job
 
 
 def cloud_of(job):
@@ -124,14 +124,14 @@ def test_a_raster_that_is_in_the_system_is_not_moved_by_its_origin(tmp_path):
 
     def built(*files):
         data = {"scene": {"files": [*files]}, "world": world}
-        return build(Scenario.from_data(data, folder=tmp_path))
+        return prepare(Scenario.from_data(data, folder=tmp_path))
 
     with pytest.raises(
         LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\]` for the file, or remove"
     ):
         built("hills.tif")
     world["epsg"] = 25832
-    scene = built({"file": "hills.tif", "translation": [-X0, -Y0, 0]}).job().scene
+    scene = built({"file": "hills.tif", "translation": [-X0, -Y0, 0]}).job.scene
     lower, upper = scene.bounds + scene.origin
     assert (np.abs(lower[:2] - (X0, Y0)) < 100).all() and (np.abs(upper[:2] - (X0, Y0)) < 100).all()
 
@@ -140,7 +140,7 @@ def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
     far = job_of(world={"epsg": 25832, "origin": ORIGIN}, poses=[[900, 0, 1]])
     reason = empty_cloud_reason(far.scene, far.survey)
     assert "The sensor starts at (900.000, 0.000, 1.000)" in reason and "500" not in reason
-    built = build(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
+    built = prepare(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
     assert "500,000" not in " ".join(note for note in advice(built) if "projected" not in note)
 
 
@@ -148,7 +148,7 @@ def placed_at(place, **world):
     """Return the warnings of a room at a place of its file's coordinates."""
     copies = [{"name": "Room", "box": [8, 6, 3], "at": [[*place, 0]]}]
     data = {"scene": {"copies": copies}, "poses": [[place[0], place[1], 1]], "world": world}
-    return implausibilities(build(Scenario.from_data({**PLAN, **data}), plans=False))
+    return implausibilities(prepare(Scenario.from_data({**PLAN, **data}), plans=False))
 
 
 def test_a_scene_outside_the_area_of_use_is_told_with_both_remedies():

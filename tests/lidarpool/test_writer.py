@@ -11,7 +11,7 @@ from lidarpool.datasets.dataset import DataSet
 from lidarpool.run import writer
 from lidarpool.run.cluster.checks import check_workers
 from lidarpool.run.pipeline.failures import JobError
-from lidarpool.run.writer import MAX_JOBS_PER_TASK, JobWriter
+from lidarpool.run.writer import MAX_JOBS_PER_TASK, DataSetWriter
 from lidarsim.base.storage import Storage
 
 
@@ -28,7 +28,7 @@ def jobs(tmp_path, monkeypatch):
     db = SimpleNamespace(meta={"mark": "0" * 16})
     store = SimpleNamespace(db=db, storage=Storage.at(tmp_path / "parts"), made_with={})
     dataset = DataSet(Storage.at(tmp_path / "data"), "kitti")
-    yield JobWriter(tasks, dataset, store, ("probe", b"")), written, clock
+    yield DataSetWriter(tasks, dataset, store, ("probe", b"")), written, clock
 
 
 def add(to, count):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import LidarError, SceneInstance
 from lidarsim.media.materials import MaterialTable
@@ -162,7 +162,7 @@ def test_surfaces_that_are_not_there_and_colors(tmp_path):
 def built_of(tmp_path, objects, **more):
     write(tmp_path / "a.city.json", city(objects))
     data = {"scene": {"files": ["a.city.json"]}, **more}
-    return build(Scenario.from_data(data, folder=tmp_path))
+    return prepare(Scenario.from_data(data, folder=tmp_path))
 
 
 def table_of(tmp_path, objects, materials=()):
@@ -356,7 +356,7 @@ def test_the_sensor_stands_beside_buildings_or_around_them(tmp_path, ground, sid
         flat = geometry("CompositeSurface", [[[16, 17, 18, 19]]], "1")
         objects["g"] = thing(flat, kind="TINRelief")
     write(tmp_path / "a.city.json", city(objects, vertices))
-    built = build(Scenario.load(tmp_path / "a.city.json"))
+    built = prepare(Scenario.load(tmp_path / "a.city.json"))
     assert built.placing.surrounds_object is not ground
     for pose in built.placing.poses:
         x, y, z = np.subtract(pose.position, TRANSFORM["translate"]) * 2
@@ -369,5 +369,5 @@ def test_a_scene_without_buildings_has_default_poses(tmp_path):
     flat = [[0, 0, 0], [60, 0, 0], [60, 60, 0], [0, 60, 0]]
     road = thing(geometry("MultiSurface", [[[0, 1, 2, 3]]]), kind="Road")
     write(tmp_path / "a.city.json", city({"a": road}, flat))
-    built = build(Scenario.from_data({"scene": {"files": ["a.city.json"]}}, folder=tmp_path))
+    built = prepare(Scenario.from_data({"scene": {"files": ["a.city.json"]}}, folder=tmp_path))
     assert [pose.position[2] for pose in built.survey.poses] == [1, 2, 3]

@@ -13,7 +13,7 @@ from tests.lidarscenes.test_robots import DAE
 
 from lidarpool import LidarError, Scene, load_sensor
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -560,7 +560,7 @@ def test_lidars_become_sensors_with_the_angles_of_gazebo(tmp_path):
     assert np.allclose(np.arcsin(directions[..., 2]), np.linspace(-0.2, 0.1, 3))
     assert sensor.head.rate_hz == 20 and sensor.noise.range_m == 0.02
     assert sensor.optics.resolution_m == 0.01
-    built = build(Scenario.load(tmp_path / "out" / "scenario.yaml"))
+    built = prepare(Scenario.load(tmp_path / "out" / "scenario.yaml"))
     (mounted,) = built.survey.sensors
     assert (mounted.sensor.min_range_m, mounted.sensor.max_range_m) == (0.3, 30)
     pose = built.survey.poses[0].compose(mounted.mount)
@@ -648,7 +648,7 @@ def test_lidars_see_visuals_by_masks_and_flags(tmp_path):
     assert sensors["top"]["unseen"] == ["boat/hull/helper", "water/link", "buoy/link"]
     assert sensors["low"]["unseen"] == ["boat/hull", "quay [[]2]/*"]
     assert sensors["off"]["unseen"] == ["*"]
-    built = build(scenario)
+    built = prepare(scenario)
     assert built.scene.names == (
         "boat/hull", "boat/hull/helper", "water/link", "quay [1]/link", "quay [2]/a",
         "quay [2]/b", "buoy/link",
@@ -685,7 +685,7 @@ def test_actors_and_roads_are_seen_by_all_masks_but_zero(tmp_path):
     )
     _, data, scenario = imported(tmp_path, text)
     assert data["sensors"]["s"]["unseen"] == ["m/link"]
-    assert build(scenario).scene.names == ("m/link", "way")
+    assert prepare(scenario).scene.names == ("m/link", "way")
 
 
 def test_elements_of_lidars_that_are_not_read_are_listed(tmp_path):
@@ -761,7 +761,7 @@ def test_lidars_of_models_that_fell_are_listed(tmp_path):
     output, data, scenario = imported(tmp_path, world(ROBOT, fallen))
     assert list(data["sensors"]) == ["scan"]
     assert "1,000 km away or whose position is not a number (fallen" in output
-    assert build(scenario).scene.names == ("robot/base",)
+    assert prepare(scenario).scene.names == ("robot/base",)
     with pytest.raises(
         LidarError, match=r"it contains no sensor of type gpu_lidar.*not a number \(fallen"
     ):

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import surfels
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import ImportedSurvey, import_survey
 from lidarsim.media.materials import MaterialTable
@@ -51,7 +51,7 @@ def legs(settings, *places, platform='movePerSec_m="10"'):
 def import_checked(survey: Path, out: Path) -> ImportedSurvey:
     """Import a survey as the command does."""
     return import_survey(
-        survey, out, check=lambda file: build(Scenario.load(file)), surfels=surfels
+        survey, out, check=lambda file: prepare(Scenario.load(file)), surfels=surfels
     )
 
 
@@ -94,7 +94,7 @@ def imported(survey, tmp_path):
 
     def run(*given, **named):
         made = import_checked(survey(*given, **named), tmp_path / "out")
-        built = build(scenario_of(made))
+        built = prepare(scenario_of(made))
         return made, built.scene, built.survey
 
     return run
@@ -514,7 +514,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
         survey(device, legs('pulseFreq_hz="1000" scanFreq_hz="30"'), scene, parts=parts),
         tmp_path / "out",
     )
-    built = build(scenario_of(made))
+    built = prepare(scenario_of(made))
     assert built.scene.has_voxels.tolist() == [False, True]
     bounds = built.scene.object_bounds[1]
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
@@ -543,7 +543,7 @@ def test_points_become_surfels_a_cell_of_voxel_size(survey, tmp_path, separator,
     path = survey(LASER, inside, GROUND.replace("</scene>", part), parts=parts)
     made = import_checked(path, tmp_path / "out")
     assert {p.name for p in made.path.parent.glob("*.glb")} == {"scan-1.glb"}
-    scene = build(scenario_of(made)).scene
+    scene = prepare(scenario_of(made)).scene
     assert scene.names == ("ground", "scan") and not made.unsupported
     low, high = scene.object_bounds[1] + scene.origin
     assert np.allclose([low, high], [[10, 20, 2], [14, 23, 6]], atol=0.25)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.fork_server import IFCOPENSHELL, ForkServer
 
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.files import ifc as reader
@@ -234,7 +234,7 @@ def test_a_scenario_takes_a_storey_and_has_classes(house, forked):
         "poses": [[0, 0, 1.5]],
         "cloud": {"columns": ["class"]},
     }
-    built = build(Scenario.from_data(data))
+    built = prepare(Scenario.from_data(data))
     assert built.scene.names == ("IfcSlab Floor", "IfcWall South", "IfcDoor Door")
     assert built.survey.classes == {73: "wall", 74: "slab", 78: "door"}
 

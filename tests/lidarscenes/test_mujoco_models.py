@@ -16,7 +16,7 @@ from tests.fork_server import ForkServer
 
 from lidarpool import LidarError, MujocoScanner, Scanner, Scene, Sensor
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.mujoco import model_file
@@ -161,7 +161,7 @@ def test_objects_are_bodies_and_named_geoms_of_the_world(room):
 def test_a_scenario_takes_the_options(room):
     entry = {"file": "room.xml", "keyframe": "home", "groups": [0], "exclude": ["floor"]}
     data = {"scene": {"files": [entry]}, "poses": [[0, 0, 2]]}
-    scene = build(Scenario.from_data(data, folder=room.parent)).scene
+    scene = prepare(Scenario.from_data(data, folder=room.parent)).scene
     assert scene.names == ("world", "robot", "arm", "ball")
     for change, message in (
         ({"keyframe": "hom"}, "no keyframe 'hom'. Did you mean 'home'"),
@@ -175,7 +175,7 @@ def test_a_scenario_takes_the_options(room):
     ):
         with pytest.raises(LidarError, match=message):
             changed = {**data, "scene": {"files": [{**entry, **change}]}}
-            build(Scenario.from_data(changed, folder=room.parent))
+            prepare(Scenario.from_data(changed, folder=room.parent))
 
 
 def test_copies_of_large_meshes_are_instances(tmp_path):
@@ -220,7 +220,7 @@ def test_rangefinders_become_sensors_that_measure_as_in_mujoco(room):
             ROOM.replace('group="3"', 'rgba="0 0 0 0"'),
         )
     )
-    built = build(Scenario.load(out / "scenario.yaml"))
+    built = prepare(Scenario.load(out / "scenario.yaml"))
     measured = data.sensordata.copy()
     assert len(measured) == 1 + 35 + 16 + 9
     expected = np.split(measured, np.cumsum([1, 35, 16]))

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import LidarError, Scene
 from lidarsim.scene.files.meshfile import load_meshes
@@ -553,7 +553,7 @@ def test_classes_and_materials(tmp_path):
         ],
         "cloud": {"columns": ["class", "material"]},
     }
-    built = build(Scenario.from_data(scenario, folder=tmp_path))
+    built = prepare(Scenario.from_data(scenario, folder=tmp_path))
     assert built.survey.classes == {11: "road surface", 64: "road mark", 65: "sidewalk"}
     assert {*built.scene.names} == {"driving lane 1/-1", "sidewalk lane 1/-2", "road mark 1"}
     assert {*built.scene.material_names} == {"asphalt", "concrete", "paint white"}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import rasters
 from lidarsim import LidarError, Scanner, Sensor
@@ -403,7 +403,7 @@ def epsg_of(folder, *files, **world):
     cloud = {"precision_m": 0.001}
     data = {"scene": {"files": [*files]}, "world": world, "cloud": cloud}
     scenario = Scenario.from_data(data, folder=folder)
-    return build(scenario).survey.epsg
+    return prepare(scenario).survey.epsg
 
 
 def test_the_scene_has_one_coordinate_system(tmp_path):
@@ -557,7 +557,7 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     assert checked.exit_code == 0, checked.output
     assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
     assert "note: hill.tif has 2 bands. Heights are read from the first band.\n" in checked.output
-    built = build(Scenario.load(tmp_path / "hill.tif"))
+    built = prepare(Scenario.load(tmp_path / "hill.tif"))
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
         [pose.position for pose in built.placing.poses],
@@ -572,7 +572,7 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     np.testing.assert_allclose(z, 100 + ((x - x0) / 2 - 0.5) / 10, atol=0.002)
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
-    built = build(Scenario.load(tmp_path / "hole.tif"))
+    built = prepare(Scenario.load(tmp_path / "hole.tif"))
     at = np.array(built.placing.poses[0].position)
     assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
     assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)

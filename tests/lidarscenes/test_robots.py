@@ -14,7 +14,7 @@ from tests.shapes import level, made
 from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import Mounted, box
 from lidarsim.base.vectors import into_axes
@@ -269,15 +269,15 @@ def test_a_scenario_names_the_assets_of_a_robot(tmp_path, packages):
     for entry in ({"files": [file]}, {"files": [file | {"assets": "ws/private"}]}):
         scenario = Scenario.from_data({"scene": entry, "poses": poses}, folder=tmp_path)
         if "assets" in entry["files"][0]:
-            assert build(scenario).scene.names == ("r/leg",)
+            assert prepare(scenario).scene.names == ("r/leg",)
         else:
             with pytest.raises(LidarError, match="Set `assets` to"):
-                build(scenario)
+                prepare(scenario)
     actor = {"name": "R", "file": file | {"assets": "ws"}, "at": [3, 0, 0]}
     scenario = Scenario.from_data(
         {"scene": "seed", "actors": [actor], "poses": poses}, folder=tmp_path
     )
-    assert len(build(scenario).scene.actors) == 1
+    assert len(prepare(scenario).scene.actors) == 1
 
 
 HINGE = joint("j", "revolute", "a", "b")
@@ -552,7 +552,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
         "mount": {"link": "lidar", "position": [0, 0, 0.036], "yaw_deg": 90},
         "materials": [{"objects": "Rover/*wheel", "reflectance": 0.1}, {"objects": "*"}],
     }  # fmt: skip
-    built = build(Scenario.from_data(data, folder=folder))
+    built = prepare(Scenario.from_data(data, folder=folder))
     actors = {actor.name: actor for actor in built.scene.actors}
     assert [name for name in actors if name.startswith("Rover/")][:2] == [
         "Rover/base_link", "Rover/front_left_wheel",
@@ -582,7 +582,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
 
 def test_a_robot_that_stands_moves_its_joints_by_the_clock_of_the_survey(folder):
     data = SCENARIO | {"actors": [ROVER | {"at": {"position": [9, 0, 0], "yaw_deg": 90}}]}
-    actors = {a.name: a for a in build(Scenario.from_data(data, folder=folder)).scene.actors}
+    actors = {a.name: a for a in prepare(Scenario.from_data(data, folder=folder)).scene.actors}
     assert actors["Rover/base_link"].trajectory.pose(0, 1e9).yaw_deg == pytest.approx(90)
     turret = actors["Rover/shoulder_block"].trajectory.pose(0, 1e9)
     expected = [9, 0.3, 0.4, 90 + np.degrees(0.5)]
@@ -613,7 +613,7 @@ def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
     data = {key: value for key, value in data.items() if value is not None}
     with pytest.raises(LidarError, match=words):
         scenario = Scenario.from_data(data, folder=folder)
-        build(scenario)
+        prepare(scenario)
 
 
 def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
@@ -629,26 +629,26 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
         },
         folder=folder,
     )
-    job = build(scenario).job()
+    job = prepare(scenario).job
     for actor in job.scene.actors:
         assert actor.trajectory.presence_ns == pytest.approx((0.2e9, 0.6e9))
 
 
 def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
-    alone = build(Scenario.load(folder / "rover.urdf"))
+    alone = prepare(Scenario.load(folder / "rover.urdf"))
     robot = load_robot(folder / "rover.urdf")
     assert alone.placing.surrounds_object and not alone.scene.actors
     assert alone.scene.names == tuple(actor.name for actor in robot.actors())
     assert "are at zero. To move them" in advice(alone)[0]
     entry = {"file": "rover.urdf", "rotation_deg": [0, 0, 90], "translation": [5, 0, 0]}
-    placed = build(Scenario.from_data({"scene": [entry]}, folder=folder)).scene
+    placed = prepare(Scenario.from_data({"scene": [entry]}, folder=folder)).scene
     at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
     np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
     with pytest.raises(
         LidarError, match=r"is a robot, which is always in meters with z up\. Remove `unit`"
     ):
-        build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
+        prepare(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
     with pytest.raises(
         LidarError, match=r"cannot be read\. It describes a robot\. Read it with load_robot"
     ):
@@ -669,7 +669,7 @@ def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way)
         Scenario.from_data({"scene": name}, folder=tmp_path),
     ):
         with pytest.raises(LidarError, match=f"{name} cannot be read. .*{way}"):
-            build(scenario)
+            prepare(scenario)
 
 
 def test_of_a_scale_of_four_numbers_the_first_three_count(tmp_path):

@@ -19,7 +19,7 @@ from tests.fork_server import USD_CORE, ForkServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
 from lidarsim import LidarError, SceneInstance
@@ -201,7 +201,7 @@ def test_moving_prims_are_actors(tmp_path):
              "points": [{"time_s": t, "position": [0, 0, 0], "yaw_deg": 0} for t in (0, 9)]}}]},
         folder=tmp_path,
     )  # fmt: skip
-    scene = build(scenario).scene
+    scene = prepare(scenario).scene
     assert [actor.name for actor in scene.actors] == ["Car", "Wheel", "Van"]
 
 
@@ -236,7 +236,7 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     objects, lines = told(path)
     assert lines == ["m.usda moves Car, but all objects are treated as static at their first pose"]
     assert bounds(objects)[0, 0] == 1
-    built = build(Scenario.load(path))
+    built = prepare(Scenario.load(path))
     assert not built.scene.actors and built.scene.bounds[0, 0] == 1
     assert "a scene requires at least one static object" in advice(built)[0]
     uneven = Transform.from_parts(scale=(1, 2, 1))
@@ -259,7 +259,7 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
 
     def names(**more):
         files = [{"file": "scenes/m.usda"} | more]
-        return build(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
+        return prepare(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
 
     with pytest.raises(LidarError, match=r"Set assets to the folder"):
         names()
@@ -482,7 +482,7 @@ def test_a_person_of_a_scenario_moves(tmp_path):
     man = {"name": "Man", "file": "man.usda", "at": [4, 0, 0], "animation": "Walk"}
     data = {"scene": {"ground": {"margin_m": 30}}, "poses": [[0, 0, 1]], "steps": 36,
             "sensor": {"model": "velodyne/vlp16"}, "actors": [man]}  # fmt: skip
-    scene = build(Scenario.from_data(data, folder=tmp_path)).scene
+    scene = prepare(Scenario.from_data(data, folder=tmp_path)).scene
     scanner = Scanner(scene, Sensor.grid(720, 60), columns=["object", "time"])
     middles = []
     for start in (0.1, 0.5):

@@ -13,7 +13,7 @@ from tests.shapes import made
 from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import Cloud, SceneMesh, box
 from lidarsim.motion.rotations import matrices
@@ -644,7 +644,7 @@ def test_scenarios_name_animations(tmp_path):
     one = {"name": "A", "file": "pedestrian.glb", "animation": "Walk", "trajectory": WAY}
     walk = {"name": "Walk", "speed_m_s": 1.4, "repeat": False, "offset_s": 0.5}
     other = one | {"name": "B", "animation": walk}
-    built = build(scenario(tmp_path, one, one | {"name": "C"}, other))
+    built = prepare(scenario(tmp_path, one, one | {"name": "C"}, other))
     a, c, b = built.scene.actors
     assert a.mesh.animation is c.mesh.animation and a.mesh.animation.speed_m_s is None
     assert (b.mesh.animation.speed_m_s, b.mesh.animation.repeat, b.offset_s) == (1.4, False, 0.5)
@@ -652,7 +652,7 @@ def test_scenarios_name_animations(tmp_path):
     assert told.startswith(
         "the animation of B ends after 1.05 s, before the end of the survey, and its last"
     )
-    still = build(scenario(tmp_path, {k: v for k, v in one.items() if k != "animation"}))
+    still = prepare(scenario(tmp_path, {k: v for k, v in one.items() if k != "animation"}))
     assert still.scene.actors[0].mesh.animation is None
     assert any("set `animation: NAME` on an actor" in line for line in advice(still))
 
@@ -675,7 +675,7 @@ def test_scenarios_name_animations(tmp_path):
 )
 def test_what_is_wrong_with_a_scenario_is_a_line(tmp_path, entry, message):
     with pytest.raises(LidarError, match=message):
-        build(scenario(tmp_path, {"name": "A", "trajectory": WAY} | entry))
+        prepare(scenario(tmp_path, {"name": "A", "trajectory": WAY} | entry))
 
 
 @pytest.mark.extended
@@ -689,7 +689,7 @@ def test_people_of_traffic_walk_at_their_own_speed_and_out_of_step(tmp_path):
     walk = {"name": "Walk", "speed_m_s": 1.4, "offset_s": 50}
     shape = {"file": "pedestrian.glb", "animation": walk}
     traffic = {"file": "fcd.xml", "vehicles": [{"types": "*", **shape}]}
-    built = build(scenario(tmp_path, traffic=traffic, steps=36 * 20))
+    built = prepare(scenario(tmp_path, traffic=traffic, steps=36 * 20))
     walks, stands = built.scene.actors
     assert walks.mesh.animation is stands.mesh.animation and walks.offset_s != stands.offset_s
     assert min(walks.offset_s, stands.offset_s) >= 50

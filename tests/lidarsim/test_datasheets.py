@@ -22,7 +22,7 @@ from lidarpool import (
 )
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base.model_names import model_names
 from lidarsim.sensor.models import Detection, read_model
@@ -95,7 +95,7 @@ def test_stated_false_alarms_are_a_share_of_the_pulses():
 
 
 def carried(**sections):
-    survey = build(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]], **sections})).survey
+    survey = prepare(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]], **sections})).survey
     return list(zip(survey.noise_each, survey.returns_each, strict=True))
 
 
@@ -158,7 +158,7 @@ def test_each_of_several_sensors_has_its_own():
 def test_figures_that_a_data_sheet_lacks_are_told_only_on_request(model):
     sheet = {"model": model, "performance": "datasheet"}
     data = {"scene": "seed", "poses": [[0, 0, 1]], "sensor": sheet}
-    assert advice(build(Scenario.from_data(data))) == []
+    assert advice(prepare(Scenario.from_data(data))) == []
     shown = CliRunner().invoke(sensors, [model]).output
     (unknown,) = re.findall("^unknown .*", shown, re.MULTILINE)
     assert unknown.endswith("false alarms (noise.false_alarm_hz)")

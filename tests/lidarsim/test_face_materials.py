@@ -28,7 +28,7 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.columns.table import SCAN
@@ -518,14 +518,14 @@ def test_a_scenario_reads_names_of_materials_if_an_entry_has_one(house):
         "materials": [{"material": "Glass", "class": 3}, {"objects": "*", "class": 1}],
         "cloud": {"columns": ["class"]},
     }
-    built = build(Scenario.from_data(data, source=house.parent / "a.yaml"))
+    built = prepare(Scenario.from_data(data, source=house.parent / "a.yaml"))
     assert built.scene.material_names == ("Brick", "Glass", "Grass")
     cloud = cloud_of(built.scene, built.survey)
     assert set(cloud["class"].tolist()) == {1, 3}
     data["materials"] = [{"objects": "*", "class": 1}]
-    assert build(Scenario.from_data(data, source=house.parent / "a.yaml")).scene.materials is None
+    assert prepare(Scenario.from_data(data, source=house.parent / "a.yaml")).scene.materials is None
     data["cloud"] = {"columns": ["material"]}
-    assert build(Scenario.from_data(data, source=house.parent / "a.yaml")).scene.materials
+    assert prepare(Scenario.from_data(data, source=house.parent / "a.yaml")).scene.materials
 
 
 def test_copies_have_their_class_on_all_materials(house):
@@ -543,7 +543,7 @@ def test_copies_have_their_class_on_all_materials(house):
             {"objects": "*", "reflectance": 0.6, "class": 1},
         ],
     }
-    built = build(Scenario.from_data(data, source=house.parent / "a.yaml"))
+    built = prepare(Scenario.from_data(data, source=house.parent / "a.yaml"))
     table = Rig(built.scene, built.survey, "numpy").surfaces.materials
     kinds = built.scene.surface_kinds
     found = {

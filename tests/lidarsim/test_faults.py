@@ -33,8 +33,8 @@ from lidarpool.clouds.webdataset import WebDataset
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.datasets.sweep_data import sweep_of_job
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import Cloud
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -356,7 +356,7 @@ def test_scenarios_and_campaigns(tmp_path):
         "faults:\n  - {kind: dirt, azimuth_deg: [-20, 20], transmission: 0.3}\n"
         "  - {kind: frozen, from_s: 0.05}\n"
     )
-    given = build(Scenario.load(base)).survey.faults
+    given = prepare(Scenario.load(base)).survey.faults
     assert given[0] == Fault("dirt", transmission=0.3, azimuth_deg=(-20, 20))
     campaign = tmp_path / "campaign.yaml"
     campaign.write_text(

@@ -13,9 +13,9 @@ import trimesh
 
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
 from lidarpool.clouds.format_table import point_suffixes
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import scene_of_points, surfels
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
 from lidarsim import LidarError
@@ -37,7 +37,7 @@ def traffic(path):
     trimesh.creation.box().export(path.with_name("place.stl"))
     section = {"file": path.name, "vehicles": [vehicles]}
     data = {"scene": {"files": "place.stl"}, "traffic": section}
-    return build(Scenario.from_data(data, folder=path.parent))
+    return prepare(Scenario.from_data(data, folder=path.parent))
 
 
 def copies(path):
@@ -45,7 +45,7 @@ def copies(path):
     entry = {"name": "Tree", "file": "tree.stl", "table": path.name}
     trimesh.creation.box().export(path.with_name("tree.stl"))
     data = {"scene": {"files": "tree.stl", "copies": [entry]}}
-    return build(Scenario.from_data(data, folder=path.parent))
+    return prepare(Scenario.from_data(data, folder=path.parent))
 
 
 READERS = {

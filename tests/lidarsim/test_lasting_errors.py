@@ -9,7 +9,7 @@ import pytest
 from tests.shapes import wall
 
 from lidarpool import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
@@ -118,6 +118,6 @@ def test_what_does_not_fit():
 def test_scenarios_have_them_beside_a_data_sheet():
     noise = {"channel_bias_m": [0.01] * 16, "warm_up_m": 0.02, "ripple_deg": 0.02}
     sensor = {"model": "velodyne/vlp16", "performance": "datasheet"}
-    made = build(Scenario.from_data({"scene": "seed", "sensor": sensor, "noise": noise}))
+    made = prepare(Scenario.from_data({"scene": "seed", "sensor": sensor, "noise": noise}))
     made = made.survey.noise_each[0]
     assert made.range_m == 0.03 and made.warm_up_s == 600 and len(made.channel_bias_m) == 16

@@ -451,7 +451,7 @@ def test_actors_have_opaque_and_masked_parts(backend):
 
 
 def test_a_scenario_ignores_masks_if_told(tmp_path):
-    from lidarpool.scenario.build import build
+    from lidarpool.scenario.prepare import prepare
     from lidarpool.scenario.scenario import Scenario
 
     header, body = card()
@@ -459,7 +459,7 @@ def test_a_scenario_ignores_masks_if_told(tmp_path):
     path = tmp_path / "s.yaml"
     for opacity, masked in (("mask", ("Leaves",)), ("ignore", ())):
         write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": opacity}]}}))
-        assert build(Scenario.load(path)).scene.masked == masked
+        assert prepare(Scenario.load(path)).scene.masked == masked
     write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": "glass"}]}}))
     with pytest.raises(LidarError, match="opacity"):
         Scenario.load(path)

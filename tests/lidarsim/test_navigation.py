@@ -27,8 +27,8 @@ from lidarpool import (
 )
 from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.motion.navigation import fixes, geodetic, imu_samples
 from lidarsim.motion.rotations import matrices
@@ -403,7 +403,7 @@ def test_scenarios(tmp_path):
     """
     (tmp_path / "scenario.yaml").write_text(text)
     scenario = Scenario.load(tmp_path / "scenario.yaml")
-    navigation = build(scenario).survey.navigation
+    navigation = prepare(scenario).survey.navigation
     assert navigation == Navigation(
         imu=Imu(rate_hz=100, gyroscope_random_walk=2e-5, mount=Pose((0, 0, 0), 10)),
         gnss=Gnss(origin=(48.7, 9.1, 290), drift_horizontal_m=0.5),

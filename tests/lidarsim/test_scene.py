@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import LidarError, Scene, SceneMesh
 from lidarsim.scene.object_names import unique_names
@@ -152,7 +152,7 @@ def test_equal_names_of_the_files_of_a_scenario(tmp_path, same_names, counts):
     section = {"files": ["a.obj", "b.obj"]}
     if same_names:
         section["same_names"] = same_names
-    built = build(Scenario.from_data({"scene": section, "poses": [[0, 0, 1]]}, folder=tmp_path))
+    built = prepare(Scenario.from_data({"scene": section, "poses": [[0, 0, 1]]}, folder=tmp_path))
     assert face_counts(built.scene) == counts
     notes = [note for note in advice(built) if "a duplicate name" in note]
     assert len(notes) == (same_names != "join")

@@ -21,7 +21,7 @@ from click.testing import CliRunner
 
 from lidarpool.cli.commands import cli
 from lidarpool.cli.import_plugins import import_whole
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.gazebo.import_world import import_world
 from lidarscenes.helios import import_scanner, is_scanner
@@ -825,7 +825,7 @@ def test_import_makes_a_scenario_of_a_file(name, file_format, tmp_path):
     file = export_sensor(load_sensor("livox/mid360"), tmp_path / name, format=file_format)
     left_out = import_whole(import_sensor, tmp_path / name, tmp_path / "new", (), Scenario.load)
     assert len(left_out) == (file_format is None), left_out
-    built = build(Scenario.load(tmp_path / "new/scenario.yaml"), plans=False)
+    built = prepare(Scenario.load(tmp_path / "new/scenario.yaml"), plans=False)
     [carried] = built.survey.carried
     firings = np.arange(len(file.rays))
     assert angle_deg(carried.sensor.directions(firings)[:, 0], file.rays.directions) < 1e-5

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from lidarpool import LidarError, Pose, Track, load_trajectory
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 
 # Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
@@ -458,7 +458,7 @@ def test_a_scenario_depends_on_the_files_of_a_folder(oxts, tmp_path):
     )
     names = [file.name for file in Scenario.load(path).files]
     assert names == [f"{number:010}.txt" for number in range(3)] + ["timestamps.txt"]
-    assert np.isclose(build(Scenario.load(path)).job().survey.pose(0).position[2], 12.8)
+    assert np.isclose(prepare(Scenario.load(path)).job.survey.pose(0).position[2], 12.8)
 
 
 def test_a_scenario_states_the_unit_of_its_times(tmp_path):
@@ -476,13 +476,13 @@ def test_a_scenario_states_the_unit_of_its_times(tmp_path):
             {"name": "Van", "box": [4, 2, 1], "trajectory": {"points": points, **unit}},
         ],
     }
-    built = build(Scenario.from_data(data, folder=tmp_path))
-    assert built.job().survey.path.duration_ns == 2e9
+    built = prepare(Scenario.from_data(data, folder=tmp_path))
+    assert built.job.survey.path.duration_ns == 2e9
     for actor in built.scene.actors:
         assert actor.trajectory.pose(0, 1.5e9).position[0] + built.scene.origin[0] == 1.5
     del data["actors"][1]["trajectory"]["time_unit"]
     with pytest.raises(LidarError, match=r"actor 'Van': points: .* probably nanoseconds"):
-        build(Scenario.from_data(data, folder=tmp_path))
+        prepare(Scenario.from_data(data, folder=tmp_path))
     del data["actors"][0]["trajectory"]["time_unit"]
     with pytest.raises(LidarError, match=r"actor 'Car': .*car\.tum .* probably nanoseconds"):
-        build(Scenario.from_data(data, folder=tmp_path))
+        prepare(Scenario.from_data(data, folder=tmp_path))

@@ -23,7 +23,7 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim import SceneMesh
@@ -410,7 +410,7 @@ planning: {enabled: false}
 """
     )
     scenario = Scenario.load(path)
-    built = build(scenario)
+    built = prepare(scenario)
     scene = built.scene
     assert dict(zip(scene.names, scene.has_voxels.tolist(), strict=True)) == {
         "oak": True, "Oak": True, "Ground": False
@@ -418,6 +418,6 @@ planning: {enabled: false}
     assert scene.object_bounds[0] == pytest.approx(np.array([[4, -1, 1], [6, 1, 4]]), abs=0.021)
     (line,) = built.findings.sources.values()
     assert "2 x 2 x 3 voxels" in line
-    job = build(scenario).job()
+    job = prepare(scenario).job
     plain = Scene.from_meshes([box("Ground", (0, 0, 0), (1, 1, 1))])
     assert cast_bytes(job.scene, job.survey) > cast_bytes(plain, job.survey)

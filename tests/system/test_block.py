@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.simulator.rig import Rig
 
@@ -23,8 +23,8 @@ def scanned(tmp_path_factory):
     for pattern in ("block*", "rover*", "car.obj"):
         for file in EXAMPLES.glob(pattern):
             shutil.copy(file, folder)
-    built = build(Scenario.load(folder / "block.yaml"))
-    job = built.job()
+    built = prepare(Scenario.load(folder / "block.yaml"))
+    job = built.job
     batches = list(Rig(job.scene, job.survey, "tiles").cast(0, 72))
     columns = {
         column.name: np.concatenate([column.make(batch) for batch in batches])

@@ -34,7 +34,7 @@ from lidarpool import (
 )
 from lidarpool.run.forecast import forecast
 from lidarpool.run.options import RunOptions
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene_mesh import Cutout
@@ -74,7 +74,7 @@ def test_clear_air_leaves_all_of_the_light(tmp_path, lidarpool):
 
 @pytest.mark.extended
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
-    job = build(Scenario.from_data(SHORT), plans=False).job()
+    job = prepare(Scenario.from_data(SHORT), plans=False).job
     with Client(cluster, set_as_default=False) as client:
         made = forecast(job, RunOptions(backend="numpy", out=tmp_path), client)
         result = simulate(

@@ -9,12 +9,14 @@ import ast
 import doctest
 import importlib.util
 import inspect
+import io
 import json
 import re
 import runpy
 import shlex
 import subprocess
 import sys
+import tokenize
 import tomllib
 import warnings
 from collections.abc import Iterator
@@ -45,9 +47,9 @@ from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
 from lidarpool.datasets.dataset import DATA_SETS
-from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
 from lidarsim.base.model_names import model_names
@@ -461,7 +463,7 @@ def test_yaml_is_what_it_is_for(block):
         scenario = Scenario.from_data(data, source=block.where)
         if all(path.exists() for path in scenario.files):
             with suppress(LidarError):  # a fragment, such as materials of another scene
-                assert implausibilities(build(scenario, plans=False)) == []
+                assert implausibilities(prepare(scenario, plans=False)) == []
 
 
 # What in code needs an extra of lidarpool, {extra: pattern}.
@@ -711,3 +713,30 @@ def test_the_docstring_of_simulate_says_what_is_printed(in_threads, capsys):
     for example in examples:
         exec(example.source, names)
     assert capsys.readouterr().out == "".join(example.want for example in examples) != ""
+
+
+def texts_of(source: str) -> Iterator[str]:
+    """Yield the comments and docstrings of Python code."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.string
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield ast.get_docstring(node) or ""
+
+
+def test_modules_that_comments_and_docstrings_name_exist():
+    folders = ("kernels", "scheduler", "workflows")
+    modules = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    pages = [ROOT / "tests", ROOT / "benchmarks", ROOT / "examples"]
+    known = [*modules, *(path for page in pages for path in page.rglob("*.py"))]
+    known += [path for folder in folders for path in (ROOT / folder).rglob("*.cu")]
+    endings = {"/".join(path.parts[-count:]) for path in known for count in range(1, 5)}
+    named = {
+        (path.name, name)
+        for path in modules
+        for text in texts_of(path.read_text(encoding="utf-8"))
+        for name in re.findall(r"(?<![\w./*{}-])(?:\w+/)*\w+\.(?:py|cu)\b", text)
+    }
+    assert len(named) > 20
+    assert sorted(pair for pair in named if pair[1] not in endings) == []

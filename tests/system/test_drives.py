@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Campaign, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
@@ -98,7 +98,7 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     write_scene(tmp_path / "city.glb", city(20_000))
     for name in ("city-drive.yaml", "car.obj", "pedestrian.glb"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
-    built = build(Scenario.load(tmp_path / "city-drive.yaml"))
+    built = prepare(Scenario.load(tmp_path / "city-drive.yaml"))
     scene = built.scene
     survey = built.survey
     assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
@@ -113,7 +113,7 @@ def test_the_crossing_by_day_and_wet_by_night_can_be_made(tmp_path):
     write_scene(tmp_path / "city.glb", city(20_000))
     for name in ("crossing.yaml", "crossing-night.yaml", "car.obj", "pedestrian.glb"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
-    day = build(Scenario.load(tmp_path / "crossing.yaml"))
+    day = prepare(Scenario.load(tmp_path / "crossing.yaml"))
     night = Campaign.load(tmp_path / "crossing-night.yaml").job(0)
     for scene, survey in ((day.scene, day.survey), (night.scene, night.survey)):
         people = [actor for actor in scene.actors if actor.name.startswith("Person")]
@@ -149,7 +149,7 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     points = report["points_by_object"]
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")
-    built = build(Scenario.load(town / "drive.yaml"))
+    built = prepare(Scenario.load(town / "drive.yaml"))
     scene = built.scene
     survey = built.survey
     batches = list(Rig(scene, survey, report["backend"]).cast(0, survey.scan_count))

@@ -14,7 +14,7 @@ from distributed import Client
 from lidarpool import LidarError, save_cloud, simulate
 from lidarpool.report.output import FILES
 from lidarpool.run import forecast
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 
 SCENARIO = """
@@ -27,12 +27,12 @@ pool: {backend: tiles}
 @pytest.fixture(scope="module")
 def run(cluster: str) -> Callable[..., Any]:
     """Run the scenario from Python."""
-    built = build(Scenario.from_data(yaml.safe_load(SCENARIO)))
+    built = prepare(Scenario.from_data(yaml.safe_load(SCENARIO)))
 
     def run(**options: Any) -> Any:
         with Client(cluster, set_as_default=False) as client:
             return simulate(
-                built.scene, built.survey, built.planning, client=client,
+                built.scene, built.survey, built.job.planning, client=client,
                 backend="tiles", **options,
             )  # fmt: skip
 

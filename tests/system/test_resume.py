@@ -16,7 +16,7 @@ from distributed import Client
 from tests import killed_drivers
 
 from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, remove_run, save_cloud, simulate
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
@@ -37,7 +37,7 @@ KEPT = r"contains an unfinished run with [\d,]+ of \d+ scans\. Continue it with"
 @pytest.fixture(scope="module")
 def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Cloud of the scenario in one go."""
-    built = build(Scenario.from_data(yaml.safe_load(SCENARIO)))
+    built = prepare(Scenario.from_data(yaml.safe_load(SCENARIO)))
     with Client(cluster, set_as_default=False) as client:
         result = simulate(built.scene, built.survey, client=client, backend="numpy")
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"

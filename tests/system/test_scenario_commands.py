@@ -9,7 +9,7 @@ import trimesh
 
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 
 
@@ -46,7 +46,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     made = Scenario.load("a/b/scenario.yaml")
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
-    assert len(build(made).scene.names) == 2
+    assert len(prepare(made).scene.names) == 2
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimeter"
     text = Path("a/b/scenario.yaml").read_text()
     assert "# The scene was recognized as an object of " in text and len(text.splitlines()) < 22
@@ -78,8 +78,8 @@ def test_init_writes_the_poses_that_were_chosen(tmp_path, lidarpool):
     (tmp_path / "hall.stl").write_bytes(trimesh.creation.box((8, 6, 3)).export(file_type="stl"))
     assert lidarpool("init", "new", "--mesh", "hall.stl", "--sensor", "vlp16").code == 0
     made = Scenario.load("new/scenario.yaml")
-    chosen = build(Scenario.load("hall.stl", {"sensor": "vlp16"})).survey
-    assert fingerprint(build(made).survey) == fingerprint(chosen)
+    chosen = prepare(Scenario.load("hall.stl", {"sensor": "vlp16"})).survey
+    assert fingerprint(prepare(made).survey) == fingerprint(chosen)
     assert made.poses is not None
 
 
@@ -87,7 +87,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
     assert lidarpool("init", "new", "--sensor", "vlp16").code == 0
     text = (tmp_path / "new" / "scenario.yaml").read_text()
     assert "\nscene: seed " in text and "\nsensor: vlp16 " in text and text.count("\n") < 15
-    assert len(build(Scenario.load("new/scenario.yaml")).scene.names) == 6
+    assert len(prepare(Scenario.load("new/scenario.yaml")).scene.names) == 6
 
 
 @pytest.mark.parametrize(

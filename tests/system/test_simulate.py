@@ -18,8 +18,8 @@ from lidarpool import LidarError, Planning, ScanSpec, Scene, Sensor, Survey, sim
 from lidarpool.base.shared_memory import SharedHandle
 from lidarpool.run.pipeline.casting_workers import INLINE_BYTES
 from lidarpool.run.pipeline.stage_messages import ScanRange
-from lidarpool.scenario.build import build
 from lidarpool.scenario.demo import demo_scenario
+from lidarpool.scenario.prepare import prepare
 from poolpart import Pool
 
 LONG_S = 60.0  # for what happens at once, or the test fails
@@ -120,7 +120,7 @@ def queue_sizes(plain, names):
 @pytest.mark.slow
 def test_another_client_watches_the_queues_and_variables_of_the_default_survey(client, plain):
     """Stage 1 is ahead of the driver at the start; stages 3 and 4 are while it handles a frame."""
-    job = build(demo_scenario())
+    job = prepare(demo_scenario())
     sizes = Counter()
     states = {}
 

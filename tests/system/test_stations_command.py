@@ -10,7 +10,7 @@ import yaml
 from PIL import Image
 
 from lidarpool.report.result_pictures import COLORS, COVERED, OTHER, UNCOVERED
-from lidarpool.scenario.build import build
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("pictures")
@@ -212,5 +212,5 @@ def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
     )
     assert outcome.code == 0, outcome.err
     written = Scenario.load(hall / "hall-stations" / "stations.yaml")
-    assert build(written).scene.names[-2:] == ("Crate", "Crate.2")
+    assert prepare(written).scene.names[-2:] == ("Crate", "Crate.2")
     assert written.scene.copies[0].semantic_class == 4

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
-    from .scenario.build import Job
+    from .scenario.job import Job
     from .showing.pages.scanner_page import show
     from .showing.playback.live import play
     from .showing.viewers.scanner_view import Foxglove, Rerun
@@ -139,7 +139,7 @@ _MODULES = {
     ".places.building": ("Twin", "twin"),
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
-    ".scenario.build": ("Job",),
+    ".scenario.job": ("Job",),
     ".showing.viewers.scanner_view": ("Foxglove", "Rerun"),
     ".clouds.recording": ("Recording",),
     ".recordings.opening": ("open_recording",),

@@ -79,9 +79,9 @@ class Result(RunResult):
         further_formats = [ExportSpec.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
-        with output.lock():
+        with output.lock() as locked:
             output.check_existing(self, overwrite=overwrite)
-            output.write(self)
+            output.write(locked, self)
 
     @checked
     def pictures(

@@ -30,7 +30,7 @@ from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
-from ..scenario.build import Job
+from ..scenario.job import Job
 from ..showing.pages import page_of
 from .result import Result
 
@@ -227,7 +227,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         target = output_place(out)
         chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
-        run_options = RunOptions(out=target, folder=folder, **chosen).with_pool(self.pool, chosen)
+        run_options = RunOptions(folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
             return run_campaign(target, jobs, run_options, Screen(on_progress), page)

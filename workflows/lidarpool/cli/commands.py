@@ -239,7 +239,7 @@ def cli() -> None:
 @shared.out
 @_common_options
 @_with_run_options
-def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
+def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) -> None:
     """Run the demo: scan six objects, plan a path, and draw pictures.
 
     The demo runs examples/seed.yaml on this machine.
@@ -252,7 +252,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     from ..scenario.demo import demo_scenario
     from .run_command import run_scenario
 
-    run_scenario(demo_scenario(), terminal, options, extent=extent or "pictures")
+    run_scenario(demo_scenario(), out, terminal, options, extent=extent or "pictures")
 
 
 @cli.command(cls=_LiveCommand)
@@ -301,6 +301,8 @@ def run(
     terminal: Terminal,
     options: RunOptions,
     scenarios: tuple[str, ...],
+    out: Any,
+    *,
     of_mesh: dict[str, Any],
     extent: str | None,
     number: int | None,
@@ -343,8 +345,7 @@ def run(
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
         return
-    assert options.out is not None, "it has a default"
-    options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
+    options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
     is_several = len(paths) > 1
     if of_mesh and is_several:
         raise click.UsageError(
@@ -354,11 +355,12 @@ def run(
     if is_several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
-            run_job(campaign, number, terminal, options, backend, extent)
+            run_job(campaign, number, out, terminal, options, backend, extent)
         elif extent is not None:
             raise click.UsageError("`--cloud-only` and `--pictures` cannot be used with campaigns.")
         else:
-            run_campaign(campaign.of_shard(settings["shard"] or ALL), terminal, options, backend)
+            campaign = campaign.of_shard(settings["shard"] or ALL)
+            run_campaign(campaign, out, terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError(
             "`--job`, `--retry-failed` and `--verify` can only be used with campaigns."
@@ -366,7 +368,7 @@ def run(
     else:
         scenario = Scenario.load(paths[0], of_mesh)
         settings["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
-        run_scenario(scenario, terminal, options, backend, extent=extent, **settings)
+        run_scenario(scenario, out, terminal, options, backend, extent=extent, **settings)
 
 
 @cli.command()

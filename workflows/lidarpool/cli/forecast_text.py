@@ -23,10 +23,11 @@ from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice, unlabeled
-from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
+from ..scenario.job import Job
 from ..scenario.plausibility import implausibilities
+from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
@@ -40,6 +41,7 @@ def forecast_scenario(
     of_mesh: Mapping[str, Any],
     number: int | None,
     client: Client | None,
+    out: Path | Storage,
     options: RunOptions,
     backend: str | None,
     *,
@@ -70,18 +72,20 @@ def forecast_scenario(
         )
         assert scenario is not None, "of a file"
         with terminal.status("reading the scene", logged=False):
-            built = build(scenario, plans=campaign is None)
-            job = built.job()
+            prepared = prepare(scenario, plans=campaign is None)
+            job = prepared.job
+        output = SurveyOutput(out, job.survey, job.outputs)
         with terminal.status("casting sample rays"):
             figures = forecast(
                 job,
+                out,
                 options.with_pool(scenario.pool, {"backend": backend}),
                 client,
-                refuse=None if has_jobs else lambda: _refuse_other_result(job, options),
+                refuse=None if has_jobs else lambda: output.check_existing(OneJob(job)),
             )
-        figures["notes"] += advice(built)
-        figures["warnings"] += implausibilities(built)
-        figures["sources"] = dict(built.findings.sources)
+        figures["notes"] += advice(prepared)
+        figures["warnings"] += implausibilities(prepared)
+        figures["sources"] = dict(prepared.findings.sources)
         if campaign is not None:
             file_format = campaign.keep.of_jobs
             figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
@@ -94,12 +98,12 @@ def forecast_scenario(
     if campaign is None or not has_jobs:
         job, figures = forecast_job(number or 0)
         return figures, _job_lines(job, figures)
-    figures = _campaign_figures(campaign, options, lambda number: forecast_job(number)[1])
+    figures = _campaign_figures(campaign, out, lambda number: forecast_job(number)[1])
     return figures, _campaign_lines(campaign, figures)
 
 
 def _campaign_figures(
-    campaign: CampaignSpec, options: RunOptions, forecast_job: Callable[[int], dict[str, Any]]
+    campaign: CampaignSpec, out: Path | Storage, forecast_job: Callable[[int], dict[str, Any]]
 ) -> dict[str, Any]:
     """Return the figures of some jobs of a campaign.
 
@@ -126,7 +130,7 @@ def _campaign_figures(
     return {
         "can_run": not errors,
         "reasons": lines_of_errors(errors),
-        "occupied": _holds_files(options.out),
+        "occupied": _holds_files(out),
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),
         "count": campaign.count,
@@ -151,16 +155,10 @@ def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -
     }
 
 
-def _refuse_other_result(job: Job, options: RunOptions) -> None:
-    """Raise a LidarError if the folder of the result holds another result."""
-    assert options.out is not None, "commands write"
-    SurveyOutput(options.out, job.survey, job.outputs).check_existing(OneJob(job))
-
-
-def _holds_files(folder: Path | Storage | None) -> bool:
-    """Return whether the folder of the result holds files."""
+def _holds_files(folder: Path | Storage) -> bool:
+    """Return whether the output folder contains files."""
     with suppress(NotADirectoryError):
-        return bool(folder and Storage.at(folder).entries())
+        return bool(Storage.at(folder).entries())
     return False
 
 

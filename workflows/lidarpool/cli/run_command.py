@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -33,9 +34,10 @@ from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.build import Built, Job, build
 from ..scenario.campaign import CampaignSpec
+from ..scenario.job import Job
 from ..scenario.plausibility import implausibilities
+from ..scenario.prepare import Prepared, prepare
 from ..scenario.scenario import Scenario
 from ..showing.pages import page_of
 from .shared_options import show
@@ -44,6 +46,7 @@ from .terminal import Terminal
 
 def run_scenario(
     scenario: Scenario,
+    out: Path | Storage,
     terminal: Terminal,
     options: RunOptions,
     backend: str | None = None,
@@ -63,60 +66,59 @@ def run_scenario(
     if options.starts_workers:
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
-        built = build(scenario)
-        job = built.job()
+        prepared = prepare(scenario)
     timeline.mark(timeline.SCENE)
-    for warning in implausibilities(built):
+    for warning in implausibilities(prepared):
         terminal.warn(warning)
     if shard is None:
-        _run_survey(built, job, options, terminal, extent)
+        _run_survey(prepared, out, options, terminal, extent)
         return
-    assert options.out is not None, "commands write"
-    run_notes = {"extent": extent or "page", "scans": job.survey.scan_count}
-    jobs = OneJob(job, shard, title=built.scenario.title)
-    with result_folder(options.out), page_of(jobs, options.live) as page:
-        result = cast_to_store(jobs, options, terminal, page, made_of={**made_of, **run_notes})
+    jobs = OneJob(prepared.job, shard, title=scenario.title)
+    made_of = {**made_of, "extent": extent or "page", "scans": prepared.survey.scan_count}
+    with result_folder(out), page_of(jobs, options.live) as page:
+        result = cast_to_store(jobs, options, terminal, page, made_of=made_of, target=out)
     points = len(result.points)
-    lines = [*terminal.notes(result.notes)]
-    words = shard_in_words(str(shard))
-    lines.append(
-        f"{words} in {options.out}: {plural(points, 'point')}. To combine the shards, use "
-        "lidarpool merge"
+    line = (
+        f"{shard_in_words(str(shard))} in {out}: {plural(points, 'point')}. To combine the shards, "
+        "use lidarpool merge"
     )
-    figures = {"folder": str(options.out), "shard": str(shard), "points": points}
-    show(figures, lines, terminal.as_json)
+    figures = {"folder": str(out), "shard": str(shard), "points": points}
+    show(figures, [*terminal.notes(result.notes), line], terminal.as_json)
 
 
 def _run_survey(
-    built: Built,
-    job: Job,
+    prepared: Prepared,
+    out: Path | Storage,
     options: RunOptions,
     terminal: Terminal,
     extent: str | None,
-    note_on: Callable[[RunResult], str] = lambda result: "",
+    compare: Callable[[RunResult], str] | None = None,
 ) -> None:
-    """Run a job, and write the result of a survey.
+    """Run the job of a scenario, write the result of a survey, and print a summary.
 
-    `note_on` returns a note on the result.
+    `compare` returns a note on the result, or raises an error before the result is written.
     """
-    assert options.out is not None, "commands write"
-    for note in advice(built):
+    job = prepared.job
+    for note in advice(prepared):
         terminal.tell(note)
-    jobs = OneJob(job, title=built.scenario.title)
-    extent = extent or "page"
-    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, note_on)
+    jobs = OneJob(job, title=prepared.scenario.title)
+    output = SurveyOutput(out, job.survey, job.outputs, extent or "page", prepared.scenario)
     with page_of(jobs, options.live) as page:
-        result, report = run_survey(jobs, options, output, terminal, page)
-        lines = _result_lines(options.out, result, job, report, terminal)
-        show(summary(options.out, report), lines, terminal.as_json)
+        result, report = run_survey(jobs, options, output, terminal, page, compare)
+        lines = _result_lines(out, result, job, report, terminal)
+        show(summary(out, report), lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
-            with local_result(options.out, [CLOUD]) as folder:
+            with local_result(out, [CLOUD]) as folder:
                 page.stay(folder / CLOUD)
 
 
 def run_campaign(
-    campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
+    campaign: CampaignSpec,
+    out: Path | Storage,
+    terminal: Terminal,
+    options: RunOptions,
+    backend: str | None,
 ) -> None:
     """Run a campaign, and print a summary.
 
@@ -127,21 +129,20 @@ def run_campaign(
             "`--pace` can only be used with a single survey, not with a campaign."
         )
     options = options.with_pool(campaign.pool, {"backend": backend})
-    assert options.out is not None, "commands write"
     campaign.keep.of_jobs.check_installed()
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:
-        run = cast_campaign(options.out, campaign, options, terminal, page)
+        run = cast_campaign(out, campaign, options, terminal, page)
         names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
-        figures = {"folder": str(options.out), "jobs": run.done}
+        figures = {"folder": str(out), "jobs": run.done}
         figures |= {"failed": [row.name for row in run.failed]}
         figures |= {name: getattr(run, name) for name in names}
         lines = [
             *terminal.notes(run.notes),
             f"{plural(run.done, 'job')}, {plural(run.rays, 'ray')}, "
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
-            f"data set in {click.format_filename(str(options.out))}; see its README.md",
+            f"data set in {click.format_filename(str(out))}; see its README.md",
         ]
         show(figures, lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
@@ -161,7 +162,7 @@ def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]
     number = campaign.numbers[0]
     with suppress(LidarError), terminal.status("reading the scene", logged=False):
         if (scenario := campaign.scenario(number)) is not None:  # else a function makes the jobs
-            warnings = implausibilities(build(scenario, plans=False))
+            warnings = implausibilities(prepare(scenario, plans=False))
             return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
     return []
 
@@ -169,6 +170,7 @@ def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]
 def run_job(
     campaign: CampaignSpec,
     number: int,
+    out: Path | Storage,
     terminal: Terminal,
     options: RunOptions,
     backend: str | None,
@@ -176,42 +178,42 @@ def run_job(
 ) -> None:
     """Run a job of a campaign again, and write the result of a survey.
 
-    If the target is the data set of the campaign, the result is a folder in the data set, and its
-    points must be the same. LidarError if they differ, or cannot be compared: the data set was made
-    by other software, or its files of the job are damaged.
+    If `out` is the data set of the campaign, the result is a folder in the data set, and its points
+    must be the same. LidarError if they differ, or cannot be compared: the data set was made by
+    other software, or its files of the job are damaged.
     """
-    assert options.out is not None, "commands write"
-    target = Storage.at(options.out)
+    target = Storage.at(out)
     name = campaign.name(number)
     dataset = DataSet(target, **asdict(campaign.keep))
-    of_dataset = CAMPAIGN_FILE in target.entries()
-    if of_dataset:
+    compare: Callable[[RunResult], str] | None = None
+    if CAMPAIGN_FILE in target.entries():
         backend = check_same(target, campaign)["backend"]
         verify(target, number)
-        folder = output_place(f"{options.out}/job-{name}")
-        options = replace(options, out=folder, folder=Storage.at(folder).below(RUN_FOLDER))
-    scenario = campaign.scenario(number)
-    assert scenario is not None, "of a file"
-    built = build(scenario, plans=False)
-    job = campaign.job(number, columns=dataset.columns)
-    for warning in implausibilities(built):
+        out = output_place(f"{out}/job-{name}")
+        options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
+        compare = partial(_compare_with_dataset, target, number, name)
+    prepared = campaign.prepare(number, dataset.columns)
+    for warning in implausibilities(prepared):
         terminal.warn(warning)
+    prepared = replace(prepared, job=prepared.job.with_fields(number=0))
+    options = options.with_pool(prepared.scenario.pool, {"backend": backend})
+    _run_survey(prepared, out, options, terminal, extent, compare)
 
-    def compare_with_dataset(result: RunResult) -> str:
-        """Return a note that the points are the data set's, or raise LidarError."""
-        rows = read_table(target) if of_dataset else ()
-        hashes = [row.sha256 for row in rows if row.number == number and row.done]
-        if not hashes:
-            return ""
-        if Tally.from_cloud(result.points).sha256 not in hashes:
-            raise LidarError(
-                f"The points of job {name} differ from those in {target}, because a file that the "
-                "job uses, such as an image of a mesh, has changed."
-            )
-        return f"the points of job {name} are bit-identical to those in {target}"
 
-    options = options.with_pool(scenario.pool, {"backend": backend})
-    _run_survey(built, replace(job, number=0), options, terminal, extent, compare_with_dataset)
+def _compare_with_dataset(dataset: Storage, number: int, name: str, result: RunResult) -> str:
+    """Return a note that the points of a job are the data set's, or raise LidarError.
+
+    The note is empty if the data set lacks the job.
+    """
+    hashes = [row.sha256 for row in read_table(dataset) if row.number == number and row.done]
+    if not hashes:
+        return ""
+    if Tally.from_cloud(result.points).sha256 not in hashes:
+        raise LidarError(
+            f"The points of job {name} differ from those in {dataset}, because a file that the "
+            "job uses, such as an image of a mesh, has changed."
+        )
+    return f"the points of job {name} are bit-identical to those in {dataset}"
 
 
 def _result_lines(

@@ -55,7 +55,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
       lidarpool init every --all
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.advice import advice
-    from ..scenario.build import build
+    from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario, mesh_data
     from ..scenario.schema import (
         SCENARIO_FILE,
@@ -76,9 +76,9 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         # From here: the scenario's folder need not be there yet.
         content = {"scene": "seed"} | mesh_data(meshes, Path(), of_mesh)
         scenario = Scenario.from_data(content, source=str(target))
-        built = build(scenario, plans=False)
-        notes = advice(built)
-        if (placing := built.placing) is not None:
+        prepared = prepare(scenario, plans=False)
+        notes = advice(prepared)
+        if (placing := prepared.placing) is not None:
             note = placing.note
             data["poses"] = placing.entries
             data |= {"sensor": dict(placing.grid)} if placing.grid else {}
@@ -140,14 +140,14 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from lidarscenes.mujoco.import_model import import_model
     from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
-    from ..scenario.build import build
     from ..scenario.point_scene import surfels
+    from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
     from ..scenario.sections import SensorSection
     from .import_plugins import SCENARIO_FILE, import_by, import_whole, importer_of, is_mujoco_model
 
     def check(path: Path) -> None:
-        build(Scenario.load(path))
+        prepare(Scenario.load(path))
 
     folder = out or Path(survey.stem)
     if survey.suffix.lower() in WORLDS:
@@ -221,12 +221,13 @@ def check(
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
-            run_options = RunOptions(out=out, cluster=file)
+            run_options = RunOptions(cluster=file)
             figures, lines = forecast_scenario(
                 scenario,
                 of_mesh,
                 number,
                 client,
+                out,
                 run_options,
                 backend,
                 quiet=as_json,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lidarsim.base.arrays import Floats
 
     from ..plan.stations import StationPlan, SurveyCoverage
-    from ..scenario.build import Built
+    from ..scenario.prepare import Prepared
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
@@ -209,9 +209,9 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     sensor = load_sensor(model)
     sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
-    built, notes = _built_with_notes(scenario, terminal)
+    prepared, notes = _prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
-        plan = plan_stations(built.scene, sensor, **settings)
+        plan = plan_stations(prepared.scene.georeferenced((0, 0, 0)), sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(
@@ -223,12 +223,14 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         draw_stations(plan).save(folder / PICTURE_FILE)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
     if settings["targets"]:
-        shortfalls += _unreachable_notes(built.scene.names, plan, "candidate positions")
+        shortfalls += _unreachable_notes(prepared.scene.names, plan, "candidate positions")
     else:
-        shortfalls += _target_notes(plan, built)
-    figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
+        shortfalls += _target_notes(plan, prepared)
+    figures = _plan_figures(plan, prepared, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
-    options.show(figures, chain(_plan_lines(plan, built, settings["targets"]), note_lines), as_json)
+    options.show(
+        figures, chain(_plan_lines(plan, prepared, settings["targets"]), note_lines), as_json
+    )
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
@@ -273,17 +275,17 @@ def _show_coverage(
         )
     recording = open_recording(cloud)
     terminal = Terminal(quiet=as_json)
-    built, notes = _built_with_notes(scenario, terminal)
-    if len(built.survey.carried) > 1:
+    prepared, notes = _prepared_with_notes(scenario, terminal)
+    if len(prepared.survey.carried) > 1:
         raise LidarError(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
-    positions = _station_positions(built)
+    positions = _station_positions(prepared)
     clouds = (compared_in_world(recording, number).points for number in range(recording.count))
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
-            built.scene,
-            built.survey.carried[0].sensor,
+            prepared.scene,
+            prepared.survey.carried[0].sensor,
             positions,
             clouds,
             targets=targets,
@@ -295,7 +297,7 @@ def _show_coverage(
             f"No surface{_of_targets(targets)} is reachable from the stations. Check their "
             "poses and the unit of the scene."
         )
-    figures = _coverage_figures(coverage, built) | {
+    figures = _coverage_figures(coverage, prepared) | {
         "stations": len(positions),
         "within_m": within_m,
         "notes": [*notes, *recording.omission_notes],
@@ -305,22 +307,22 @@ def _show_coverage(
         f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
         f"within {within_m:g} m of a point"
     )
-    table = _object_lines(built.scene.names, coverage)
+    table = _object_lines(prepared.scene.names, coverage)
     note_lines = map("note: {}".format, recording.omission_notes)
     options.show(figures, chain([head], table, note_lines), as_json)
 
 
-def _station_positions(built: Built) -> Floats:
+def _station_positions(prepared: Prepared) -> Floats:
     """Return the positions (s, 3) of the sensor at all stations, world meters."""
-    path = built.survey.path
-    mount = built.survey.carried[0].mount
+    path = prepared.survey.path
+    mount = prepared.survey.carried[0].mount
     poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]
-    return built.scene.origin + [pose.position for pose in poses]
+    return prepared.scene.georeferenced((0, 0, 0)).origin + [pose.position for pose in poses]
 
 
-def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
+def _coverage_figures(coverage: SurveyCoverage, prepared: Prepared) -> dict[str, Any]:
     """Return the figures of what a cloud covers for --json."""
-    names = built.scene.names
+    names = prepared.scene.names
     reachable_m2 = float(coverage.reachable_m2.sum())
     return {
         "reachable_m2": reachable_m2,
@@ -341,25 +343,23 @@ def _object_figures(
     }
 
 
-def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
-    """Build a scenario whose poses do not matter.
+def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepared, list[str]]:
+    """Prepare a scenario whose poses do not matter.
 
     Returns its notes and warnings, which are printed at once.
     """
     from ..scenario.advice import advice
-    from ..scenario.build import build
     from ..scenario.default_poses import Placing
-    from ..scenario.georeference import place_problem
+    from ..scenario.prepare import prepare
 
     with terminal.status("reading the scene", logged=False):
-        built = build(scenario, plans=False)
-    notes = advice(replace(built, placing=Placing(())))
+        prepared = prepare(scenario, plans=False)
+    notes = advice(replace(prepared, placing=Placing(())))
     for note in notes:
         terminal.tell(note)
-    placed = built.scene.georeferenced(built.scenario.world.origin)
-    if problem := place_problem(placed, built.survey.epsg):
+    if problem := prepared.job.place_problem:
         terminal.warn(problem)
-    return built, [*notes, *terminal.warnings]
+    return prepared, [*notes, *terminal.warnings]
 
 
 def _of_targets(targets: Sequence[str]) -> str:
@@ -367,14 +367,14 @@ def _of_targets(targets: Sequence[str]) -> str:
     return f" of {joined(targets)}" if targets else ""
 
 
-def _target_notes(plan: StationPlan, built: Built) -> Iterator[str]:
+def _target_notes(plan: StationPlan, prepared: Prepared) -> Iterator[str]:
     """Yield a note if all objects are covered, and one of them has most of the area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
     share = float(reachable_m2[largest] / reachable_m2.sum())
     if share > _MOST_OF_THE_AREA and (reachable_m2 > 0).sum() > 1:
         yield (
-            f"{printable(built.scene.names[largest])} accounts for {share:.0%} of the reachable "
+            f"{printable(prepared.scene.names[largest])} accounts for {share:.0%} of the reachable "
             "area, so it largely determines the stations. To cover other objects, select them with "
             "`--target`"
         )
@@ -457,9 +457,11 @@ def _stations_scenario(
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
+def _plan_figures(
+    plan: StationPlan, prepared: Prepared, sensor: str, notes: list[str]
+) -> dict[str, Any]:
     """Return the figures of a plan for --json."""
-    names = built.scene.names
+    names = prepared.scene.names
     return {
         "sensor": sensor,
         "places": len(plan.candidates),
@@ -469,15 +471,15 @@ def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]
             for position, share in zip(plan.stations, plan.coverage, strict=True)
         ],
         "objects": _object_figures(names, plan),
-        "epsg": built.survey.epsg,
-        "world_origin": [*built.scenario.world.origin],
+        "epsg": prepared.survey.epsg,
+        "world_origin": [*prepared.scenario.world.origin],
         "notes": notes,
     }
 
 
-def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iterator[str]:
+def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -> Iterator[str]:
     """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
-    names = built.scene.names
+    names = prepared.scene.names
     yield (
         f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
         f"{plan.spacing_m:g} m, from which {plan.reachable_m2.sum():,.0f} "
@@ -494,7 +496,7 @@ def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iter
     blind = int((plan.targets & (plan.reachable_m2 == 0)).sum())
     if blind:
         yield f"not reachable from any candidate position: {plural(blind, 'object')}"
-    yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)
+    yield from options.world_lines(prepared.survey.epsg, prepared.scenario.world.origin)
 
 
 def _object_lines(names: Sequence[str], areas: StationPlan | SurveyCoverage) -> Iterator[str]:

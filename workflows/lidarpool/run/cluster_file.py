@@ -30,10 +30,7 @@ _CONNECT_TIMEOUT = "30s"  # limit for a host to answer
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition.
-
-    Extra fields override arguments of the cluster.
-    """
+    """Workers of a partition; extra fields override arguments of the cluster."""
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
@@ -167,10 +164,7 @@ class ClusterFile(BaseModel):
             yield cluster
 
     def _factory(self) -> Any:
-        """Import and return the class of the cluster.
-
-        Raises LidarError if the name is not of such a class.
-        """
+        """Return the class of the cluster, or raise LidarError for another name."""
         package, _, name = self.cluster.rpartition(".")
         try:
             # Keeps the signal handlers of this process: dask-jobqueue installs its own.

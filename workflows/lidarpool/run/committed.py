@@ -72,7 +72,7 @@ class Committed:
             seconds=self.seconds,
             survey_seconds=self.survey_seconds,
             planning_seconds=self.planning_seconds,
-            replayed=only_job.offered_again,
+            replayed=self.replayed,
         )
 
     def _warn_of_empty_cloud(self, screen: Screen) -> None:

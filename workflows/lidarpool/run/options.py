@@ -36,7 +36,6 @@ class RunOptions(TaskOptions):
     describe them; the same are options of commands. The defaults are valid for all.
     """
 
-    out: Path | Storage | None = None  # output: result or data set; None if nothing is written
     # Folder of the run's store until the result is complete; None for a temporary folder that is
     # deleted with the last user of the points.
     folder: str | Path | Storage | None = None

@@ -44,27 +44,20 @@ class TrialPump:
         """True if all trials have ended."""
         return len(self.trials) == self.planning.trials
 
-    def step(self) -> bool:
-        """Take results and submit more trials, and return True if there were changes.
-
-        LidarError if a trial has failed.
-        """
+    def step(self) -> None:
+        """Take results and submit more trials. LidarError if a trial has failed."""
         running = self.tasks.running
         if running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
             self._leave_silent_workers()
-        failed = self.tasks.take_failed()
-        for number, future in failed:
+        for number, future in self.tasks.take_failed():
             # Dask gives up tasks after several deaths of their workers, whatever the cause.
             if was_killed(future) and self._rounds[number] < MAX_ROUNDS:
                 self._waiting.append(number)
             else:
                 raise_if_failed(future, f"Planning trial {number}")
-        finished = [trial for _, trial in self.tasks.take_done()]
-        self.trials += finished
-        room = min(self._max_running - len(running), len(self._waiting))
-        for _ in range(room):
+        self.trials += [trial for _, trial in self.tasks.take_done()]
+        for _ in range(min(self._max_running - len(running), len(self._waiting))):
             self._submit(self._waiting.popleft())
-        return bool(failed or finished or room > 0)
 
     def _submit(self, number: int, worker: str | None = None) -> None:
         self.tasks.submit(

@@ -13,7 +13,7 @@ from ..datasets.job_table import JobRow
 from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Progress
 from .run_result import RunResult
-from .store.job_under_way import JobUnderWay
+from .store.stored_job import StoredJob
 
 
 class RunPage:
@@ -25,7 +25,7 @@ class RunPage:
     the parts of ended jobs.
     """
 
-    def begun(self, job: JobUnderWay) -> None:
+    def begun(self, job: StoredJob) -> None:
         """Show the only job of a run, and the results of an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
@@ -41,19 +41,22 @@ class RunPage:
         """Show a frame of the only job."""
 
     def on_progress(
-        self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
+        self, progress: Progress, in_flight: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
         """Show the progress.
 
         Raises KeyboardInterrupt if a user of the page has stopped the run.
 
-        `under_way` returns `JobUnderWay.status` of the jobs that are being cast or written.
+        `in_flight` returns the states of the jobs that are being cast or written: `name` and
+        `values` of the job, the number of its `scans`, how many of them are `stored` and with how
+        many `points`, the casting time so far in `seconds`, and whether its files are being
+        written (`writing`).
         """
 
     def ended(self, row: JobRow) -> None:
         """Show a job that has ended, in this run or an earlier run."""
 
-    def look(self, row: JobRow, job: JobUnderWay) -> None:
+    def look(self, row: JobRow, job: StoredJob) -> None:
         """Read points of a finished job, if they are shown, before its parts are removed."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:

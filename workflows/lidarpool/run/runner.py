@@ -17,7 +17,7 @@ from typing import Any
 from ..base.shard import ALL
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from ..scenario.build import Job
+from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
 from .committed import Committed
 from .job_source import JobMaker, Jobs
@@ -38,16 +38,17 @@ def cast_to_store(
     page: RunPage,
     on_frame: Callable[[ScanFrame], None] | None = None,
     made_of: Mapping[str, Any] | None = None,
+    target: object = None,
 ) -> RunResult:
     """Cast the only job of a run, and leave its points in the store of the run.
 
     `on_frame` is called with each frame in scan order. `made_of` is stored with the points, so that
-    the shards of a survey can be merged.
+    the shards of a survey can be merged. Messages name `target`, or the store by default.
     """
     listener = Listener(page, on_frame, pace=options.pace)
     with (
         ClusterConnection(jobs, options, screen) as connection,
-        open_store(jobs, options, screen) as store,
+        open_store(jobs, options, screen, target) as store,
     ):
         committed = cast(store, connection, listener)
         result = committed.result(screen)
@@ -57,8 +58,12 @@ def cast_to_store(
 
 
 @contextmanager
-def open_store(jobs: Jobs, options: RunOptions, screen: Screen) -> Iterator[RunStore]:
+def open_store(
+    jobs: Jobs, options: RunOptions, screen: Screen, target: object = None
+) -> Iterator[RunStore]:
     """Open the store of a run, which may have points of an earlier run.
+
+    `target` is the location of the result, which messages name; by default, the store.
 
     Notes of errors and interrupts in the body name what stays in the store.
 
@@ -80,8 +85,7 @@ def open_store(jobs: Jobs, options: RunOptions, screen: Screen) -> Iterator[RunS
     # A task of a batch queue resumes its shard whether the shard has begun or not.
     explained = store.committed_in_words or store.notes or jobs.shard != ALL
     if options.resume and store.only_job and not explained:
-        location = options.out or options.folder
-        store.notes.append(f"{location} contained no unfinished run to resume")
+        store.notes.append(f"{target or options.folder} contained no unfinished run to resume")
     with store.kept_on_error():
         yield store
 

@@ -1,8 +1,8 @@
 """Sweeps of a campaign as they are cast: from the workers to the reader, without files.
 
-A stream takes the role of stages 1 and 4: it gives the scans of the next sweeps to a `Dispatcher`,
-which offers them to workers, again if workers die, and it fetches the columns from the workers that
-cast them.
+A stream replaces stages 1 and 4: it passes the scans of the next sweeps to a `Dispatcher`, which
+offers them to workers, again if workers die, and it fetches the columns from the workers that cast
+them.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import logging
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,16 +36,17 @@ from ..clouds.boxes import Boxes
 from ..clouds.kitti import intensity_of
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import sweep_of_job
-from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import Keep
 from ..scenario.empty_cloud import empty_cloud_reason
+from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
 from .cluster.cluster import client_of
 from .cluster.watch import Waiting, Watch
 from .job_source import JobMaker
 from .options import RunOptions
 from .pipeline.casting_workers import CastingWorkers
+from .pipeline.committed_results import CommittedResults
 from .pipeline.dispatch import Dispatcher
 from .pipeline.failures import JobError
 from .pipeline.pipeline_job import PipelineJob
@@ -54,7 +54,8 @@ from .pipeline.stage_messages import CollectOrder, ColumnsLost, Receipt
 from .pipeline.stage_names import GPU
 from .progress import Screen
 
-LONGEST_PAUSE_S = 0.02  # while nothing moves
+PAUSE_S = 0.005  # while the next sweep is being cast
+_READER = "reader"  # the stream, as the only collector of the dispatcher
 
 logger = logging.getLogger(__name__)
 
@@ -123,25 +124,25 @@ class SweepStream:
         return TorchStream(self, transform)
 
 
-class StreamedJob(PipelineJob):
-    """A job whose sweeps are cast, with the columns that wait to be read.
+@dataclass(eq=False)
+class _StreamedSweeps:
+    """Sweeps of a job that are being cast, with the columns that wait to be read.
 
-    Points as of `keep`, the format of the data set that a run of the campaign writes.
+    Their points are those of `keep`, the format of the data set that a run of the campaign writes.
     """
 
-    def __init__(self, job: Job, keep: Keep) -> None:
-        super().__init__(job.number, job.scene, job.survey, range(job.survey.scan_count))
-        self.job = job
-        self.keep = keep
-        self.columns: dict[int, PartColumns] = {}  # {first scan: columns of a batch}
-        self.sweeps_begun = 0  # sweeps that the dispatcher has or had
-        self.points_read = 0
+    job: Job
+    keep: Keep
+    casting: PipelineJob
+    columns: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: batch}
+    sweeps_begun: int = 0  # sweeps that the dispatcher has or had
+    points_read: int = 0
 
-    def take(self, number: int) -> Sweep | None:
+    def pop(self, number: int) -> Sweep | None:
         """Remove and return a sweep, or None if scans of the sweep are not yet cast."""
         job = self.job
-        survey = self.survey
-        sweeps = self.job.sweeps
+        survey = job.survey
+        sweeps = job.sweeps
         scan, stop = sweeps.scans[number : number + 2].tolist()
         parts = []
         while scan < stop:
@@ -171,10 +172,7 @@ class StreamedJob(PipelineJob):
 
 
 class _Casting:
-    """Casts the sweeps of a stream, in the role of stages 1 and 4 for the dispatcher."""
-
-    collector_count = 1
-    collectors: Mapping[str, str] = MappingProxyType({"reader": ""})  # {name: address}
+    """Casts the sweeps of a stream."""
 
     def __init__(self, stream: SweepStream, client: Client, waiting: Waiting) -> None:
         self._stream = stream
@@ -186,40 +184,28 @@ class _Casting:
         partition = Partition(GPU, client)
         run = uuid.uuid4().hex[:8]
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
-        self._dispatcher = Dispatcher(self._casting, self, "")
+        self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
-        self._orders: list[CollectOrder] = []  # orders for columns to be fetched
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
-        self._jobs: dict[int, StreamedJob] = {}  # jobs that are being cast
-        self._next: StreamedJob | None = None  # the job whose sweeps are cast next
-        self._sweeps_under_way: deque[tuple[StreamedJob, int]] = (
-            deque()
-        )  # sweeps that are being cast
+        self._jobs: dict[int, _StreamedSweeps] = {}  # {number of a job: its sweeps}
+        self._next: _StreamedSweeps | None = None  # sweeps that are cast next
+        self._in_flight = deque[tuple[_StreamedSweeps, int]]()  # sweeps that are being cast
         self._warned = False  # True after a warning of a job without points
-
-    def send(self, name: str, orders: Sequence[CollectOrder]) -> None:
-        """Accept orders of the dispatcher for stage 4."""
-        self._orders += orders
-
-    def advise(self, scans: int) -> None:
-        """Ignore the advice for stage 1: a batch is a sweep, or a part of a sweep that fits."""
 
     def sweeps(self) -> Generator[Sweep]:
         """Yield the sweeps in order."""
-        pause_s = 0.0
-        while not (self._maker.ended and self._next is None and not self._sweeps_under_way):
-            moved = self._step()
-            streamed, number = self._sweeps_under_way[0] if self._sweeps_under_way else (None, 0)
-            if streamed is not None and (sweep := streamed.take(number)) is not None:
-                self._sweeps_under_way.popleft()
-                if number + 1 == len(streamed.job.sweeps):
-                    self._end(streamed)
-                    self._warn_if_empty(streamed)
-                moved = True
-                yield sweep
-            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            time.sleep(pause_s)
+        while not (self._maker.ended and self._next is None and not self._in_flight):
+            self._step()
+            streamed, number = self._in_flight[0] if self._in_flight else (None, 0)
+            if streamed is None or (sweep := streamed.pop(number)) is None:
+                time.sleep(PAUSE_S)
+                continue
+            self._in_flight.popleft()
+            if number + 1 == len(streamed.job.sweeps):
+                self._end(streamed)
+                self._warn_if_empty(streamed)
+            yield sweep
 
     def close(self) -> None:
         """Stop casting, and release the workers."""
@@ -230,43 +216,38 @@ class _Casting:
             self._client.cancel(self._casting.futures)
             self._casting.release()
 
-    def _step(self) -> bool:
-        """Step the dispatcher once, and return True if there were changes."""
-        moved = self._begin_sweeps()
-        moved |= self._dispatcher.check()
-        if (locations := self._casting.look()) is not None:
+    def _step(self) -> None:
+        """Begin, cast and fetch sweeps, as far as possible without waiting."""
+        self._begin_sweeps()
+        self._dispatcher.check()
+        if (locations := self._casting.refresh()) is not None:
             scan_count = sum(map(len, self._dispatcher.batches.values()))
-            self._casting.want(self._dispatcher.slots_wanted(scan_count))
-            self._dispatcher.leave_workers(locations)
+            self._casting.request_slots(self._dispatcher.slots_wanted(scan_count))
+            self._dispatcher.reclaim_lost(locations)
         for job, error in [*self._dispatcher.failed.items()]:
             failed = self._jobs[job.number]
             self._end(failed)
-            self._sweeps_under_way = deque(
-                coming for coming in self._sweeps_under_way if coming[0] is not failed
-            )
+            self._in_flight = deque(coming for coming in self._in_flight if coming[0] is not failed)
             self._next = None if self._next is failed else self._next
             self._warn_of_failure(failed.job.name, error)
-        self._dispatcher.hand_over()
-        moved |= self._fetch()
-        moved |= self._dispatcher.offer()
+        orders = self._dispatcher.assign({_READER: ""})
+        self._fetch(orders.get(_READER, ()))
+        self._dispatcher.offer()
         self._watch.look()
-        return moved
 
-    def _begin_sweeps(self) -> bool:
-        """Begin further sweeps, at most `ahead` of the reader, and return True if any was begun."""
-        begun_before = len(self._sweeps_under_way)
-        while len(self._sweeps_under_way) < self._stream.ahead and (
-            self._next or self._begin_job()
-        ):
+    def _begin_sweeps(self) -> None:
+        """Begin further sweeps, at most `ahead` of the reader."""
+        while len(self._in_flight) < self._stream.ahead and (self._next or self._begin_job()):
             if (streamed := self._next) is not None:  # else the job has failed
                 number = streamed.sweeps_begun
                 sweeps = streamed.job.sweeps
-                self._dispatcher.take(streamed, *sweeps.scans[number : number + 2].tolist())
-                self._sweeps_under_way.append((streamed, number))
+                self._dispatcher.add_scans(
+                    streamed.casting, *sweeps.scans[number : number + 2].tolist()
+                )
+                self._in_flight.append((streamed, number))
                 streamed.sweeps_begun += 1
                 if streamed.sweeps_begun == len(sweeps):
                     self._next = None
-        return len(self._sweeps_under_way) > begun_before
 
     def _begin_job(self) -> bool:
         """Take the next job, which may fail, and return False if no job is ready."""
@@ -277,31 +258,28 @@ class _Casting:
             return True
         job = entry
         options = self._stream.options
-        streamed = StreamedJob(job, self._stream.campaign.keep)
         try:
             check_workers(job, options, self._backend, self._workers)
-            packed, scene_name = self._casting.add(job.number, job.scene, job.survey)
+            _, scene_name = self._casting.add(job.number, job.scene, job.survey)
         except JobError as error:
             self._warn_of_failure(job.name, error)
             return True
-        streamed.run = self._casting.run
-        streamed.packed = packed
-        streamed.scene_name = scene_name
         limit = options.batch_mb * MB
         on_device = self._backend == "cuda"
-        streamed.scans_per_task = scans_that_fit(job.scene, job.survey, limit, on_device=on_device)
-        streamed.scans_of_run = job.survey.scan_count
-        self._jobs[job.number] = streamed
-        self._next = streamed
+        scan_count = job.survey.scan_count
+        casting = PipelineJob(
+            committed=CommittedResults(job.number, range(scan_count)),  # stays empty
+            run=self._casting.run,
+            scene_name=scene_name,
+            scans_per_task=scans_that_fit(job.scene, job.survey, limit, on_device=on_device),
+            scans_of_run=scan_count,
+        )
+        self._next = _StreamedSweeps(job, self._stream.campaign.keep, casting)
+        self._jobs[job.number] = self._next
         return True
 
-    def _fetch(self) -> bool:
-        """Fetch the columns of casting tasks from their workers.
-
-        Returns True if any columns were ordered.
-        """
-        orders = self._orders
-        self._orders = []
+    def _fetch(self, orders: Sequence[CollectOrder]) -> None:
+        """Fetch the columns of casting tasks from their workers."""
         for order in orders:
             results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
@@ -314,21 +292,16 @@ class _Casting:
                 batch = batches[job, first]
                 streamed.columns[first] = batch.part
                 receipt = Receipt.from_part(batch.part, job, name, 0, batch.record)
-                receipts.append((streamed, receipt))
+                receipts.append((streamed.casting, receipt))
             self._dispatcher.release(receipts)
-        return bool(orders)
 
-    def _end(self, streamed: StreamedJob) -> None:
-        """Stop casting a job."""
+    def _end(self, streamed: _StreamedSweeps) -> None:
         del self._jobs[streamed.job.number]
-        self._dispatcher.drop(streamed)
+        self._dispatcher.drop(streamed.casting)
         self._casting.remove(streamed.job.number)
 
-    def _warn_if_empty(self, streamed: StreamedJob) -> None:
-        """Warn of the first job without points.
-
-        This process casts rays to find the reason.
-        """
+    def _warn_if_empty(self, streamed: _StreamedSweeps) -> None:
+        """Warn of the first job without points, and cast rays here to find the reason."""
         if streamed.points_read or self._warned:
             return
         self._warned = True

@@ -41,11 +41,8 @@ GATHER_S = 0.25  # time that a job waits for more jobs of its task
 MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
-class JobFiles(NamedTuple):
-    """Input for writing a job.
-
-    `row` lacks the counts of points.
-    """
+class WriteRequest(NamedTuple):
+    """Input for writing a job, whose `row` lacks the counts of points."""
 
     row: JobRow
     cloud: StoredCloud
@@ -56,21 +53,11 @@ class JobFiles(NamedTuple):
 JobOutcome = JobRow | LidarError
 
 
-class Probe(NamedTuple):
-    """A file by which a worker finds out whether the worker sees a storage."""
-
-    storage: Storage
-    name: str
-    content: bytes
-
-    @property
-    def is_seen(self) -> bool:
-        """True if this process finds the file with its content."""
-        return self.storage.sees(self.name, self.content)
+Probe = tuple[Storage, str, bytes]  # a storage, and the name and content of a file in it
 
 
 def write_jobs(
-    dataset: DataSet, probes: tuple[Probe, Probe], jobs: Sequence[JobFiles]
+    dataset: DataSet, probes: Sequence[Probe], jobs: Sequence[WriteRequest]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
     """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
 
@@ -78,18 +65,15 @@ def write_jobs(
     the rows if the worker does not see both files. The record of the task counts scans.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(probe.is_seen for probe in probes):
+    if not all(storage.sees(name, content) for storage, name, content in probes):
         return None, recorder.finish()
     outcomes = [_write_job(dataset, job) for job in jobs]
     scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # one past the last scan of each
     return outcomes, recorder.finish(scan_count)
 
 
-def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job.
-
-    Returns its row, or a JobError, or a LidarError if the storage is the cause.
-    """
+def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
+    """Write a job, and return its row, a JobError, or a LidarError due to the storage."""
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
@@ -104,18 +88,16 @@ def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
         return JobError(message)
 
 
-class JobWriter:
+class DataSetWriter:
     """Has LIDAR workers write jobs into a data set.
 
-    The driver writes jobs that they cannot see.
-
     `parts_probe` is a file among the parts of the `store`, name and content: a worker that does not
-    see this file, or a similar file in the data set, writes no job.
+    see this file, or a similar file in the data set, writes no job. The driver writes such jobs.
     """
 
     def __init__(
         self,
-        tasks: Tasks[list[JobFiles]],
+        tasks: Tasks[list[WriteRequest]],
         dataset: DataSet,
         store: RunStore,
         parts_probe: tuple[str, bytes],
@@ -125,14 +107,15 @@ class JobWriter:
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
         # The name of a temporary file: later writers remove the file of a killed run.
-        dataset_probe = Probe(storage, f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
-        self._probes = dataset_probe, Probe(store.storage, *parts_probe)
+        self._probe_name = f"{TEMPORARY}dataset-{mark[:8]}"
+        dataset_probe = storage, self._probe_name, mark.encode()
+        self._probes: Sequence[Probe] = (dataset_probe, (store.storage, *parts_probe))
         with explained(f"{storage} cannot be written"):
             storage.prepare()
-            storage.write(dataset_probe.name, dataset_probe.content)
-        self._waiting = deque[JobFiles]()
+            storage.write(self._probe_name, mark.encode())
+        self._waiting = deque[WriteRequest]()
         self._due_at = 0.0  # when the waiting jobs are to be written
-        self._driver_writes: dict[Future[JobOutcome], JobFiles] = {}
+        self._driver_writes: dict[Future[JobOutcome], WriteRequest] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
         self.hidden = False  # True if a worker did not see the data set
@@ -143,13 +126,13 @@ class JobWriter:
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
-    def add(self, files: JobFiles) -> None:
+    def add(self, files: WriteRequest) -> None:
         """Queue a job for writing."""
         if not self._waiting:
             self._due_at = time.monotonic() + GATHER_S
         self._waiting.append(files)
 
-    def step(self, slots: int, *, more_to_come: bool) -> list[tuple[JobFiles, JobOutcome]]:
+    def step(self, slots: int, *, more_to_come: bool) -> list[tuple[WriteRequest, JobOutcome]]:
         """Submit waiting jobs to free slots, and return written jobs with their rows or errors.
 
         Jobs wait a moment for others of their task if there are `more_to_come`. Errors of single
@@ -164,7 +147,7 @@ class JobWriter:
             jobs = self._next()
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
-        ended: list[tuple[JobFiles, JobOutcome]] = []
+        ended: list[tuple[WriteRequest, JobOutcome]] = []
         for jobs, outcomes in self.tasks.take_done():
             if outcomes is None:
                 self.hidden = True
@@ -184,7 +167,7 @@ class JobWriter:
         self._relieve(bool(ended))
         return ended
 
-    def _next(self) -> list[JobFiles]:
+    def _next(self) -> list[WriteRequest]:
         """Remove and return the jobs of the next task."""
         jobs = [self._waiting.popleft()]
         points = len(jobs[0].cloud)
@@ -215,7 +198,7 @@ class JobWriter:
             future.cancel()
             self._write_here(jobs)
 
-    def _write_here(self, jobs: Sequence[JobFiles]) -> None:
+    def _write_here(self, jobs: Sequence[WriteRequest]) -> None:
         self._driver_writes |= {
             self._thread.submit(_write_job, self.dataset, job): job for job in jobs
         }
@@ -225,9 +208,8 @@ class JobWriter:
         with suppress(Exception):  # report the first error
             self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
-        dataset_probe, _ = self._probes
         with suppress(OSError):
-            dataset_probe.storage.remove([dataset_probe.name])
+            self.dataset.storage.remove([self._probe_name])
 
 
 LOOK_EVERY_S = 0.01

@@ -1,4 +1,4 @@
-"""Notes on likely mistakes in a scenario that can be built."""
+"""Notes on likely mistakes in a scenario that can be prepared."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 
-from .build import Built
 from .georeference import missing_system
+from .prepare import Prepared
 from .scenario import Scenario, survey_of
 
 # Sizes of scenes in meters are between these. An .stl is mostly a part, in millimeters; an object
@@ -41,35 +41,36 @@ HAZE_KM = 10.0  # no lidar detects light that returns from clearer air
 MIN_STEPS = 100  # smallest length of a scene, in steps of the precision
 
 
-def advice(built: Built) -> list[str]:
+def advice(prepared: Prepared) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
     There are also notes on objects that were left out, files whose axes were guessed, poses that
     were chosen, and settings without effect.
     """
-    notes = built.findings.notes
-    remarks = built.findings.remarks
-    axes = [_for_mesh(remark) if _is_of_mesh(built.scenario) else remark for remark in remarks[:1]]
+    notes = prepared.findings.notes
+    remarks = prepared.findings.remarks
+    axes = [
+        _for_mesh(remark) if _is_of_mesh(prepared.scenario) else remark for remark in remarks[:1]
+    ]
     if others := len(remarks[1:]):
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
-    side = float(np.ptp(built.scene.bounds, axis=0).max())
-    step = built.survey.precision_m
-    placed = () if built.placing is None else built.placing.notes
-    origin = built.scenario.world.origin
-    system = missing_system(built.scene.georeferenced(origin), built.survey.epsg)
-    likely = filter(None, (_size_note(built, side), system, *placed, _color_note(built)))
+    side = float(np.ptp(prepared.scene.bounds, axis=0).max())
+    step = prepared.survey.precision_m
+    placed = () if prepared.placing is None else prepared.placing.notes
+    system = missing_system(prepared.scene, prepared.survey.epsg)
+    likely = filter(None, (_size_note(prepared, side), system, *placed, _color_note(prepared)))
     coarse = [
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"
     ] * (side < MIN_STEPS * step)
-    labels = _unnamed_classes(built.survey)
-    if any(column.name == "class" for column in built.survey.stored_columns):
-        labels = chain(unlabeled(built.scene, built.survey), labels)
-    settings = (*coarse, *_notes_of_formats(built), *labels, *_without_effect(built.scenario))
-    light = (*_single_returns(built), *_dark_fog(built.survey))
+    labels = _unnamed_classes(prepared.survey)
+    if any(column.name == "class" for column in prepared.survey.stored_columns):
+        labels = chain(unlabeled(prepared.scene, prepared.survey), labels)
+    settings = (*coarse, *_notes_of_formats(prepared), *labels, *_without_effect(prepared.scenario))
+    light = (*_single_returns(prepared), *_dark_fog(prepared.survey))
     groups = (
-        *(notes, axes, likely, _heading_notes(built.findings.without_angles)),
-        *(settings, light, _timing_notes(built)),
+        *(notes, axes, likely, _heading_notes(prepared.findings.without_angles)),
+        *(settings, light, _timing_notes(prepared)),
     )
     return [as_scenario(line) for line in chain.from_iterable(groups)]
 
@@ -132,19 +133,19 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         )
 
 
-def _notes_of_formats(built: Built) -> list[str]:
+def _notes_of_formats(prepared: Prepared) -> list[str]:
     """Return notes on what the formats of the output cannot store."""
-    specs = built.scenario.output.write
-    notes = (note for spec in specs for note in spec.cloud_format.survey_notes(built.survey))
+    specs = prepared.scenario.output.write
+    notes = (note for spec in specs for note in spec.cloud_format.survey_notes(prepared.survey))
     return [*dict.fromkeys(notes)]
 
 
-def _size_note(built: Built, side: float) -> str:
+def _size_note(prepared: Prepared, side: float) -> str:
     """Return a note if the longest side of the scene (meters) suggests another unit, else ""."""
-    scenario = built.scenario
-    placing = built.placing
+    scenario = prepared.scenario
+    placing = prepared.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
-    files = [file for file in files if file not in built.findings.classes]  # towns are large
+    files = [file for file in files if file not in prepared.findings.classes]  # towns are large
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     has_stl = any(file.lower().endswith(".stl") for file in unitless)
     min_m = SMALL_M
@@ -173,10 +174,10 @@ def _lacks_unit(path: Path) -> bool:
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
-def _color_note(built: Built) -> str:
+def _color_note(prepared: Prepared) -> str:
     """Return a note on objects that lack the colors that settings need, or an empty string."""
-    scene = built.scene
-    if not built.scenario.colored:
+    scene = prepared.scene
+    if not prepared.scenario.colored:
         return ""
     if not scene.colored:
         return (
@@ -185,7 +186,7 @@ def _color_note(built: Built) -> str:
         )
     names = scene.object_names
     kinds = scene.surface_kinds
-    table = MaterialTable.build(built.survey.materials, kinds, voxels=scene.has_voxels)
+    table = MaterialTable.build(prepared.survey.materials, kinds, voxels=scene.has_voxels)
     textured = np.zeros(len(names), np.bool_)
     textured[kinds.object[table.scale > 0]] = True
     if not len(gray := np.flatnonzero(textured & ~scene.has_colors)):
@@ -230,13 +231,13 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         )
 
 
-def _single_returns(built: Built) -> Iterator[str]:
+def _single_returns(prepared: Prepared) -> Iterator[str]:
     """Yield a note if sensors report several returns, and no pulse has a second one.
 
     False alarms do not count, although they are returns, too.
     """
-    survey = built.survey
-    setups = [setup_of(built.scene, survey, number) for number in range(len(survey.carried))]
+    survey = prepared.survey
+    setups = [setup_of(prepared.scene, survey, number) for number in range(len(survey.carried))]
     single = [
         setup
         for setup in setups
@@ -306,12 +307,12 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
     yield note
 
 
-def _timing_notes(built: Built) -> Iterator[str]:
+def _timing_notes(prepared: Prepared) -> Iterator[str]:
     """Yield notes on times: a date that is lost, faults without sweeps, and absent actors.
 
     Animations of actors that end before the survey have notes, too.
     """
-    survey = built.survey
+    survey = prepared.survey
     if isinstance(survey.path, Track) and survey.start is None:
         start_s = survey.path.start_s
         assert start_s is not None  # every track has a start
@@ -322,7 +323,7 @@ def _timing_notes(built: Built) -> Iterator[str]:
                 "start of the survey. If the trajectory times are seconds since 1970, set "
                 f"`cloud: {{start: {moment}}}` to keep the date"
             )
-    end = np.array([built.survey.duration_ns])
+    end = np.array([prepared.survey.duration_ns])
     for number, (_, starts, _) in enumerate(survey.sweeps_each):
         for index, fault in survey.faults_of(number, "frozen").items():
             if not fault.during(starts).any():
@@ -331,7 +332,7 @@ def _timing_notes(built: Built) -> Iterator[str]:
                     f"`faults[{index}]` does not freeze {sensor}, because no sweep starts during "
                     "the fault"
                 )
-    for actor in built.scene.actors:
+    for actor in prepared.scene.actors:
         first, last = presence_ns(actor.trajectory)
         if first > end[0] or last < 0:
             yield f"{actor.name} is not in the scene during the survey. Check its times"

@@ -28,9 +28,10 @@ from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..clouds.writing import with_format_columns
 from ..datasets.job_table import Value
-from .build import Job
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
 from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits
+from .job import Job
+from .prepare import Prepared
 from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
@@ -247,15 +248,30 @@ class CampaignSpec:
             If the job does not exist or cannot be made. The message states the reason.
         """
         number = self._checked_number(number)
-        fields = {"number": number, "name": self.name(number), "split": self.split(number)}
-        job = self._jobs.job(number, cache, columns, fields)
+        return self._for_dataset(self._jobs.job(number, cache, columns, self._fields(number)))
+
+    def prepare(self, number: int, columns: Sequence[str] = ()) -> Prepared:
+        """Prepare the scenario of a job, which is made as by `job`.
+
+        A job that a function makes has no scenario.
+        """
+        number = self._checked_number(number)
+        prepared = self._jobs.prepare(number, None, columns, self._fields(number))
+        return replace(prepared, job=self._for_dataset(prepared.job))
+
+    def _fields(self, number: int) -> dict[str, Any]:
+        """Return the fields of a job that depend on its number only."""
+        return {"number": number, "name": self.name(number), "split": self.split(number)}
+
+    def _for_dataset(self, job: Job) -> Job:
+        """Return a job with the columns that the data set requires."""
         if job.survey.navigation is not None:
             raise LidarError(
                 "`navigation` is not supported in campaigns, because data sets have no files for "
                 "it. Remove `navigation` from the base of the campaign."
             )
         survey = with_format_columns(job.survey, [self.keep.of_jobs])
-        return job if survey is job.survey else replace(job, survey=survey)
+        return job if survey is job.survey else job.with_fields(survey=survey)
 
     def without_folders(self, message: str) -> str:
         """Return a message without the folders of the campaign's files on this machine.

@@ -30,7 +30,6 @@ from ..base.fingerprint import fingerprint
 from ..base.software import plugin_versions
 from ..clouds.format_table import check_all_returns
 from ..datasets.job_table import Value
-from .build import Job, build
 from .campaign_sections import (
     MAX_JOBS,
     CampaignSection,
@@ -40,6 +39,8 @@ from .campaign_sections import (
     read_rows,
 )
 from .field_paths import FieldSteps, find_field, replace_value
+from .job import Job
+from .prepare import Prepared, prepare
 from .scenario import Scenario
 from .sections import file_states
 from .static_scene import SceneCache
@@ -80,15 +81,21 @@ class JobSource:
         """Return what names a file, to start a message, such as a scenario and its field."""
         return ""
 
+    def prepare(
+        self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
+    ) -> Prepared:
+        """Prepare the scenario of a job, with the arguments of `job`."""
+        scenario = self.scenario(number)
+        assert scenario is not None, "of a file"
+        made_of = file_hashes(scenario.files)
+        fields |= {"values": self.values(number), "made_of": made_of}
+        return prepare(scenario, plans=False, cache=cache, columns=columns, **fields)
+
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
         """Make a job, with further columns of its cloud and further fields of the job."""
-        scenario = self.scenario(number)
-        assert scenario is not None, "of a file"
-        made_of = file_hashes(scenario.files)
-        built = build(scenario, plans=False, cache=cache, columns=columns)
-        return built.job(values=self.values(number), made_of=made_of, **fields)
+        return self.prepare(number, cache, columns, fields).job
 
 
 class FunctionJobs(JobSource):

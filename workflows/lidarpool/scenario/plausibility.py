@@ -20,9 +20,8 @@ from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.survey.survey import Survey
 
-from .build import Built
 from .default_poses import free_above, on_one_line, seen_from, surroundings_of
-from .georeference import place_problem
+from .prepare import Prepared
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
@@ -76,20 +75,19 @@ class _SensorPosition(NamedTuple):
     station: int
 
 
-def implausibilities(built: Built) -> list[str]:
+def implausibilities(prepared: Prepared) -> list[str]:
     """Return warnings of places, poses, motions and noise that real surveys do not have.
 
     Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes with
     a moderate number of triangles.
     """
-    scene = built.scene
-    survey = built.survey
-    chosen = built.scenario.poses is None and built.scenario.trajectory is None
+    scene = prepared.scene.georeferenced((0, 0, 0))  # in the coordinates of the scenario
+    survey = prepared.survey
+    chosen = prepared.scenario.poses is None and prepared.scenario.trajectory is None
     samples = [] if chosen else _sample_positions(survey)
     positions = np.array([sample.position for sample in samples]).reshape(-1, 3)
     surroundings = surroundings_of(scene, positions) if samples else None
-    placed = scene.georeferenced(built.scenario.world.origin)
-    warnings = [*filter(None, [place_problem(placed, survey.epsg)])]
+    warnings = [*filter(None, [prepared.job.place_problem])]
     warnings += [*_noise_warnings(survey, _sight_m(scene, surroundings, positions))]
     if not chosen:
         warnings += _position_warnings(scene, survey, surroundings, samples)

@@ -343,6 +343,8 @@ class Scene:
         [500000.0, 5400000.0, 0.0]
         """
         added = _world_position(world_origin)
+        if np.array_equal(added, self.world_origin):
+            return self
         scene = copy(self)
         object.__setattr__(scene, "origin", self.origin - self.world_origin + added)
         object.__setattr__(scene, "world_origin", added)

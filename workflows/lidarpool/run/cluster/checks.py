@@ -23,7 +23,7 @@ from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
 from ...clouds.writing import ExportSpec
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
@@ -33,10 +33,7 @@ LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """Error for a partition without enough workers or slots.
-
-    More workers may join.
-    """
+    """Error for a partition without enough workers or slots, which may still join."""
 
 
 class SurveyWorkers(NamedTuple):
@@ -49,10 +46,7 @@ class SurveyWorkers(NamedTuple):
 
 
 def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
-    """Return the slots that a run needs in each partition, {name: slots}.
-
-    Writing jobs takes a slot of LIDAR.
-    """
+    """Return the slots that a run needs in each partition, {name: slots}."""
     return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 

@@ -19,9 +19,7 @@ T = TypeVar("T")
 
 
 class Tasks(Generic[T]):
-    """Submitted tasks of a partition.
-
-    `book` has the records of finished tasks.
+    """Submitted tasks of a partition, and a `book` with the records of finished tasks.
 
     Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
@@ -57,10 +55,7 @@ class Tasks(Generic[T]):
         return results
 
     def take_failed(self) -> list[tuple[T, Future]]:
-        """Remove failed and cancelled tasks, and return their purposes and futures.
-
-        Dask repeats lost tasks, but not these.
-        """
+        """Remove and return failed and cancelled tasks, which Dask does not repeat."""
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
@@ -70,9 +65,6 @@ class Tasks(Generic[T]):
         return look_for_tasks(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Cancel all tasks.
-
-        Tasks that have begun run to their end.
-        """
+        """Cancel all tasks, although tasks that have begun run to their end."""
         self._client.cancel([*self.running])
         self.running.clear()

@@ -91,10 +91,7 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check the partitions if the last check is old.
-
-        Raises LidarError if workers are missing.
-        """
+        """Raise LidarError if workers are missing, unless the last check is recent."""
         now_s = time.monotonic()
         if now_s - self._looked < WATCH_EVERY_S:
             return
@@ -122,7 +119,6 @@ class Watch:
                 waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
-        """Report a paused worker at its first appearance."""
         note = (
             f"Dask paused worker {worker['name']} of partition {partition}, because its memory "
             f"is nearly full (limit: {format_bytes(worker['memory_limit'])}). Other workers take "

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
-from enum import Enum, auto
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -32,64 +31,16 @@ from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, inter
 from .stage_messages import BatchRange
 from .stage_names import INTERSECT
 
-LOOK_EVERY_S = 1.0
+REFRESH_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
 LOST_DEVICES = 3  # processes that may lose their GPU in a run, and the last ends it
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # time for workers to drop their rigs
-SPARE_SCENES = 2  # scenes without a survey under way, kept for the next survey
+SPARE_SCENES = 2  # scenes without a survey in flight, kept for the next survey
 INLINE_BYTES = 1 << 17  # larger payloads are sent to one worker, and fetched by other workers
 CHECKING = "Checking the casting workers"
 PREPARING = "Preparing the scene on the casting workers"
-
-
-@dataclass(eq=False)
-class _Payload:
-    """A value that casting tasks bring to workers without a copy.
-
-    A small value is sent with each task. A large value lies in memory of this process, which
-    workers of this machine map; other workers get a future of its bytes.
-    """
-
-    name: str  # name on the workers
-    make: Callable[[], object]  # returns the value, again if the future is lost
-    small: Pickled | None  # pickled small value
-    shared: SharedValue | None = None
-    future: Future | None = None  # None until a worker needs it
-    recipients: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
-    holders: set[str] = field(default_factory=set)  # addresses of workers that have received it
-    blind: set[str] = field(default_factory=set)  # addresses of workers that do not see `shared`
-
-    def release(self) -> None:
-        """Release the memory now: the traceback of an error may keep this object for a while."""
-        if self.shared is not None:
-            self.shared.close()
-        if self.future is not None:
-            self.future.release()
-
-
-class WorkerState(Enum):
-    """How far a worker has come.
-
-    A worker that leaves is forgotten, unless it was refused.
-    """
-
-    CHECKING = auto()  # a task on the worker asks for its software
-    CASTING = auto()  # it may cast
-    REFUSED = auto()  # other software, or a lost GPU: it gets no task of this run
-
-
-@dataclass(eq=False)
-class _Worker:
-    """A worker that the run knows, by its address."""
-
-    # The task that checks it. Its answer is not kept on the worker: a worker with a result cannot
-    # be returned to the queue.
-    check: Future | None
-    state: WorkerState = WorkerState.CHECKING
-    slots: int = 0  # casting tasks at a time
-    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
 
 
 class CastingWorkers:
@@ -100,7 +51,7 @@ class CastingWorkers:
     batch. The first tasks of a job on a worker bring the plan and scene of the worker's rig.
 
     Each task is bound to one worker. Dask lets such a task wait for ever when the worker is gone,
-    so `look` checks every second which workers exist. In return, Dask never fails a task for the
+    so `refresh` checks every second which workers exist. In return, Dask never fails a task for the
     deaths of its neighbors, and the driver knows which batches a dead worker had.
 
     `run` is the run's id; `software` is the software that workers must have (`base.software`).
@@ -116,14 +67,14 @@ class CastingWorkers:
         self._software = dict(software)
         # {job: (plan of its rig, static part of its scene, which other jobs may share)}
         self._jobs: dict[int, tuple[_Payload, _Payload]] = {}
-        # {ids of the fields of a scene: its static part}, last used last. `_Payload.make` holds the
+        # {ids of the fields of a scene: its static part}, last used last. The payload holds the
         # scene, so that the ids stay valid.
         self._scenes: dict[tuple[int, ...], _Payload] = {}
         self._workers: dict[str, _Worker] = {}  # {address: worker}
         self._name_count = 0  # names and keys so far
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
         self._died: list[str] = []  # workers that died while they were checked, in a row
-        self._looked_at = float("-inf")
+        self._refreshed_at = float("-inf")
         self.locations = TaskLocations()
         self._requested_slots = -1  # number that the scheduler knows
         self._adapts = True  # False once the partition is known not to adapt to requests
@@ -133,8 +84,10 @@ class CastingWorkers:
     @property
     def slots(self) -> dict[str, int]:
         """Workers that were checked and take tasks, {address: tasks at a time}."""
-        casting = self._in_state(WorkerState.CASTING)
-        return {a: worker.slots for a, worker in casting.items() if a in self.locations.free}
+        free = self.locations.free
+        return {
+            a: worker.slots for a, worker in self._workers.items() if worker.slots and a in free
+        }
 
     @property
     def slot_count(self) -> int:
@@ -147,9 +100,13 @@ class CastingWorkers:
         shared = [payload.future for payload in self._payloads if payload.future is not None]
         return [*(cast for cast, _ in self._casts.values()), *self._checks.values(), *shared]
 
-    def _in_state(self, state: WorkerState) -> dict[str, _Worker]:
-        """Return the workers in a state, {address: worker}."""
-        return {a: worker for a, worker in self._workers.items() if worker.state is state}
+    @property
+    def _casting(self) -> set[str]:
+        return {a for a, worker in self._workers.items() if worker.slots}
+
+    @property
+    def _refused(self) -> set[str]:
+        return self._workers.keys() - self._casting - self._checks.keys()
 
     @property
     def _checks(self) -> dict[str, Future]:
@@ -169,9 +126,7 @@ class CastingWorkers:
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Register a job.
-
-        Returns its pickled survey, and a name that jobs of its scene share.
+        """Register a job, and return its pickled survey and a name that jobs of its scene share.
 
         JobError if the job cannot be pickled.
         """
@@ -194,8 +149,7 @@ class CastingWorkers:
     def remove(self, job: int) -> None:
         """Stop casting a job.
 
-        With the next task of another job, the workers drop the rig of this job, and old unused
-        scenes.
+        Workers drop its rig, and old unused scenes, with the next task of another job.
         """
         if (payloads := self._jobs.pop(job, None)) is None:
             return
@@ -206,51 +160,17 @@ class CastingWorkers:
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for payload in old:
             payload.release()
-            for address in payload.recipients & self._in_state(WorkerState.CASTING).keys():
+            for address in payload.recipients & self._casting:
                 self._workers[address].unneeded.append(payload.name)
 
     def _payload(self, label: str, make: Callable[[], object]) -> _Payload:
         self._name_count += 1
-        name = f"{self.run}.{label}-{self._name_count}"
-        pickled = Pickled.from_value(make())
-        if pickled.nbytes <= INLINE_BYTES:
-            return _Payload(name, make, pickled.copy())
-        shared = None
-        with suppress(OSError):  # this system has no shared memory, or too little
-            shared = SharedValue(pickled)
-        return _Payload(name, make, None, shared)
-
-    def _share(self, payload: _Payload) -> Future:
-        self._name_count += 1
-        key = f"{payload.name}-packed-{self._name_count}"
-        return share(
-            self._partition, Pickled.from_value(payload.make()).copy(), key=key, priority=10
-        )
-
-    def _payload_for(
-        self, payload: _Payload, worker: str
-    ) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that brings a payload to a worker.
-
-        Returns None if the worker has a copy.
-        """
-        if worker in payload.holders:
-            return None
-        payload.recipients.add(worker)
-        if payload.small is not None:
-            return payload.small
-        if payload.shared is not None and worker not in payload.blind and _is_here(worker):
-            return payload.shared.handle
-        if payload.future is None or payload.future.status in ("lost", "cancelled", "error"):
-            payload.future = self._share(payload)
-        return payload.future
+        return _Payload(f"{self.run}.{label}-{self._name_count}", make, self._partition)
 
     # -- casting ---------------------------------------------------------------------------
 
     def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Submit batches, each with its job, to a worker as a task.
-
-        Returns the key of the task.
+        """Submit batches, each with its job, to a worker as a task, and return the key of the task.
 
         The jobs must share a scene.
         """
@@ -263,7 +183,7 @@ class CastingWorkers:
             for job, spans_of_job in spans.items()
         ]
         payloads = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
-        arguments = [self._payload_for(payload, worker) for payload in payloads]
+        arguments = [payload.argument_for(worker) for payload in payloads]
         # Each offer has a separate key. A task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         self._name_count += 1
@@ -290,14 +210,12 @@ class CastingWorkers:
         payloads = {payload for job in jobs for payload in self._jobs.get(job, ())}
         if status == "finished":
             for payload in payloads:
-                payload.holders.add(worker)
+                payload.record_copy(worker)
             return Outcome.DONE
         error = error_of(future)
         if isinstance(error, RigMissing):
             for payload in payloads:
-                payload.holders.discard(worker)
-                if isinstance(error, MemoryUnseen):
-                    payload.blind.add(worker)
+                payload.record_loss(worker, unseen=isinstance(error, MemoryUnseen))
             return Outcome.NO_RIG
         if isinstance(error, DeviceLost):
             self._count_lost_device(error, worker)
@@ -311,15 +229,12 @@ class CastingWorkers:
         return Outcome.PENDING
 
     def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
-        """Note that a worker has lost its GPU.
-
-        Raises LidarError if that happens again and again.
-        """
+        """Refuse a worker that has lost its GPU. LidarError if this happens again and again."""
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
         # Until its process ends; the next has another address.
-        self._workers[worker] = _Worker(None, WorkerState.REFUSED)
+        self._workers[worker] = _Worker(None)
         self.notes.append(f"the GPU of {worker} stopped responding ({error})")
         if not error.restarts:
             raise LidarError(
@@ -343,20 +258,19 @@ class CastingWorkers:
 
     # -- checking workers --------------------------------------------------------------------
 
-    def look(self) -> TaskLocations | None:
+    def refresh(self) -> TaskLocations | None:
         """Handle workers that have joined or left, or take no tasks, if the last check is old.
 
         Returns the locations of workers and casting tasks, or None if the last check is recent.
         LidarError if no worker may cast, or several in a row die while they are checked.
         """
-        if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
+        if time.monotonic() - self._refreshed_at <= REFRESH_EVERY_S:
             self._check()
             return None
-        self._looked_at = time.monotonic()
+        self._refreshed_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.locations = look_for_tasks(self._client, self._partition.name, keys)
-        refused = self._in_state(WorkerState.REFUSED).keys()
-        for address in self._workers.keys() - self.locations.members - refused:
+        for address in self._workers.keys() - self.locations.members - self._refused:
             self._remove(address)
         for address in sorted(self.locations.free.keys() - self._workers.keys()):
             self._name_count += 1
@@ -387,9 +301,9 @@ class CastingWorkers:
         for key, software in answers.items():
             address = addresses[key]
             if address in identities:  # else it has left
-                self._take(address, software, identities[address])
+                self._accept(address, software, identities[address])
 
-    def want(self, slots: int) -> None:
+    def request_slots(self, slots: int) -> None:
         """Request a number of slots of an adaptive partition, or 0 when all work is done.
 
         The driver binds each batch to a worker, so that no batch waits for workers to come.
@@ -405,12 +319,11 @@ class CastingWorkers:
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
-        casting = self._in_state(WorkerState.CASTING).keys()
-        addresses = [*casting & self.locations.members]
-        for address in casting:
+        addresses = [*self._casting & self.locations.members]
+        for address in self._casting:
             del self._workers[address]
         if self._client.status == "running":
-            self.want(0)
+            self.request_slots(0)
         if addresses and self._client.status == "running":
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
@@ -422,32 +335,30 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
+    def _accept(
+        self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]
+    ) -> None:
         """Record a worker that has answered the software check, and refuse different software."""
         worker = self._workers[address]
         worker.check = None
         if differs := difference(software, self._software):
-            worker.state = WorkerState.REFUSED
             self.notes.append(
                 f"worker {identity['name']} at {address} was not used because it has {differs}"
             )
-            if self._in_state(WorkerState.REFUSED).keys() >= self.locations.members:
+            if self._refused >= self.locations.members:
                 raise LidarError(
                     f"No worker of partition {self._partition.name!r} has the software that the "
                     f"run requires. The worker at {address} has {differs}. Install the same "
                     "versions on all workers."
                 )
             return
-        slots = identity["resources"].get(self._partition.name, 1)
-        worker.state = WorkerState.CASTING
-        worker.slots = max(1, int(slots))
+        worker.slots = max(1, int(identity["resources"].get(self._partition.name, 1)))
         self._died.clear()
 
     def _remove(self, address: str) -> None:
-        """Remove a worker that has gone."""
         check = self._workers.pop(address).check
         for payload in self._payloads:
-            payload.holders.discard(address)
+            payload.record_loss(address)
         if check is None:
             return
         location = self.locations.tasks.get(check.key)
@@ -460,16 +371,90 @@ class CastingWorkers:
             )
 
 
+class _Payload:
+    """A value that casting tasks bring to workers without a copy.
+
+    A small value is sent with each task. A large value lies in memory of this process, which
+    workers of this machine map; other workers get a future of its bytes.
+    """
+
+    def __init__(self, name: str, make: Callable[[], object], partition: Partition) -> None:
+        self.name = name  # name on the workers
+        self.future: Future | None = None  # None until a worker needs it
+        self.recipients: set[str] = set()  # addresses of workers that it was sent to
+        self._make = make  # returns the value, again if the future is lost
+        self._partition = partition
+        self._holders: set[str] = set()  # addresses of workers that have received it
+        self._blind: set[str] = set()  # addresses of workers that do not see `_shared`
+        self._futures = 0  # so far
+        self._small: Pickled | None = None
+        self._shared: SharedValue | None = None
+        pickled = Pickled.from_value(make())
+        if pickled.nbytes <= INLINE_BYTES:
+            self._small = pickled.copy()
+        else:
+            with suppress(OSError):  # this system has no shared memory, or too little
+                self._shared = SharedValue(pickled)
+
+    def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
+        """Return the argument that brings the value to a worker, or None if it has a copy."""
+        if worker in self._holders:
+            return None
+        self.recipients.add(worker)
+        if self._small is not None:
+            return self._small
+        if self._shared is not None and worker not in self._blind and _is_here(worker):
+            return self._shared.handle
+        if self.future is None or self.future.status in ("lost", "cancelled", "error"):
+            self._futures += 1
+            self.future = share(
+                self._partition,
+                Pickled.from_value(self._make()).copy(),
+                key=f"{self.name}-packed-{self._futures}",
+                priority=10,
+            )
+        return self.future
+
+    def record_copy(self, worker: str) -> None:
+        """Record that a worker has a copy."""
+        self._holders.add(worker)
+
+    def record_loss(self, worker: str, *, unseen: bool = False) -> None:
+        """Record that a worker has no copy, and perhaps does not see the shared memory."""
+        self._holders.discard(worker)
+        if unseen:
+            self._blind.add(worker)
+
+    def release(self) -> None:
+        """Release the memory now: the traceback of an error may keep this object for a while."""
+        if self._shared is not None:
+            self._shared.close()
+        if self.future is not None:
+            self.future.release()
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A worker that the run knows, by its address: it is checked, and then casts or is refused.
+
+    A refused worker has different software or has lost its GPU, and gets no tasks of this run. A
+    worker that leaves is forgotten, unless it was refused.
+    """
+
+    # The task that asks for its software. Its answer is not kept on the worker: a worker with a
+    # result cannot be returned to the queue.
+    check: Future | None
+    slots: int = 0  # casting tasks at a time; 0 while it is checked, or if it is refused
+    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
+
+
 def _is_here(address: str) -> bool:
     """Return True if a worker is probably on this machine."""
     return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 
 def share(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns `value` for other tasks.
-
-    Dask repeats it if a worker dies.
-    """
+    """Submit a task that returns `value` for other tasks, again if a worker dies."""
     with warnings.catch_warnings():
         # A large value makes a large graph, which is the only way to have it recomputed.
         warnings.filterwarnings("ignore", message="Sending large graph")

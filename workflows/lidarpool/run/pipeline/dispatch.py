@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Collection, Iterable, Mapping
 
 from poolpart.task_locations import TaskLocations
 
@@ -26,42 +25,31 @@ from .stage_messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .task_records import TaskRecord
 
-MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a request to stage 1
+MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a message to stage 1
 PIECES = 16  # batches, at most, that a batch is divided into when its worker has died with it alone
-
-
-class Stages(Protocol):
-    """Interface of stages 1 (GENERATE) and 4 (COLLECT) for a dispatcher."""
-
-    collector_count: int  # including collectors that are starting
-
-    @property
-    def collectors(self) -> Mapping[str, str]:
-        """Collectors that take orders: {name: address of the worker}."""
-        ...
-
-    def advise(self, scans: int) -> None:
-        """Set the number of scans in each range that stage 1 sends from now on."""
-        ...
-
-    def send(self, name: str, messages: Sequence[CollectOrder]) -> None:
-        """Send orders to a collector."""
-        ...
 
 
 class Dispatcher:
     """Dispatches the batches of all jobs, and isolates scans that kill their workers.
 
-    The run's `mark` is in the file names of parts. Jobs that cannot be cast are in `failed`, until
-    they are dropped.
+    Jobs that cannot be cast are in `failed`, until they are dropped.
+
+    Parameters
+    ----------
+    workers
+        Workers that cast the batches.
+    collector_count
+        Number of collectors, including those that are starting.
+    mark
+        Text of the run, which is in the file names of all parts.
     """
 
-    def __init__(self, workers: CastingWorkers, stages: Stages, mark: str) -> None:
+    def __init__(self, workers: CastingWorkers, collector_count: int, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[PipelineJob, JobError] = {}
-        self.advice = 1  # scans in each range that stage 1 sends: as many as in a batch
+        self.advice = 1  # scans of a batch, which each range from stage 1 should have
         self._workers = workers
-        self._stages = stages
+        self._collector_count = collector_count
         self._mark = mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: uncommitted batches}
         self._batch_count = 0  # batches so far
@@ -80,7 +68,6 @@ class Dispatcher:
         return [batch for batch in self.batches.values() if batch.state in states]
 
     def _batches_of(self, job: PipelineJob) -> list[Batch]:
-        """Return the uncommitted batches of a job."""
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _batches_within(self, receipt: Receipt) -> list[Batch]:
@@ -99,19 +86,16 @@ class Dispatcher:
             if batch.job.number == receipt.job and first <= batch.first and batch.stop <= stop
         ]
 
-    # -- amount of work under way -----------------------------------------------------------
+    # -- amount of work in flight -----------------------------------------------------------
 
     @property
     def max_weight(self) -> int:
-        """Largest permitted weight of the batches under way (`policies.weight`)."""
+        """Largest permitted weight of the batches in flight (`policies.weight`)."""
         slots = self._workers.slot_count
-        collectors = self._stages.collector_count
-        return policies.max_under_way(slots, collectors, self.per_task)
+        return policies.max_under_way(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of further batches of a job that may be under way.
-
-        No batch may be under way if the weight is 0 or less.
+        """Return the weight of further batches of a job that may be in flight, if positive.
 
         The job has no room if many batches of any jobs are younger than the oldest batch of this
         job: the sorter, and the memory, would have to hold their scans.
@@ -127,7 +111,7 @@ class Dispatcher:
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
     def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
-        """Update the sizes of batches and tasks from casting times, and advise stage 1.
+        """Update the sizes of batches and tasks from casting times.
 
         Each record is of one batch: its casting time, and in `items` its number of scans.
         """
@@ -142,21 +126,18 @@ class Dispatcher:
             advice = policies.scans_per_batch(
                 self._recent_casts, job.scans_per_task, job.scans_of_run, slots
             )
-            if (
-                abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice
-            ):  # advice costs a request
+            if abs(advice - self.advice) > MIN_ADVICE_CHANGE * self.advice:
                 self.advice = advice
-                self._stages.advise(advice)
 
     # -- casting ---------------------------------------------------------------------------
 
-    def take(self, job: PipelineJob, first: int, stop: int) -> None:
+    def add_scans(self, job: PipelineJob, first: int, stop: int) -> None:
         """Make batches of the uncommitted scans in a range that stage 1 has sent."""
         first = max(first, job.generated)  # a restarted generator repeats scans
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
         job.generated = max(stop, job.generated)
-        for missing_start, missing_stop in job.parts.missing(first, stop):
+        for missing_start, missing_stop in job.committed.parts.missing(first, stop):
             # The advised size may exceed the memory of this job's casting tasks.
             for start in range(missing_start, missing_stop, job.scans_per_task):
                 batch_stop = min(start + job.scans_per_task, missing_stop)
@@ -164,13 +145,13 @@ class Dispatcher:
                 self.batches[job.number, start] = Batch(job, start, batch_stop, number, number)
                 self._batch_count += 1
 
-    def offer(self) -> bool:
-        """Offer waiting batches to workers that have room, and return True if any was offered."""
+    def offer(self) -> None:
+        """Offer waiting batches to workers that have room."""
         waiting = sorted(
             self.in_states(BatchState.WAITING), key=lambda batch: (batch.order, batch.first)
         )
         if not waiting:
-            return False
+            return
         batches = [
             *waiting,
             *self.in_states(BatchState.CASTING, BatchState.CAST, BatchState.COLLECTING),
@@ -186,17 +167,15 @@ class Dispatcher:
                 batch.collector = ""
                 batch.move(BatchState.CASTING)
                 batch.job.trace("submit", INTERSECT, batch.scans)
-        return bool(chosen)
 
-    def check(self) -> bool:
-        """Update the batches of casting tasks that have ended, and return True if there are any.
+    def check(self) -> None:
+        """Update the batches of casting tasks that have ended.
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
         casting has failed, and the task had batches of several jobs, they are offered again, too,
         each in a task with batches of one job only (`Outcome.SEPARATE_JOBS`). With batches of a
         single job, the job fails.
         """
-        moved = False
         for key, task_batches in [*self._tasks.items()]:
             if task_batches[0].state is not BatchState.CASTING:
                 continue
@@ -208,16 +187,14 @@ class Dispatcher:
             if outcome is Outcome.PENDING:
                 continue
             for batch in [*task_batches]:
-                moved = True
                 if outcome is Outcome.DONE:
                     batch.move(BatchState.CAST)
                     batch.job.cast += len(batch)
                 else:
                     self._offer_again(batch, outcome.value)
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
-        return moved
 
-    def leave_workers(self, locations: TaskLocations) -> None:
+    def reclaim_lost(self, locations: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent or late, or take no tasks."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
@@ -232,7 +209,6 @@ class Dispatcher:
         if state is BatchState.WAITING:
             self._forget_task(batch)
         batch.move(state)
-        batch.job.offered_again += 1
         self.replayed += 1
         if reason in (Outcome.DIED.value, Outcome.GONE.value):
             self.lost_workers.add(batch.worker)
@@ -241,7 +217,6 @@ class Dispatcher:
             self._blame(batch, INTERSECT, batch.worker)
 
     def _remove(self, batch: Batch) -> None:
-        """Remove a batch that is committed, divided or condemned."""
         self._forget_task(batch)
         del self.batches[batch.job.number, batch.first]
 
@@ -265,10 +240,7 @@ class Dispatcher:
     # -- poison batches ----------------------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batch, and divide or condemn the batch.
-
-        `policies.kills_alone` is the rule.
-        """
+        """Count the death of a worker against its batch, and divide or condemn the batch."""
         batch.deaths[stage] += 1
         kills = policies.kills_alone(batch, stage)
         if stage == INTERSECT and not batch.job.cast and kills > 0:
@@ -318,13 +290,16 @@ class Dispatcher:
 
     # -- stage 4 -----------------------------------------------------------------------------
 
-    def hand_over(self) -> bool:
-        """Assign batches that were cast to collectors, and return True if any was assigned."""
+    def assign(self, collectors: Mapping[str, str]) -> dict[str, list[CollectOrder]]:
+        """Assign batches that were cast to collectors, and return the orders of each collector.
+
+        `collectors` maps the name of each running collector to the address of its worker.
+        """
+        orders: dict[str, list[CollectOrder]] = {}
         if not (cast := self.in_states(BatchState.CAST)):
-            return False
-        orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
+            return orders
         batches = [*cast, *self.in_states(BatchState.COLLECTING)]
-        for task, name in policies.handovers(batches, self._stages.collectors):
+        for task, name in policies.handovers(batches, collectors):
             parts = []
             for batch in task:
                 batch.collector = name
@@ -336,9 +311,7 @@ class Dispatcher:
                 parts.append((number, (first, batch.stop), part))
             order = CollectOrder(task[0].key, task[0].worker, tuple(parts))
             orders.setdefault(name, []).append(order)
-        for name, messages in orders.items():
-            self._stages.send(name, messages)
-        return bool(orders)
+        return orders
 
     def recast_part(self, receipt: Receipt) -> None:
         """Cast the batches of a part again, which was lost with the worker that held the part."""
@@ -377,7 +350,7 @@ class Dispatcher:
                 waiting.move(BatchState.COLLECTING)
         self._learn(records)
 
-    def leave_collectors(self, died: Mapping[str, str], started: Collection[str]) -> None:
+    def reclaim_uncollected(self, died: Mapping[str, str], started: Collection[str]) -> None:
         """Take back the batches of collectors, to be collected by another collector.
 
         `died` are the collectors whose workers died, {name: address of the worker}; `started` are

@@ -17,17 +17,11 @@ ASK_S = 10.0  # wait for an error's text, which the scheduler has
 
 
 class JobError(LidarError):
-    """Error of a single job.
-
-    The run goes on with the next jobs.
-    """
+    """Error of a single job, after which the run goes on with the next jobs."""
 
 
 class ScanError(RuntimeError):
-    """Error while scans are described, cast or packed.
-
-    The message names the scans.
-    """
+    """Error while scans are described, cast or packed. The message names the scans."""
 
 
 class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened

@@ -1,19 +1,18 @@
 """Stages 1, 3 and 4: the long-running tasks on LIDAR workers.
 
-Each stage secedes at once: it frees its thread but keeps its slot, so that a worker with one thread
-and four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver knows the
-reason.
+Each stage takes groups of messages from the driver until a pipe is closed. It secedes at once: it
+frees its thread but keeps its slot, so that a worker with one thread and four LIDAR slots runs all
+four. A failed pipe ends a stage silently, because the driver knows the reason.
 """
 
 from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any
 
 from distributed import Client, secede
 
@@ -45,77 +44,26 @@ SEND_EVERY_S = 0.05  # messages that follow each other faster are sent together
 LINGER_S = 0.02  # wait of the sorter for more messages
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
-
-def _serve(
-    start: StageStart,
-    inlet: Pipe,
-    process: Callable[[Iterator[Any]], Iterable[int]],
-    linger_s: float = 0.0,
-) -> TaskRecord:
-    """Process the messages of the driver until a pipe is closed.
-
-    Returns the record of the task.
-
-    `process` gets an iterator of messages and yields the number of scans after each step. After the
-    first message, `linger_s` seconds are waited for more.
-    """
-    recorder = Recorder(start.stage, LIDAR)
-    scans = 0
-    start.trace("start")
-    with suppress(PipeClosed, PipeFailed):
-        while True:
-            for count in process(chain.from_iterable(inlet.get_all(linger_s=linger_s))):
-                scans += count
-    return recorder.finish(scans)
-
-
-def _send_news(
-    start: StageStart,
-    outlet: Pipe,
-    news: Iterable[Scans | ColumnsLost | Failed],
-    max_items: int = 0,
-) -> Iterator[int]:
-    """Send news to the driver, and yield the number of scans of each sent group.
-
-    News that follow each other quickly are sent together, at most `max_items`. Without a limit, 0,
-    the driver limits its orders.
-    """
-    waiting: list[Scans | ColumnsLost | Failed] = []
-
-    def send() -> int:
-        outlet.put_many(waiting, unbounded=not max_items)
-        scan_ranges = [item.scans for item in waiting if isinstance(item, Scans)]
-        for scans in scan_ranges:
-            start.trace("sent", scans)
-        waiting.clear()
-        return sum(map(len, scan_ranges))
-
-    sent_at = time.monotonic()
-    for item in news:
-        waiting.append(item)
-        if len(waiting) == max_items or time.monotonic() - sent_at > SEND_EVERY_S:
-            yield send()
-            sent_at = time.monotonic()
-    yield send()
+News = Scans | ColumnsLost | Failed  # message to the driver
 
 
 @telling_departure()
 def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 1: describe the scans of surveys in order.
 
-    The driver advises the scans of an item.
-
-    From the driver come lists of `Description`. An item is a `ScanRange`: the survey describes the
-    scans equally on every worker. A survey that cannot be described is reported as `Failed`.
+    The driver sends lists of `Description`, and advises the number of scans in each `ScanRange`
+    that it gets: the survey describes the scans equally on every worker. A survey that cannot be
+    described is reported as `Failed`.
     """
     secede()
-    return _serve(
-        start,
-        inlet,
-        lambda descriptions: _send_news(
-            start, outlet, _describe_scans(start, descriptions, outlet), outlet.capacity
-        ),
-    )
+    recorder = Recorder(start.stage, LIDAR)
+    sender = _Sender(start, outlet, max_items=outlet.capacity)
+    start.trace("start")
+    with suppress(PipeClosed, PipeFailed):
+        while True:
+            descriptions = chain.from_iterable(inlet.get_all())
+            sender.send(_describe_scans(start, descriptions, outlet))
+    return recorder.finish(sender.scan_count)
 
 
 def _describe_scans(
@@ -143,30 +91,31 @@ def _describe_scans(
 def sort_frames(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of the scans of each survey into scan order.
 
-    From the driver come lists of `Summaries`. Each is sent back to the driver once all earlier
-    scans were sent back, or had been handed out before (`Summaries.framed`). A survey is forgotten
-    after its last scan.
+    The driver sends lists of `Summaries`, and gets each back once all earlier scans were sent back,
+    or had been handed out before (`Summaries.framed`). A survey is forgotten after its last scan.
     """
     secede()
+    recorder = Recorder(start.stage, LIDAR)
     orders: dict[int, _ScanOrder] = {}  # {job: its waiting summaries}
-
-    def sort(news: Iterator[Summaries]) -> Iterator[int]:
-        ready = []
-        for item in news:
-            start.trace("get", item.scans)
-            order = orders.setdefault(item.job, _ScanOrder())
-            ready += order.add(item)
-            if order.next_scan >= item.until:
-                del orders[item.job]
-        if ready:
-            scans = [*chain.from_iterable(item.scans for item in ready)]
-            start.trace("put", scans)
-            outlet.put_many(ready, unbounded=True)
-            start.trace("sent", scans)
-            yield len(scans)
-
-    # Each answer wakes the driver.
-    return _serve(start, inlet, sort, linger_s=LINGER_S)
+    scan_count = 0
+    start.trace("start")
+    with suppress(PipeClosed, PipeFailed):
+        while True:
+            ready: list[Summaries] = []
+            # Each answer wakes the driver, so wait for more messages.
+            for item in chain.from_iterable(inlet.get_all(linger_s=LINGER_S)):
+                start.trace("get", item.scans)
+                order = orders.setdefault(item.job, _ScanOrder())
+                ready += order.add(item)
+                if order.next_scan >= item.until:
+                    del orders[item.job]
+            if ready:
+                scans = [*chain.from_iterable(item.scans for item in ready)]
+                start.trace("put", scans)
+                outlet.put_many(ready, unbounded=True)
+                start.trace("sent", scans)
+                scan_count += len(scans)
+    return recorder.finish(scan_count)
 
 
 @dataclass(eq=False)
@@ -195,23 +144,26 @@ def collect(
     """Stage 4: fetch batches from the workers that cast the batches, and write each as a part.
 
     `probe` is a file in the storage, name and content: a worker that does not see this file holds
-    its parts in memory, and the driver fetches the parts. From the driver come lists of
-    `CollectOrder`; `Receipt`, `ColumnsLost` and `Failed` are sent to the driver.
+    its parts in memory, and the driver fetches the parts. The driver sends lists of `CollectOrder`,
+    and gets `Receipt`, `ColumnsLost` and `Failed`.
     """
     secede()
     visible_storage = storage if storage.sees(*probe) else None
-
-    def store(orders: Iterator[CollectOrder]) -> Iterator[int]:
-        # The pipe's client: `own_client` makes a message to the scheduler each time.
-        news = (_write_parts(start, visible_storage, order, inlet.client) for order in orders)
-        return _send_news(start, outlet, chain.from_iterable(news))
-
-    return _serve(start, inlet, store)
+    recorder = Recorder(start.stage, LIDAR)
+    sender = _Sender(start, outlet)  # the driver limits its orders
+    start.trace("start")
+    with suppress(PipeClosed, PipeFailed):
+        while True:
+            orders = chain.from_iterable(inlet.get_all())
+            # The pipe's client: `own_client` makes a message to the scheduler each time.
+            news = (_write_parts(start, visible_storage, order, inlet.client) for order in orders)
+            sender.send(chain.from_iterable(news))
+    return recorder.finish(sender.scan_count)
 
 
 def _write_parts(
     start: StageStart, storage: Storage | None, order: CollectOrder, client: Client
-) -> Iterator[Receipt | ColumnsLost | Failed]:
+) -> Iterator[News]:
     """Write the parts of a casting task, and yield the messages to the driver."""
     results = fetch_available(client, [order.key], FETCH_PATIENCE_S, holder=order.worker)
     if order.key not in results:
@@ -237,3 +189,35 @@ def _write_parts(
             yield receipt
         except ScanError as error:
             yield Failed(job, COLLECT, str(error))
+
+
+class _Sender:
+    """Sends news to the driver: those that follow each other quickly together.
+
+    At most `max_items` are sent at a time; without a limit, 0, the pipe may hold any number.
+    """
+
+    def __init__(self, start: StageStart, outlet: Pipe, max_items: int = 0) -> None:
+        self._start = start
+        self._outlet = outlet
+        self._max_items = max_items
+        self.scan_count = 0  # scans that were sent
+
+    def send(self, news: Iterable[News]) -> None:
+        """Send news while they are made."""
+        waiting: list[News] = []
+        sent_at = time.monotonic()
+        for item in news:
+            waiting.append(item)
+            if len(waiting) == self._max_items or time.monotonic() - sent_at > SEND_EVERY_S:
+                self._put(waiting)
+                waiting = []
+                sent_at = time.monotonic()
+        self._put(waiting)
+
+    def _put(self, news: list[News]) -> None:
+        self._outlet.put_many(news, unbounded=not self._max_items)
+        for item in news:
+            if isinstance(item, Scans):
+                self._start.trace("sent", item.scans)
+                self.scan_count += len(item.scans)

@@ -19,6 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 from distributed import Future, Lock
@@ -39,7 +40,7 @@ from .stage_messages import CollectOrder, Description, Message, Receipt, StageSt
 from .stage_names import COLLECT, GENERATE, SORT
 from .task_records import TaskRecord
 
-LOOK_EVERY_S = 0.5
+REFRESH_EVERY_S = 0.5
 SETTLE_S = 2.0  # time for a submitted task to start
 MAX_DEATHS = 12  # deaths of a stage with nothing committed in between
 ASK_LOCK_S = 0.05  # wait for the lock
@@ -50,8 +51,6 @@ Order = Description | CollectOrder | Summaries  # order to a stage
 
 @dataclass(eq=False)
 class _StageTask:
-    """Current task of a stage."""
-
     future: Future
     worker: str  # address of the only worker that may run the task
     inlet: Pipe  # pipe that the driver fills
@@ -104,10 +103,9 @@ class LongStages:
         self._scans = Pipe(scans, queue_capacity, self.client, fails_with_tasks=False)
         # News of stages 3 and 4.
         self._news = Pipe(news, 64, self.client, fails_with_tasks=False)
-        self.inbox: list[Message] = []  # received messages, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # {name of a pipe: messages}
-        self._looked_at = 0.0  # time of the last `look`
-        self._progress = -1  # progress of the driver at the last `look`
+        self._refreshed_at = 0.0  # time of the last `refresh`
+        self._progress = -1  # progress of the driver at the last `refresh`
         self._deaths: dict[str, list[str]] = {}  # {name: workers that died since any progress}
         self._enough_at = time.monotonic()  # last time with enough slots, free or not
         self._waited_from: float | None = None  # start of the wait for slots of other runs
@@ -125,10 +123,7 @@ class LongStages:
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
-        """Create the pipes and the probe file.
-
-        The caller must call `finish` afterwards.
-        """
+        """Create the pipes and the probe file. `finish` must be called afterwards."""
         with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
@@ -139,22 +134,18 @@ class LongStages:
 
     def wait(
         self, seconds: float, keys: Sequence[str], *, scans: bool, linger_s: float = 0.0
-    ) -> None:
-        """Exchange messages with the stages.
+    ) -> list[Message]:
+        """Exchange messages with the stages, and return the received messages.
 
-        Waits at most `seconds` for news or a task of `keys`.
-
-        After the first message, `linger_s` seconds are waited for more.
-
-        The same request sends the outbox and takes all messages, from stage 1 only with `scans`:
-        each request costs driver and scheduler a millisecond.
+        Waits at most `seconds` for news or a task of `keys` and, after the first message,
+        `linger_s` seconds for more. The same request sends the outbox and takes all messages, from
+        stage 1 only with `scans`: each request costs driver and scheduler a millisecond.
         """
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
         puts = {name: [orders] for name, orders in self._outbox.items()}
         self._outbox = {}
         news = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=linger_s)
-        for items in news.values():
-            self.inbox += items
+        return [*chain.from_iterable(news.values())]
 
     def send(self, name: str, messages: Sequence[Order]) -> None:
         """Send messages to a stage with the next `wait`.
@@ -197,10 +188,7 @@ class LongStages:
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start all stages, each on a free slot.
-
-        With too few slots, the next `look` retries.
-        """
+        """Start all stages, each on a free slot. With too few slots, the next call retries."""
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
         with suppress(RuntimeError):  # another run has just removed it (`_forget_lock`)
@@ -215,7 +203,7 @@ class LongStages:
 
     def _start_all(self) -> None:
         # All or none, and under a lock: two runs might each get slots that the other needs.
-        locations = self._look()
+        locations = self._locate()
         now_s = time.monotonic()
         slot_count = len(self._names)
         free = {address: count for address, count in locations.free.items() if count > 0}
@@ -238,8 +226,8 @@ class LongStages:
             )
         for name in self._names:
             self._submit(name, free)
-        # Another run may look once the lock is free: the scheduler must know the tasks by then.
-        while len(self._look().tasks) < slot_count and time.monotonic() < now_s + SETTLE_S:
+        # Another run may start once the lock is free: the scheduler must know the tasks by then.
+        while len(self._locate().tasks) < slot_count and time.monotonic() < now_s + SETTLE_S:
             time.sleep(0.005)
 
     def _too_few(self, problem: str) -> LidarError:
@@ -248,13 +236,13 @@ class LongStages:
             "repeat the run."
         )
 
-    def _look(self) -> TaskLocations:
+    def _locate(self) -> TaskLocations:
         keys = [task.future.key for task in self._tasks.values()]
         return look_for_tasks(self.client, self.partition.name, keys)
 
     # -- restarting --------------------------------------------------------------------------
 
-    def look(self, progress: int) -> tuple[Mapping[str, str], Sequence[str]]:
+    def refresh(self, progress: int) -> tuple[Mapping[str, str], Sequence[str]]:
         """Start all stages, and restart stages that died or wait for a slot.
 
         Does nothing if the last call is recent. `progress` is any number that grows when scans are
@@ -265,9 +253,9 @@ class LongStages:
         the partition has too few slots for too long.
         """
         now_s = time.monotonic()
-        if now_s - self._looked_at < LOOK_EVERY_S:
+        if now_s - self._refreshed_at < REFRESH_EVERY_S:
             return {}, ()
-        self._looked_at = now_s
+        self._refreshed_at = now_s
         if progress > self._progress:
             self._progress = progress
             self._deaths = {}
@@ -280,10 +268,10 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that died or wait for a slot, and return as `look` does."""
+        """Restart stages that died or wait for a slot, and return as `refresh` does."""
         died: dict[str, str] = {}
         started: list[str] = []
-        locations = self._look()
+        locations = self._locate()
         free = dict(locations.free)
         for name, task in list(self._tasks.items()):
             if task.future.status == "finished":
@@ -336,10 +324,7 @@ class LongStages:
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """Count a death of a stage's worker.
-
-        Raises LidarError when the stage keeps dying.
-        """
+        """Count a death of a stage's worker. LidarError if the stage keeps dying."""
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > MAX_DEATHS:

@@ -1,4 +1,4 @@
-"""The pipeline: it offers batches of all jobs, commits their parts and hands out their frames.
+"""The pipeline: it offers batches of all jobs, commits their parts and sorts their frames.
 
 The driver and four stages exchange messages (`stage_messages.py`):
 
@@ -11,36 +11,32 @@ The driver and four stages exchange messages (`stage_messages.py`):
 A summary of a scan has its numbers of hits and points, and the ends of a few sample rays.
 
 Everything happens in `step`, called repeatedly from one thread; no call in `step` waits for long.
+A step calls nobody back: it returns the new parts, the next frames and the jobs that have ended.
 There is one rule of recovery: uncommitted batches are offered again, and frames that were not
 handed out are sorted again, whatever was lost. Messages that arrive twice do no harm: a second
 receipt of a scan is ignored, and its part is the same file with the same bytes. The number of
-batches under way, and the distance of the last to the first, are limited: that bounds every queue,
+batches in flight, and the distance of the last to the first, are limited: that bounds every queue,
 and the memory of sorter and workers.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Protocol
 
+from lidarsim.scene.scene import Scene
+from lidarsim.survey.survey import Survey
+
 from .casting_workers import CastingWorkers
+from .committed_results import CommittedResults
 from .dispatch import Dispatcher
 from .failures import JobError
 from .long_stages import LongStages
 from .pipeline_job import PipelineJob
-from .stage_messages import (
-    ColumnsLost,
-    Description,
-    Failed,
-    Message,
-    Receipt,
-    ScanFrame,
-    ScanRange,
-    Summaries,
-)
+from .stage_messages import ColumnsLost, Description, Failed, Message, Receipt, ScanRange, Summaries
 from .stage_names import COLLECT, GENERATE, SORT
 from .task_book import TaskBook
 
@@ -48,22 +44,31 @@ STALL_S = 60.0  # time without frames of the sorter, after which it gets its sum
 WAIT_S = 0.05  # wait for news while the driver is idle
 LINGER_S = 0.004  # wait for more news after the first, for each job or batch of a task
 MAX_LINGERS = 25  # jobs or batches that are counted for that wait
-CLOSING_S = 0.001  # longest wait while the stages end
+CLOSING_S = 0.001  # wait for news while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have ahead at least, whatever their size
 
 
 class Commits(Protocol):
     """Interface of the run's database, where parts are committed."""
 
-    def commit(
-        self, receipts: Iterable[tuple[PipelineJob, Receipt]]
-    ) -> list[tuple[PipelineJob, Receipt]]:
+    def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
         """Commit parts of jobs, and return the parts that were not committed before."""
         ...
 
     def summaries(self, part: Receipt) -> bytes:
         """Return the summaries of a committed part's scans, bytes of a `summary_type` array."""
         ...
+
+
+@dataclass
+class PipelineNews:
+    """What a step of the pipeline has achieved, for its caller to use in this order."""
+
+    parts: list[Receipt] = field(default_factory=list)  # newly committed parts
+    # Next scans of jobs with frames, to be handed out. Scans that were handed out may be included.
+    frames: list[tuple[PipelineJob, Summaries]] = field(default_factory=list)
+    # Jobs that have ended, each with its error or None.
+    ended: list[tuple[PipelineJob, JobError | None]] = field(default_factory=list)
 
 
 class Pipeline:
@@ -80,61 +85,59 @@ class Pipeline:
         self.workers = workers
         self.stages = stages
         self._commits = commits
-        self.dispatcher = Dispatcher(workers, stages, mark)
+        self.dispatcher = Dispatcher(workers, stages.collector_count, mark)
         self.jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast}
         # Times and workers of the batches of stage 2 and, after `finish`, of the long stages.
         self.book = TaskBook()
-        self.progress = 0  # number of scans that were committed, plus frames handed out
-        self.scans_to_come = 0  # estimated scans of jobs that are not begun yet; the caller sets it
+        self.progress = 0  # number of scans that were committed, plus scans that were sorted
         # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
         self._announced: dict[int, int] = {}
-        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # jobs for `take_ended`
+        self._messages: list[Message] = []  # received since the last step
+        self._news = PipelineNews()  # since the last step
 
     # -- jobs --------------------------------------------------------------------------------
 
     def begin(
         self,
-        job: PipelineJob,
+        committed: CommittedResults,
+        scene: Scene,
+        survey: Survey,
         *,
         scans_per_task: int,
         scans_of_run: int = 0,
-        on_frame: Callable[[ScanFrame], None] | None = None,
-        on_parts: Callable[[list[Receipt]], None] | None = None,
-    ) -> None:
+    ) -> PipelineJob:
         """Add a job to the pipeline. Committed scans of the job are not cast again.
 
         Parameters
         ----------
+        committed
+            Scans of the job, and its committed results.
+        scene, survey
+            Scene, and the sensors and scans of the survey.
         scans_per_task
             Scans that fit into the memory of a casting task.
         scans_of_run
-            Scans of the jobs of the run that have not ended, if all are like this job. Batches need
-            not be divided among all slots where many jobs follow.
-        on_frame
-            Called with each frame, in scan order, in the driver's thread. Without `on_frame` the
-            run makes no frames, and the job is complete when all its scans are committed.
-        on_parts
-            Called with the parts of each commit.
+            Scans of the jobs of the run that have not ended, if all are like this job.
 
         Raises
         ------
         JobError
             If the job cannot be sent to workers.
         """
-        job.packed, job.scene_name = self.workers.add(job.number, job.scene, job.survey)
-        job.run = self.stages.run
-        job.scans_per_task = scans_per_task
-        job.scans_of_run = max(scans_of_run, len(job.scans))
-        job.has_frames = on_frame is not None
-        job.on_frame = on_frame
-        job.on_parts = on_parts
-        # One past the last scan that stage 1 has described. If all is committed, stage 1 need not
-        # describe any scan.
-        job.generated = job.scans.start if job.missing_count else job.scans.stop
+        packed, scene_name = self.workers.add(committed.number, scene, survey)
+        job = PipelineJob(
+            committed=committed,
+            run=self.stages.run,
+            scene_name=scene_name,
+            scans_per_task=scans_per_task,
+            scans_of_run=max(scans_of_run, len(committed.scans)),
+            packed=packed,
+        )
         self.jobs[job.number] = job
         self._describe([job])
         self._sort_again([job])
         self._end_complete([job])
+        return job
 
     @property
     def has_room(self) -> bool:
@@ -151,26 +154,20 @@ class Pipeline:
         )
         return len(self.dispatcher.batches) + to_come < max_weight
 
-    def take_ended(self) -> list[tuple[PipelineJob, JobError | None]]:
-        """Return the jobs that have ended since the last call, each with its error or None."""
-        ended = self._ended
-        self._ended = []
-        return ended
-
     def _end(self, job: PipelineJob, error: JobError | None = None) -> None:
         """Remove a job from the pipeline, and record its error or success."""
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
         # The sorter forgets a job once the last scan is framed: `until=1, framed=1`.
-        if error is not None and job.has_frames:
+        if error is not None and job.committed.has_frames:
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
-        self._ended.append((job, error))
+        self._news.ended.append((job, error))
 
     def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
-        """End each job whose scans are all committed and, in a job with frames, framed."""
+        """End each job whose scans are all committed and, in a job with frames, sorted."""
         for job in jobs:
-            if job.scans_complete and job.number in self.jobs:
+            if job.complete and job.number in self.jobs:
                 self._end(job)
 
     @property
@@ -181,52 +178,53 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages.
-
-        The caller must call `stop` on failure, and `finish` always.
-        """
+        """Start the stages. The caller must call `stop` on failure, and `finish` always."""
         self.stages.open()
-        self._look()
+        self._refresh(scans_to_come=0)
 
-    def step(self) -> bool:
-        """Process messages, workers and batches once, and return True if there were changes.
+    def step(self, scans_to_come: int = 0) -> PipelineNews:
+        """Process messages, workers and batches once, and return what has changed.
+
+        `scans_to_come` is the estimated number of scans in jobs that are not begun yet.
 
         LidarError if a failure concerns all jobs.
         """
-        messages = self.stages.inbox
-        self.stages.inbox = []
-        moved = bool(messages)
+        messages = self._messages
+        self._messages = []
         self._commit([message for message in messages if isinstance(message, Receipt)])
         for message in messages:
-            self._take(message)
-        moved |= self.dispatcher.check()
-        self._look()
+            self._handle(message)
+        self.dispatcher.check()
+        self._refresh(scans_to_come)
         for job, error in [*self.dispatcher.failed.items()]:
             self._end(job, error)
-            moved = True
-        moved |= self.dispatcher.hand_over()
-        moved |= self.dispatcher.offer()
-        return moved
+        for name, orders in self.dispatcher.assign(self.stages.collectors).items():
+            self.stages.send(name, orders)
+        self.dispatcher.offer()
+        news = self._news
+        self._news = PipelineNews()
+        return news
 
-    def wait(self, seconds: float, keys: Iterable[str] = ()) -> None:
-        """Wait for messages, or the end of a casting task or a task of `keys`.
+    def wait(self, keys: Iterable[str] = ()) -> None:
+        """Wait a moment for messages, or the end of a casting task or a Dask task of `keys`.
 
-        The wait lasts `seconds` at most, or `WAIT_S` if that is longer; after `close`, `CLOSING_S`.
-        `keys` are keys of Dask tasks. The next `step` takes the messages.
+        The next `step` takes the messages.
         """
         if self.stages.closed:
-            self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
-        else:
-            seconds = max(seconds, WAIT_S)
-            keys = [*self.workers.pending, *keys]
-            # Small jobs and batches come in dozens, and while there are many, nobody waits for a
-            # single one. Each step costs a millisecond or two, however few messages came.
-            burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
-            much_under_way = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
-            linger_s = LINGER_S * min(burst, MAX_LINGERS if much_under_way else 1)
-            self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
+            self._messages += self.stages.wait(CLOSING_S, [], scans=False)
+            return
+        # Small jobs and batches come in dozens, and while there are many, nobody waits for a single
+        # one. Each step costs a millisecond or two, however few messages came.
+        burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
+        many_in_flight = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
+        self._messages += self.stages.wait(
+            WAIT_S,
+            [*self.workers.pending, *keys],
+            scans=self._wants_scans,
+            linger_s=LINGER_S * min(burst, MAX_LINGERS if many_in_flight else 1),
+        )
 
-    def _take(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         """Handle a message of a stage, except for receipts (`_commit`)."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
@@ -237,7 +235,7 @@ class Pipeline:
                 if message.stop == self._announced.get(message.job):
                     del self._announced[message.job]
                 if job is not None and not job.condemned:
-                    self.dispatcher.take(job, message.first, message.stop)
+                    self.dispatcher.add_scans(job, message.first, message.stop)
             case Failed():
                 if message.stage == GENERATE:
                     self._announced.pop(message.job, None)
@@ -245,35 +243,43 @@ class Pipeline:
                     self._end(job, JobError(f"Stage {message.stage} failed: {message.reason}"))
             case Summaries():
                 if job is not None:
-                    self.progress += job.hand_out(message)
-                    self._end_complete([job])
+                    self._take_sorted(job, message)
+
+    def _take_sorted(self, job: PipelineJob, summaries: Summaries) -> None:
+        """Pass the next scans on as frames, and end a job after its last scan."""
+        job.sorted_at = time.monotonic()
+        if summaries.first <= job.sorted < summaries.stop:
+            self.progress += summaries.stop - job.sorted
+            job.sorted = summaries.stop
+            self._news.frames.append((job, summaries))
+            self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs under way, and sort, report and record the new parts.
-
-        Jobs that are complete with these parts end.
-        """
+        """Commit the receipts of jobs in flight, and sort, record and report the new parts."""
         stored = [
-            (self.jobs[receipt.job], receipt)
+            (self.jobs[receipt.job].committed, receipt)
             for receipt in receipts
             if receipt.job in self.jobs and self._is_stored(receipt)
         ]
         new = self._commits.commit(stored)
         if not new:
             return
-        self.dispatcher.release(new)
-        of_jobs: dict[PipelineJob, list[Receipt]] = {}
-        for job, receipt in new:
+        advice = self.dispatcher.advice
+        self.dispatcher.release((self.jobs[receipt.job], receipt) for receipt in new)
+        if self.dispatcher.advice != advice:
+            self.stages.advise(self.dispatcher.advice)
+        parts_of_jobs: dict[PipelineJob, list[Receipt]] = {}
+        for receipt in new:
+            job = self.jobs[receipt.job]
             if receipt.record is not None:
                 self.book.add(receipt.record)
-            job.trace("points", COLLECT, range(receipt.first, receipt.stop))
-            of_jobs.setdefault(job, []).append(receipt)
-            self.progress += receipt.stop - receipt.first
-        for job, parts in of_jobs.items():
+            job.trace("points", COLLECT, receipt.scans)
+            parts_of_jobs.setdefault(job, []).append(receipt)
+            self.progress += len(receipt.scans)
+        for job, parts in parts_of_jobs.items():
             self._sort(job, parts)
-            if job.on_parts is not None:
-                job.on_parts(parts)
-        self._end_complete(of_jobs)
+        self._news.parts += new
+        self._end_complete(parts_of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
         """Return True if a part is in storage, and store a part that its worker holds."""
@@ -282,22 +288,23 @@ class Pipeline:
         self.dispatcher.recast_part(receipt)
         return False
 
-    # -- looking after workers and stages ------------------------------------------------------
+    # -- workers and stages ------------------------------------------------------------------
 
-    def _look(self) -> None:
+    def _refresh(self, scans_to_come: int) -> None:
         """Handle workers and stages that have joined, died or are silent, if the last check is old.
 
         LidarError if a stage has failed, or workers or slots are missing for too long.
         """
-        if (locations := self.workers.look()) is not None:
-            scan_count = self.scans_to_come + sum(job.missing_count for job in self.jobs.values())
-            self.workers.want(self.dispatcher.slots_wanted(scan_count))
-            self.dispatcher.leave_workers(locations)
+        if (locations := self.workers.refresh()) is not None:
+            missing = sum(job.committed.missing_count for job in self.jobs.values())
+            scan_count = scans_to_come + missing
+            self.workers.request_slots(self.dispatcher.slots_wanted(scan_count))
+            self.dispatcher.reclaim_lost(locations)
             since = time.monotonic() - STALL_S
             self._sort_again(job for job in self.jobs.values() if job.sorted_at < since)
-        died, started = self.stages.look(self.progress)
+        died, started = self.stages.refresh(self.progress)
         if died or started:
-            self.dispatcher.leave_collectors(died, started)
+            self.dispatcher.reclaim_uncollected(died, started)
         if GENERATE in started:  # a new stage 1 has no orders
             self._announced.clear()
             self._describe(self.jobs.values())
@@ -305,10 +312,7 @@ class Pipeline:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on.
-
-        `_look` repeats lost orders.
-        """
+        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on."""
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
@@ -336,16 +340,16 @@ class Pipeline:
     def _sort(self, job: PipelineJob, receipts: Sequence[Receipt]) -> None:
         """Send the summaries of committed parts to the sorter, for jobs with frames.
 
-        `_look` sends all again when the sorter starts.
+        `_refresh` sends all again when the sorter starts.
         """
-        if receipts and job.has_frames:
+        if receipts and job.committed.has_frames:
             messages = [
                 Summaries(
                     job.number,
                     part.first,
                     part.stop,
                     part.summaries,
-                    framed=job.frames,
+                    framed=job.sorted,
                     until=job.scans.stop,
                 )
                 for part in receipts
@@ -357,23 +361,21 @@ class Pipeline:
         """Send the sorter all summaries of jobs' committed scans that were not handed out."""
         for job in jobs:
             job.sorted_at = time.monotonic()
-            if job.has_frames:
+            if job.committed.has_frames:
+                unsorted = job.committed.parts.reaching_past(job.sorted)
                 summaries = self._commits.summaries
-                parts = [replace(part, summaries=summaries(part)) for part in job.unframed()]
+                parts = [replace(part, summaries=summaries(part)) for part in unsorted]
                 self._sort(job, parts)
 
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
         """End the stages, once everything is committed."""
-        self.workers.want(0)  # the partition may shrink
+        self.workers.request_slots(0)  # the partition may shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """End all stages at once.
-
-        `finish` must follow.
-        """
+        """End all stages at once. `finish` must follow."""
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)

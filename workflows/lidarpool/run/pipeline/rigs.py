@@ -1,10 +1,9 @@
-"""Stage 2: rigs of GPU workers, and the casting of batches with these rigs.
+"""Stage 2: casts batches on GPU workers, with rigs that each worker process builds once.
 
-Each worker process builds the rig of a job once, and casting tasks name the rig. The first task of
-a job on a worker brings the plan of the rig, and the scene; the worker keeps the rig in a table of
-this module, and the scene with its trees for other jobs of the same scene. A task's result would
-not work: Dask drops copies that no task needs at an instant, and every new copy would build its
-tree again.
+Casting tasks name the rig of their job. The first task of a job on a worker brings the plan of the
+rig, and the scene; the worker keeps the rig in a table of this module, and the scene with its trees
+for other jobs of the same scene. A task's result would not work: Dask drops copies that no task
+needs at an instant, and every new copy would build its tree again.
 """
 
 from __future__ import annotations
@@ -49,122 +48,6 @@ LEAVE_S = 2.0  # a process ends so long after the error of a GPU: the driver kno
 UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
 
 
-class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
-    """Error for a rig or scene that a worker lacks, after a restart or because it was dropped."""
-
-
-class MemoryUnseen(RigMissing):
-    """Error for a scene in memory of the driver that a worker cannot map."""
-
-
-class RigFailed(RuntimeError):  # noqa: N818
-    """Error for a survey whose rig cannot be built."""
-
-
-@dataclass(eq=False)
-class _CachedRig:
-    """A rig for a job, or for its scene, with the time of its last use."""
-
-    rig: Rig
-    scene: str  # handle
-    used_at: float  # monotonic time
-
-
-# {handle of a rig, or of a scene: a rig of it in this process}
-cached_rigs: dict[str, _CachedRig] = {}
-_ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
-_lock = threading.Lock()
-
-
-def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None) -> Rig:
-    """Return a rig of this process, built of a plan and scene if the rig is not cached.
-
-    Raises
-    ------
-    RigMissing
-        If the rig is not cached and has no plan, or if its scene is not cached either.
-    RigFailed
-        If the rig cannot be built.
-    """
-    cached = cached_rigs.get(handle)
-    if cached is None:
-        with _lock:
-            cached = cached_rigs.get(handle)
-            if cached is None:
-                cached = cached_rigs[handle] = _build(handle, plan, scene)
-                if (run := handle.partition(".")[0]) in _ended_runs:
-                    drop_all(run)
-    its_scene = cached_rigs.get(cached.scene, cached)
-    cached.used_at = its_scene.used_at = time.monotonic()
-    return cached.rig
-
-
-def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig:
-    """Build the rig of a job, cache the rig for other jobs of its scene, and return the rig.
-
-    `handle` is the handle of the rig. `plan` has the handle of the scene, the actors, the survey,
-    pickled, and the name of the backend; `scene` is the scene without actors. If a rig of the scene
-    is cached, the new rig shares its trees. Rigs that were unused for long are dropped before.
-
-    Raises RigMissing and RigFailed as `rig_of` does.
-    """
-    if plan is None:
-        raise RigMissing(f"This worker has no rig {handle!r}.")
-    try:
-        scene_handle, actors, pickled_survey, backend = _unpickled(plan)
-        survey: Survey = pickle.loads(pickled_survey)  # noqa: S301
-        now_s = time.monotonic()
-        unused = [h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S]
-        drop([unused_handle for unused_handle in unused if unused_handle != scene_handle])
-        if (of_scene := cached_rigs.get(scene_handle)) is not None:
-            rig = of_scene.rig.with_survey(of_scene.rig.scene.with_actors(actors), survey)
-        elif scene is not None:
-            static_scene: Scene = _unpickled(scene)
-            threads = get_worker().state.nthreads
-            device = own_device()
-            if device is not None:
-                choose(backend).limit_memory(device, own_device_share())
-            rig = Rig(static_scene.with_actors(actors), survey, backend, threads, device)
-        else:
-            raise RigMissing(f"This worker has no scene {scene_handle!r}.")
-    except RigMissing:
-        raise
-    except Exception as error:
-        raise RigFailed(str(error) or type(error).__name__) from error
-    cached_rigs[scene_handle] = _CachedRig(rig, scene_handle, time.monotonic())
-    trace("intersect.built", run=handle, stage="intersect", scans=[])
-    return _CachedRig(rig, scene_handle, time.monotonic())
-
-
-def _unpickled(data: Packed) -> Any:
-    """Return a value of the run's own driver.
-
-    Raises MemoryUnseen if its memory is not of this machine.
-    """
-    if isinstance(data, SharedHandle):
-        try:
-            return data.load()
-        except OSError as error:
-            raise MemoryUnseen(f"This worker cannot access the driver's memory: {error}") from error
-    return data.load()
-
-
-def drop(handles: Collection[str]) -> None:
-    """Drop cached rigs and scenes by their handles.
-
-    Unknown handles are ignored.
-    """
-    for handle in handles:
-        cached_rigs.pop(handle, None)
-
-
-def drop_all(run: str) -> None:
-    """Drop the rigs and scenes of a run that has ended."""
-    _ended_runs.append(run)
-    # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
-    drop([handle for handle in [*cached_rigs] if handle.partition(".")[0] == run])
-
-
 @dataclass(frozen=True, slots=True)
 class CastWork:
     """Batches of a job that a casting task casts with the job's rig."""
@@ -195,14 +78,8 @@ def intersect(
     unpickled from `scene`, and the rig of each job from its plan; rigs and scenes in `unneeded` are
     dropped before.
 
-    Raises
-    ------
-    RigMissing
-        If the worker has no rig for a job, and neither plan nor scene to build it.
-    RigFailed
-        If a rig cannot be built.
-    ScanError
-        If casting or a column fails, naming the scans.
+    Raises RigMissing and RigFailed as `rig_of` does, and ScanError, which names the scans, if
+    casting or a column fails.
     """
     drop(unneeded)
     results = []
@@ -256,10 +133,7 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points spread over each scan, (scans, samples, 3), meters.
-
-    Missing points are NaN.
-    """
+    """Return sample points of each scan in meters, (scans, samples, 3), with NaN if missing."""
     sample_count = samples_of_scan(returns.survey.scan_count)
     starts = np.cumsum(returns.counts) - returns.counts
     steps = np.arange(sample_count) / max(sample_count - 1, 1)
@@ -270,3 +144,112 @@ def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
     if len(returns):
         samples[valid] = returns.positions_of(rows[valid])
     return samples
+
+
+# -- the rigs of this process -----------------------------------------------------------------
+
+
+class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
+    """Error for a rig or scene that a worker lacks, after a restart or because it was dropped."""
+
+
+class MemoryUnseen(RigMissing):
+    """Error for a scene in memory of the driver that a worker cannot map."""
+
+
+class RigFailed(RuntimeError):  # noqa: N818
+    """Error for a survey whose rig cannot be built."""
+
+
+@dataclass(eq=False)
+class _CachedRig:
+    """A rig for a job, or for its scene, with the time of its last use."""
+
+    rig: Rig
+    scene: str  # handle
+    used_at: float  # monotonic time
+
+
+# {handle of a rig, or of a scene: a rig of it in this process}
+cached_rigs: dict[str, _CachedRig] = {}
+_ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
+_lock = threading.Lock()
+
+
+def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None) -> Rig:
+    """Return a rig of this process, built from a plan and scene if the rig is not cached.
+
+    Raises RigMissing if the rig is not cached and has no plan, or if its scene is not cached
+    either, and RigFailed if the rig cannot be built.
+    """
+    cached = cached_rigs.get(handle)
+    if cached is None:
+        with _lock:
+            cached = cached_rigs.get(handle)
+            if cached is None:
+                cached = cached_rigs[handle] = _build(handle, plan, scene)
+                if (run := handle.partition(".")[0]) in _ended_runs:
+                    drop_all(run)
+    its_scene = cached_rigs.get(cached.scene, cached)
+    cached.used_at = its_scene.used_at = time.monotonic()
+    return cached.rig
+
+
+def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig:
+    """Build the rig of a job, and cache it for other jobs of its scene.
+
+    `plan` has the handle of the scene, the actors, the survey, pickled, and the name of the
+    backend; `scene` is the scene without actors. If a rig of the scene is cached, the new rig
+    shares its trees. Rigs that were unused for long are dropped before.
+
+    Raises RigMissing and RigFailed as `rig_of` does.
+    """
+    if plan is None:
+        raise RigMissing(f"This worker has no rig {handle!r}.")
+    try:
+        scene_handle, actors, pickled_survey, backend = _unpickled(plan)
+        survey: Survey = pickle.loads(pickled_survey)  # noqa: S301
+        now_s = time.monotonic()
+        unused = {h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S}
+        drop(unused - {scene_handle})
+        if (of_scene := cached_rigs.get(scene_handle)) is not None:
+            rig = of_scene.rig.with_survey(of_scene.rig.scene.with_actors(actors), survey)
+        elif scene is not None:
+            static_scene: Scene = _unpickled(scene)
+            threads = get_worker().state.nthreads
+            device = own_device()
+            if device is not None:
+                choose(backend).limit_memory(device, own_device_share())
+            rig = Rig(static_scene.with_actors(actors), survey, backend, threads, device)
+        else:
+            raise RigMissing(f"This worker has no scene {scene_handle!r}.")
+    except RigMissing:
+        raise
+    except Exception as error:
+        raise RigFailed(str(error) or type(error).__name__) from error
+    cached_rigs[scene_handle] = _CachedRig(rig, scene_handle, time.monotonic())
+    trace("intersect.built", run=handle, stage="intersect", scans=[])
+    return _CachedRig(rig, scene_handle, time.monotonic())
+
+
+def drop(handles: Collection[str]) -> None:
+    """Drop cached rigs and scenes by their handles, and ignore unknown handles."""
+    for handle in handles:
+        cached_rigs.pop(handle, None)
+
+
+def drop_all(run: str) -> None:
+    """Drop the rigs and scenes of a run that has ended."""
+    _ended_runs.append(run)
+    # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
+    drop([handle for handle in [*cached_rigs] if handle.partition(".")[0] == run])
+
+
+def _unpickled(data: Packed) -> Any:
+    """Return a value of the run's own driver, or raise MemoryUnseen if it is out of reach."""
+    if isinstance(data, SharedHandle):
+        try:
+            return data.load()
+        except OSError as error:
+            raise MemoryUnseen(f"This worker cannot access the driver's memory: {error}") from error
+    return data.load()

@@ -42,10 +42,7 @@ class TaskRecord:
 
 
 class Recorder:
-    """Records time and worker of the current task.
-
-    `finish` returns the record.
-    """
+    """Records time and worker of the current task."""
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage = stage

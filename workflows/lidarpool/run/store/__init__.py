@@ -1,1 +1,1 @@
-"""The store of a run: its database, its parts, and its jobs under way."""
+"""The store of a run: its database, its parts, and its jobs in flight."""

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,8 @@ from lidarsim.base.errors import LidarError
 from ...columns.parts import part_name
 from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
-from ..pipeline.committed_job import CommittedJob
+from ..pipeline.committed_results import CommittedResults
 from ..pipeline.stage_messages import Receipt
-
-J = TypeVar("J", bound=CommittedJob)
 
 FORMAT = 9
 FILE = "run.db"
@@ -60,7 +58,7 @@ _COLUMNS = {
     "jobs": ("number", "failed", "data"),
 }
 _DISK_ERRORS = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
-_JOB_TABLES = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
+_JOB_TABLES = ("parts", "trials", "frames", "made_of")  # tables about jobs in flight
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
 
 
@@ -71,7 +69,7 @@ class DamagedError(LidarError):
 class RunDatabase:
     """Committed parts and trials of the jobs of a run, and the jobs that have ended.
 
-    Jobs under way have a copy of their committed results in memory. A file that does not exist is
+    Jobs in flight have a copy of their committed results in memory. A file that does not exist is
     created with the first `values`. Commits survive a power failure if they are `durable`. All
     methods that write raise LidarError if the disk is full or fails.
 
@@ -83,9 +81,10 @@ class RunDatabase:
         self.path = path
         self._durable = durable
         self.meta: dict[str, str] = {}
-        self.begun: set[int] = set()  # jobs under way with committed parts, trials or frames
+        self.begun: set[int] = set()  # jobs in flight with committed parts, trials or frames
         self.ended_count = 0  # jobs that have ended
         self._ended = bytearray()  # a byte for each job: 1 if the job has ended
+        self._frames: dict[int, int] = {}  # {job: stored number of frames}
         with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
@@ -137,13 +136,13 @@ class RunDatabase:
 
     # -- reading -------------------------------------------------------------------------
 
-    def read(self, job: CommittedJob) -> None:
+    def read(self, job: CommittedResults) -> None:
         """Read the committed results of a job that has none in memory."""
         if job.number in self.begun:
             with _explained(self.path):
                 self._read(job)
 
-    def _read(self, job: CommittedJob) -> None:
+    def _read(self, job: CommittedResults) -> None:
         number = job.number
         scans = job.scans
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
@@ -173,7 +172,8 @@ class RunDatabase:
             waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
             job.trials.append(Trial(waypoints=waypoints, **data))
         for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
-            job.frames = job.frames_written = int(count)
+            self._frames[number] = int(count)
+            job.advance_frames(int(count))
 
     @property
     def used(self) -> bool:
@@ -190,7 +190,7 @@ class RunDatabase:
         return [number for (number,) in self._rows(query)]
 
     def hash_of(self, number: int) -> str:
-        """Return the hash of the inputs of a job under way, or no text if no hash was stored."""
+        """Return the hash of the inputs of a job in flight, or no text if no hash was stored."""
         rows = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
         return "".join(text for (text,) in rows)
 
@@ -218,20 +218,20 @@ class RunDatabase:
             self._insert("meta", values.items(), "OR REPLACE")
         self.meta |= values
 
-    def commit(self, receipts: Iterable[tuple[J, Receipt]]) -> list[tuple[J, Receipt]]:
+    def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
         """Commit parts of jobs in a transaction, and return the newly committed parts.
 
         A part with a scan that is committed already is left out. The number of frames that were
         handed out of these jobs is committed as well.
         """
-        new: list[tuple[J, Receipt]] = []
+        new: list[tuple[CommittedResults, Receipt]] = []
         for job, part in receipts:
             span = part.first, part.stop
             if job.parts.missing(*span) == [span]:
                 job.parts.add(part)
                 new.append((job, part))
         if not new:
-            return new
+            return []
         rows = [
             (
                 p.job,
@@ -254,14 +254,14 @@ class RunDatabase:
                 job.parts.remove(part)
             raise
         self.begun.update(job.number for job, _ in new)
-        return new
+        return [part for _, part in new]
 
     def set_hash(self, number: int, text: str) -> None:
-        """Store the hash of the inputs of a job under way."""
+        """Store the hash of the inputs of a job in flight."""
         with self._transaction():
             self._insert("made_of", [(number, text)], "OR REPLACE")
 
-    def drop(self, job: CommittedJob, receipts: Sequence[Receipt]) -> None:
+    def drop(self, job: CommittedResults, receipts: Sequence[Receipt]) -> None:
         """Remove parts that are missing in storage, so that their scans are offered again."""
         with self._transaction():
             self._sql.executemany(
@@ -271,7 +271,7 @@ class RunDatabase:
         for part in receipts:
             job.parts.remove(part)
 
-    def add_trials(self, job: CommittedJob, trials: Sequence[Trial]) -> None:
+    def add_trials(self, job: CommittedResults, trials: Sequence[Trial]) -> None:
         """Commit planning trials of a job."""
         with self._transaction():
             # To the bit: a float is written with the digits that identify it.
@@ -306,16 +306,16 @@ class RunDatabase:
         for (number,) in forgotten:
             self._mark_ended(number, False)
 
-    def restart(self, job: CommittedJob) -> None:
+    def restart(self, job: CommittedResults) -> None:
         """Drop all committed results of a job that has not ended."""
         with self._transaction():
             self._delete([job.number])
         self.begun.discard(job.number)
-        job.forget_committed()
+        job.reset()
 
-    def save_frames(self, jobs: Iterable[CommittedJob]) -> None:
+    def save_frames(self, jobs: Iterable[CommittedResults]) -> None:
         """Commit the number of frames handed out of jobs, as each commit of a part does too."""
-        unsaved = [job for job in jobs if job.frames != job.frames_written]
+        unsaved = [job for job in jobs if self._has_unsaved_frames(job)]
         if unsaved:
             with self._transaction():
                 self._write_frames(unsaved)
@@ -330,10 +330,11 @@ class RunDatabase:
         self._sql.close()
 
     def _delete(self, numbers: Iterable[int]) -> None:
-        """Delete committed results of jobs."""
         parameters = [(number,) for number in numbers if number in self.begun]
         for table in _JOB_TABLES:
             self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", parameters)
+        for (number,) in parameters:
+            self._frames.pop(number, None)
 
     def _mark_ended(self, number: int, ended: bool = True) -> None:
         if not 0 <= number < MAX_JOBS:
@@ -343,12 +344,15 @@ class RunDatabase:
         self.ended_count += ended - self._ended[number]
         self._ended[number] = ended
 
-    def _write_frames(self, jobs: Iterable[CommittedJob]) -> None:
+    def _write_frames(self, jobs: Iterable[CommittedResults]) -> None:
         for job in jobs:
-            if job.frames != job.frames_written:
+            if self._has_unsaved_frames(job):
                 row = (job.number, job.frames)
                 self._insert("frames", [row], "OR REPLACE")
-                job.frames_written = job.frames
+                self._frames[job.number] = job.frames
+
+    def _has_unsaved_frames(self, job: CommittedResults) -> bool:
+        return job.frames != self._frames.get(job.number, job.scans.start)
 
     def _insert(self, table: str, rows: Iterable[Sequence[Any]], conflict: str = "") -> None:
         """Insert rows with their CRC-32, under a clause `conflict` such as ``OR REPLACE``."""
@@ -407,10 +411,7 @@ def parts_folder(mark: str) -> str:
 
 
 def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Return mark and location of parts from a database's values.
-
-    Raises ValueError if invalid.
-    """
+    """Return mark and location of parts from a database's values. ValueError if invalid."""
     mark = meta["mark"]
     location = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):

@@ -11,7 +11,7 @@ from lidarsim.base.words import listed
 
 from ..pipeline.stage_messages import Receipt, scans_in_words
 from .database import RunDatabase
-from .job_under_way import JobUnderWay
+from .stored_job import StoredJob
 
 CHECKERS = 4  # threads that check parts; each has two copies of a part in memory
 # values of a receipt that the part has as well
@@ -19,14 +19,14 @@ _IN_PART = attrgetter("first", "stop", "point_count")
 
 
 def check_parts(
-    job: JobUnderWay, db: RunDatabase, sizes: Mapping[str, int], strays: Sequence[str]
+    job: StoredJob, db: RunDatabase, sizes: Mapping[str, int], strays: Sequence[str]
 ) -> list[str]:
     """Drop missing and damaged parts of a job, and commit parts that the database does not know.
 
     Parameters
     ----------
     job
-        A job under way, with its committed results.
+        A job in flight, with its committed results.
     db
         The database; it may be new because it was lost, or an older copy.
     sizes
@@ -50,17 +50,16 @@ def check_parts(
                 lost[state].append(part)
         for state, parts in lost.items():
             if parts:
-                db.drop(job, parts)
+                db.drop(job.committed, parts)
                 notes.append(_note(job, parts, state))
         for receipt in filter(None, pool.map(job.receipt, unknown)):
-            db.commit([(job, receipt)])
+            db.commit([(job.committed, receipt)])
     finally:
         pool.shutdown(cancel_futures=True)
-    job.resumed = job.parts.scans_done
     return notes
 
 
-def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
+def _state(job: StoredJob, part: Receipt, sizes: Mapping[str, int]) -> str:
     """Return "missing", "damaged" by the checksum of any column, or "" for a valid part."""
     if part.name not in sizes:
         return "missing"
@@ -70,7 +69,7 @@ def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
     return "" if receipt is not None and _IN_PART(receipt) == _IN_PART(part) else "damaged"
 
 
-def _note(job: JobUnderWay, receipts: Sequence[Receipt], state: str) -> str:
+def _note(job: StoredJob, receipts: Sequence[Receipt], state: str) -> str:
     """Return a note that scans are repeated because their parts were missing or damaged."""
     names = listed([part.name for part in receipts])
     scans = listed([scans_in_words(part.first, part.stop) for part in receipts])

@@ -45,7 +45,7 @@ class RemoteRun:
         self.save(db)
 
     def save(self, db: RunDatabase, *, force: bool = False) -> None:
-        """Write a copy of the database to the storage, if a copy is due or with `force`.
+        """Copy the database to the storage, if a copy is due or with `force`.
 
         LidarError if another run has taken over.
         """

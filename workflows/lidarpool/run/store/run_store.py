@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
+from lidarsim.base.words import rounded
+from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
 
 from ...base.field_words import differences
@@ -25,8 +27,9 @@ from ...base.shard import shard_in_words
 from ...base.software import software
 from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
-from ...scenario.build import Job
+from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, identity_of
+from ..pipeline.committed_results import CommittedResults
 from ..pipeline.failures import storing
 from .database import (
     FILE,
@@ -36,9 +39,9 @@ from .database import (
     parts_folder,
     read_parts_location,
 )
-from .job_under_way import JobUnderWay
 from .part_check import check_parts
 from .remote import OWNER, RemoteRun, fetch_database
+from .stored_job import StoredJob
 
 PARTS = "parts"  # folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
@@ -128,8 +131,10 @@ class RunStore:
         advice = "Create its parent folder first, or choose a different folder"
         with explained(f"The run folder {folder} cannot be created", advice):
             folder.mkdir(exist_ok=True)
-        self.under_way: dict[int, JobUnderWay] = {}  # {number: job}
-        self.only_job: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
+        self.in_flight: dict[int, StoredJob] = {}  # {number: a job that has not ended}
+        # Jobs in flight whose inputs can be recognized by a later run.
+        self._identified: set[int] = set()
+        self.only_job: StoredJob | None = None  # the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
             self.db = self._open(parts_location, resume)
@@ -204,10 +209,7 @@ class RunStore:
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
-        """Remove an earlier run without committed results.
-
-        Raises LidarError for a damaged database.
-        """
+        """Remove an earlier run without committed results. LidarError for a damaged database."""
         if earlier.damage is not None:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
@@ -244,6 +246,7 @@ class RunStore:
             self._check_same(self.db.meta)
         if (only_job := self.jobs.only_job) is not None:
             self.only_job = self._load(only_job)
+            self._identified.add(only_job.number)  # the identity of the run identifies it
         if self.db.used:
             self._check_resumable(resume)
         if self._remote:
@@ -253,8 +256,8 @@ class RunStore:
                 self.storage.prepare()
                 self._write_mark()
         if self.only_job is not None:  # not before the run is known to be the same
-            strays = self._strays.get(self.only_job.number, ())
-            self.notes += check_parts(self.only_job, self.db, self._sizes, strays)
+            strays = self._strays.get(self.only_job.job.number, ())
+            self.only_job = self._check(self.only_job, strays)
 
     def _write_mark(self) -> None:
         names = ("mark", "identity", "fields", "parts", "backend", "casting")
@@ -277,10 +280,7 @@ class RunStore:
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Return how the run of a database differs, as a clause with a period.
-
-        The text is empty if the runs are the same.
-        """
+        """Return how the run of a database differs, in words with a period, or no text."""
         earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
@@ -366,42 +366,69 @@ class RunStore:
 
     # -- jobs --------------------------------------------------------------------------------
 
-    def open_job(self, job: Job) -> JobUnderWay:
-        """Return a job under way, after a check of the parts of an earlier run."""
-        if job.number in self.under_way:
-            return self.under_way[job.number]
-        under_way = self._load(job)
-        strays = self._strays.pop(job.number, ())
-        if job.number in self.db.begun or strays:
-            earlier_hash = self.db.hash_of(job.number)
-            under_way.is_identified = bool(earlier_hash) and earlier_hash == _hash_of(job)
-            if under_way.is_identified:
-                self.notes += check_parts(under_way, self.db, self._sizes, strays)
-            else:  # input files of the job have changed, or a run died before it stored the hash
-                self.db.restart(under_way)
-                self.storage.remove(strays)
-                under_way.resumed = 0
-        return under_way
+    def open_job(self, job: Job) -> StoredJob:
+        """Return a job in flight, after a check of the parts of an earlier run."""
+        number = job.number
+        if number in self.in_flight:
+            return self.in_flight[number]
+        stored = self._load(job)
+        strays = self._strays.pop(number, ())
+        if number not in self.db.begun and not strays:
+            return stored
+        earlier_hash = self.db.hash_of(number)
+        if earlier_hash and earlier_hash == _hash_of(job):
+            self._identified.add(number)
+            return self._check(stored, strays)
+        # Input files of the job have changed, or a run died before it stored the hash.
+        self.db.restart(stored.committed)
+        self.storage.remove(strays)
+        return self._add(replace(stored, resumed=0))
 
-    def _load(self, job: Job) -> JobUnderWay:
-        """Return a new job under way, with its committed results."""
+    def _load(self, job: Job) -> StoredJob:
+        """Add a job in flight with its committed results."""
         is_only = self.jobs.only_job is not None
         count = job.survey.scan_count
         scans = self.jobs.shard.scans(count) if is_only else range(count)
-        under_way = JobUnderWay(
-            job, scans, self.storage, self.db.summaries, has_frames=is_only, keeper=self
-        )
-        self.db.read(under_way)
-        under_way.resumed = under_way.parts.scans_done
-        under_way.is_identified = is_only  # the identity of the run identifies the job
-        self.under_way[job.number] = under_way
-        return under_way
+        committed = CommittedResults(job.number, scans, has_frames=is_only)
+        self.db.read(committed)
+        resumed = committed.parts.scans_done
+        return self._add(StoredJob(job, committed, self.storage, self.db, resumed, keeper=self))
 
-    def end(self, rows: Sequence[JobRow]) -> None:
-        """Commit that jobs have ended."""
+    def _check(self, stored: StoredJob, strays: Sequence[str]) -> StoredJob:
+        """Check the parts of an earlier run, and update the number of resumed scans."""
+        self.notes += check_parts(stored, self.db, self._sizes, strays)
+        return self._add(replace(stored, resumed=stored.parts.scans_done))
+
+    def _add(self, stored: StoredJob) -> StoredJob:
+        self.in_flight[stored.job.number] = stored
+        return stored
+
+    def take_over(self, job: Job) -> None:
+        """Make the committed points those of `job`, as if this run had cast all of them."""
+        assert self.only_job is not None, "of a survey"
+        self.only_job.committed.advance_frames(self.only_job.scans.stop)
+        self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
+
+    def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
+        """Commit that jobs have ended, and return those that were in flight with their rows.
+
+        The models and rates of their sensors are stored for the card of the data set.
+        """
+        ended = [(row, self.in_flight[row.number]) for row in rows if row.number in self.in_flight]
+        named = (
+            (mounted.name or "lidar", _kind_in_words(mounted.sensor))
+            for row, stored in ended
+            if row.done
+            for mounted in stored.job.survey.carried
+        )
+        sensors = with_sensors(self.sensors, named)
+        if sensors != self.sensors:
+            self.db.set(sensors=json.dumps(sensors))
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
         for row in rows:
-            self.under_way.pop(row.number, None)
+            self.in_flight.pop(row.number, None)
+            self._identified.discard(row.number)
+        return ended
 
     def forget(self, numbers: Iterable[int]) -> None:
         """Reset jobs that have ended, so that they are cast again."""
@@ -416,12 +443,6 @@ class RunStore:
         self.end([row for row in rows if not self.db.ended(row.number)])
         self.resumed = self.db.ended_count
 
-    def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
-        """Store names of sensors with model and rate, for the card of the data set."""
-        updated = with_sensors(self.sensors, sensors)
-        if updated != self.sensors:
-            self.db.set(sensors=json.dumps(updated))
-
     # -- the end -----------------------------------------------------------------------------
 
     def save(self, *, force: bool = False) -> None:
@@ -430,11 +451,12 @@ class RunStore:
         If a copy of the database is due, or with `force`, the database is copied. LidarError if the
         copy fails, or another run has taken over.
         """
-        for job in self.under_way.values():
-            if job.parts.scans_done and not job.complete and not job.is_identified:
-                job.is_identified = True
-                self.db.set_hash(job.number, _hash_of(job.job))
-        self.db.save_frames(self.under_way.values())
+        for number, stored in self.in_flight.items():
+            begun = stored.parts.scans_done and not stored.complete
+            if begun and number not in self._identified:
+                self._identified.add(number)
+                self.db.set_hash(number, _hash_of(stored.job))
+        self.db.save_frames(stored.committed for stored in self.in_flight.values())
         if self._remote:
             self._remote.save(self.db, force=force)
 
@@ -446,9 +468,9 @@ class RunStore:
         self.db.close()
 
     def tidy(self) -> None:
-        """Remove parts that are in no job under way, of dead or superseded collectors."""
+        """Remove parts that are in no job in flight, of dead or superseded collectors."""
         mark = self.db.meta["mark"]
-        part_names = [part.name for job in self.under_way.values() for part in job.parts.ordered]
+        part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]
         needed_names = {mark_name(mark), *part_names}
         with suppress(OSError, LidarError):
             self.storage.remove(
@@ -505,11 +527,12 @@ def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -
     return dict(sorted(merged.items()))
 
 
-def _hash_of(job: Job) -> str:
-    """Return the hash of a job's inputs, or no text if an input has no fingerprint.
+def _kind_in_words(sensor: Sensor) -> str:
+    return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
-    A job without a hash is not resumed.
-    """
+
+def _hash_of(job: Job) -> str:
+    """Return the hash of a job's inputs, or no text if it has none, and is not resumed."""
     try:
         return fingerprint(identity_of(job))
     except LidarError:
@@ -517,10 +540,7 @@ def _hash_of(job: Job) -> str:
 
 
 def _database_path(folder: Storage) -> Path:
-    """Return the path of the database in a local folder.
-
-    Raises LidarError if the file is a link.
-    """
+    """Return the path of the database in a local folder. LidarError if the file is a link."""
     folder.local(f"{FILE}-journal")  # SQLite would follow a link here, too
     return folder.local(FILE)
 

@@ -12,7 +12,7 @@ from lidarview.viewer.view import View
 
 from ...datasets.dataset import DataSet, job_file
 from ...datasets.job_table import JobRow
-from ...run.store.job_under_way import JobUnderWay
+from ...run.store.stored_job import StoredJob
 from .cpu_share import CpuShare
 from .downloads import downloads
 from .live_job import LiveJob
@@ -47,7 +47,7 @@ class JobViews:
         """Record that a browser wants points of the newest job."""
         self._looked_for = time.monotonic()
 
-    def read(self, row: JobRow, job: JobUnderWay, is_only: bool) -> None:
+    def read(self, row: JobRow, job: StoredJob, is_only: bool) -> None:
         """Read points of a job, if it is the only job, or a browser shows points of jobs.
 
         Points of the first job are read in any case, of others if reading is due.

@@ -25,7 +25,7 @@ from ...plan import best
 from ...report.picture_content import planning_picture
 from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.run_result import RunResult
-from ...run.store.job_under_way import JobUnderWay
+from ...run.store.stored_job import StoredJob
 from .downloads import downloads
 
 LIVE_POINTS = 150_000  # points in the browser at a time
@@ -41,9 +41,7 @@ class LiveJob:
     sample of the complete result replaces the points, so skipped parts do not matter.
     """
 
-    def __init__(
-        self, under_way: JobUnderWay, name: str = "", max_points: int = LIVE_POINTS
-    ) -> None:
+    def __init__(self, under_way: StoredJob, name: str = "", max_points: int = LIVE_POINTS) -> None:
         self.name = name
         self._under_way = under_way
         self._max_points = max_points

@@ -35,7 +35,7 @@ from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.progress import Progress
 from ...run.run_page import RunPage
 from ...run.run_result import RunResult
-from ...run.store.job_under_way import JobUnderWay
+from ...run.store.stored_job import StoredJob
 from .job_views import JobViews
 from .listed_jobs import ListedJobs
 from .live_charts import Charts
@@ -60,7 +60,7 @@ class LivePage(RunPage):
 
     # -- the run's side ------------------------------------------------------------------
 
-    def begun(self, job: JobUnderWay) -> None:
+    def begun(self, job: StoredJob) -> None:
         """Show the only job: scans of an earlier run, and scans committed from now on."""
         if job.committed_in_words:
             self._status.progress = job.progress()
@@ -107,7 +107,7 @@ class LivePage(RunPage):
         self._listed.end(row, opens=row.done and self._views.opens_written)
         self._charts.add(row)
 
-    def look(self, row: JobRow, job: JobUnderWay) -> None:
+    def look(self, row: JobRow, job: StoredJob) -> None:
         """Read points of a job, if a browser shows the points and reading is due."""
         self._views.read(row, job, is_only=self._count == 1)
 

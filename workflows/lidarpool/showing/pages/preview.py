@@ -21,9 +21,10 @@ from lidarview.viewer.view import View
 
 from ...report.picture_content import planning_picture
 from ...scenario.advice import advice
-from ...scenario.build import Job, build
 from ...scenario.campaign import CampaignSpec
 from ...scenario.campaign_sections import is_campaign
+from ...scenario.job import Job
+from ...scenario.prepare import prepare
 from ...scenario.scenario import Scenario
 
 MATERIAL = TABLE["material"]
@@ -48,10 +49,10 @@ def scenario_view(
         job = campaign.job(0)
         note = f"This is job {job.name} of {campaign.count:,} in the campaign. {_PREVIEW}"
     else:
-        built = build(_with_materials(Scenario.load(path, of_mesh)))
-        for line in advice(built):
+        prepared = prepare(_with_materials(Scenario.load(path, of_mesh)))
+        for line in advice(prepared):
             tell(line)
-        job = built.job()
+        job = prepared.job
     return preview_of(job, note, f"{path.resolve().name} - lidarpool")
 
 

@@ -39,7 +39,7 @@ from ...run.pipeline.stage_messages import Receipt, ScanFrame
 from ...run.progress import Progress
 from ...run.run_page import RunPage
 from ...run.run_result import RunResult
-from ...run.store.job_under_way import JobUnderWay
+from ...run.store.stored_job import StoredJob
 from ..viewers.viewer import Viewer, open_viewer
 from .cpu_share import CpuShare
 
@@ -61,7 +61,7 @@ class ViewerPage(RunPage):
         self._survey: SurveyFeed | None = None  # feed of the only job
         self._looking = CpuShare(READING_SHARE)
 
-    def begun(self, job: JobUnderWay) -> None:
+    def begun(self, job: StoredJob) -> None:
         """Show the only job of a run."""
         self._survey = SurveyFeed(job, self._viewer)
 
@@ -82,7 +82,7 @@ class ViewerPage(RunPage):
         if self._survey is not None:
             self._survey.show_path()
 
-    def look(self, row: JobRow, job: JobUnderWay) -> None:
+    def look(self, row: JobRow, job: StoredJob) -> None:
         """Show a finished job of a campaign, before its parts are removed."""
         if self._looking.due:
             with self._looking.use(LOOK_EVERY_S), suppress(LidarError):
@@ -127,7 +127,7 @@ def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
 class SweepReader:
     """Reads sweeps of a job from its parts."""
 
-    def __init__(self, job: JobUnderWay) -> None:
+    def __init__(self, job: StoredJob) -> None:
         self._job = job.job
         self.sequence = SweepSequence(job.job.sweeps)
         self._points = job.points()  # points of the columns of parts
@@ -174,7 +174,7 @@ class SweepReader:
 class SurveyFeed:
     """Sends the finished sweeps of the only job of a run to a viewer, in a thread."""
 
-    def __init__(self, job: JobUnderWay, viewer: Viewer) -> None:
+    def __init__(self, job: StoredJob, viewer: Viewer) -> None:
         self._under_way = job
         self._viewer = viewer
         self._reader = SweepReader(job)

@@ -28,9 +28,10 @@ from ...clouds.folder import local_result
 from ...clouds.navigation_files import write_instruments
 from ...clouds.writing import ExportSpec
 from ...scenario.advice import advice
-from ...scenario.build import Job, build
 from ...scenario.campaign import CampaignSpec
 from ...scenario.campaign_sections import is_campaign
+from ...scenario.job import Job
+from ...scenario.prepare import prepare
 from ...scenario.scenario import Scenario
 from ...scenario.sections import OutputSection
 from .schedule import casting_threads
@@ -165,10 +166,10 @@ def scenario_job(
     else:
         scenario = Scenario.load(path, of_mesh)
     output = OutputSection(write=() if needs is None else (needs,))
-    built = build(scenario.model_copy(update={"output": output}), plans=False)
-    for note in advice(built):
+    prepared = prepare(scenario.model_copy(update={"output": output}), plans=False)
+    for note in advice(prepared):
         tell(note)
-    return built.job()
+    return prepared.job
 
 
 def _cast(job: Job, stack: ExitStack) -> Played:

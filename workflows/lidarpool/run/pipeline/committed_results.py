@@ -39,10 +39,7 @@ class CommittedParts:
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
-        """Return the part of a committed scan.
-
-        Raises KeyError if the scan is not committed.
-        """
+        """Return the part of a committed scan, or raise KeyError for other scans."""
         for part in self.ordered[self._index(scan) :][:1]:
             if scan in part.scans:
                 return part
@@ -81,10 +78,10 @@ class CommittedParts:
         self.hit_count += sign * part.hit_count
 
 
-class CommittedJob:
-    """Committed results of a job.
+class CommittedResults:
+    """Committed results of a job: parts, planning trials, and the frames that were handed out.
 
-    Only the run's database changes parts and trials.
+    `RunDatabase` changes the parts and trials, `advance_frames` the frames.
 
     Parameters
     ----------
@@ -93,21 +90,24 @@ class CommittedJob:
     scans
         Scans that are to be done.
     has_frames
-        True if scans are handed out as frames, too.
+        True if scans are also handed out as frames.
     """
 
     def __init__(self, number: int, scans: range, *, has_frames: bool = False) -> None:
         self.number = number
         self.scans = scans
         self.has_frames = has_frames
-        self.forget_committed()
+        self.reset()
 
-    def forget_committed(self) -> None:
-        """Reset parts, trials and frames to none."""
+    def reset(self) -> None:
+        """Remove all parts, trials and frames."""
         self.parts = CommittedParts()
         self.trials: list[Trial] = []
         self.frames = self.scans.start  # one past the last scan that was handed out as a frame
-        self.frames_written = self.scans.start  # the same, as the database has it
+
+    def advance_frames(self, stop: int) -> None:
+        """Record that the scans before `stop` were handed out as frames."""
+        self.frames = stop
 
     @property
     def missing_count(self) -> int:
@@ -119,7 +119,3 @@ class CommittedJob:
         """True if all scans are committed, and were handed out if the job has frames."""
         framed = not self.has_frames or self.frames == self.scans.stop
         return framed and not self.missing_count
-
-    def unframed(self) -> list[Receipt]:
-        """Return the parts with scans that were not handed out as frames, in order."""
-        return self.parts.reaching_past(self.frames)

@@ -1,12 +1,11 @@
-"""Builds the scene, the survey and the planning of a scenario."""
+"""Prepares a scenario: reads its files, and makes a job of its scene, survey and planning."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from functools import cached_property
 from glob import escape
 from typing import Any, NamedTuple
 
@@ -16,11 +15,9 @@ from lidarscenes.robots.robot import Robot
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import name_hint, plural
 from lidarsim.media.materials import (
     Material,
-    MaterialTable,
     SurfaceKinds,
     rows_named,
     with_class,
@@ -28,27 +25,24 @@ from lidarsim.media.materials import (
 )
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER, Pose, Track
-from lidarsim.scene.actors import Actor, check_spray
+from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Noise, Returns, Sensor
-from lidarsim.simulator.casting.static_bodies import warn_of_reach
-from lidarsim.simulator.casting.surfaces import warn_of_gray
-from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
-from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.format_table import check_all_returns
-from ..clouds.writing import ExportSpec, with_format_columns
+from ..clouds.writing import with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
 from .default_poses import Placing, place_sensor
-from .georeference import check_epsg, place_problem
+from .georeference import check_epsg
 from .ground import StandingSurfaces
+from .job import Job
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
-from .static_scene import Findings, SceneCache, Shapes, read_static_scene
+from .static_scene import Findings, SceneCache, Shapes, StaticScene, read_static_scene
 from .traffic import (
     TrafficContent,
     TrafficSection,
@@ -76,120 +70,60 @@ MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
-class Job:
-    """A survey of a scene, optionally with path planning.
+class Prepared:
+    """A scenario whose files were read and checked.
 
-    A function that makes the jobs of a `Campaign` sets only the scene, the survey and the values.
-    The campaign sets the number, name and split of each job.
-
-    Parameters
+    Attributes
     ----------
-    scene, survey, planning
-        As for `simulate`, in the local coordinates of the scene.
-    values
-        Values that differ between the jobs of a campaign, as a mapping from names to numbers, text,
-        True or False, or None for an empty cell. All jobs of a campaign have the same names, which
-        are columns of its job table.
-    number, name, split
-        Number of the job in its campaign, its name in files, and the name of its split.
-    outputs
-        Formats of the cloud in addition to PLY.
-    made_of
-        Names and SHA-256 hashes of the files that the job was made from.
-
-    Raises
-    ------
-    LidarError
-        If a field has the wrong type, the precision of the survey is too small for the scene, a
-        material matches no object, an object has no material although others have one, or the
-        coordinate system of the survey is not in true meters at the location of the scene.
+    scenario
+        The scenario.
+    job
+        Scene, survey and planning of the scenario. The scene is where `world.origin` places it.
+    placing
+        Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
+        or a trajectory, or has the objects of the demo.
+    findings
+        Notes about the files, and descriptions of their content.
     """
 
-    scene: Scene
-    survey: Survey
-    planning: Planning | None = None
-    values: Mapping[str, Any] = field(default_factory=dict)
-    number: int = 0
-    name: str = ""
-    split: str = ""
-    outputs: Sequence[ExportSpec] = ()
-    made_of: Sequence[tuple[str, str]] = ()
-
-    def __post_init__(self) -> None:
-        scene = self.scene
-        survey = self.survey
-        MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
-        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
-        # Largest local coordinate, of actors too. Divided by the precision it must fit 32-bit
-        # integers.
-        reach_m = float(np.abs(scene.bounds).max(initial=0.0))
-        if survey.spray_g_m3:  # vehicles on a wet road raise spray
-            check_spray(scene.actors)
-        for actor in scene.actors:
-            actor.check(0.0, survey.duration_ns)
-            positions, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(actor.bounds).max()))
-        if reach_m / survey.precision_m >= 2**31 - 1:
-            raise LidarError(
-                f"`precision_m` is {survey.precision_m}, which is too small for a scene that "
-                f"extends {reach_m:.0f} m from its origin. Set it to at least {reach_m / 2e9:.2g}"
-                f"{_outlier_advice(scene)}."
-            )
-        if survey.epsg is not None:
-            check_epsg(survey.epsg, scene)
-        if self.place_problem:
-            _log.warning("%s", self.place_problem)
-        warn_of_gray(scene, survey)
-        warn_of_reach(scene, survey)
-
-    @cached_property
-    def place_problem(self) -> str:
-        """Warning that the scene is probably in the wrong place, or an empty string."""
-        return place_problem(self.scene, self.survey.epsg)
+    scenario: Scenario
+    job: Job
+    placing: Placing | None
+    findings: Findings
 
     @property
-    def trials(self) -> int:
-        """Number of planning trials."""
-        return self.planning.trials if self.planning else 0
+    def scene(self) -> Scene:
+        """Scene of the job."""
+        return self.job.scene
 
-    @cached_property
-    def sweeps(self) -> Sweeps:
-        """Sweeps with their poses and the boxes of actors.
-
-        The computation takes seconds for thousands of poses.
-        """
-        return Sweeps.from_survey(self.survey, self.scene)
+    @property
+    def survey(self) -> Survey:
+        """Survey of the job."""
+        return self.job.survey
 
 
-def _outlier_advice(scene: Scene) -> str:
-    """Return advice to remove the object that is far from all others, or an empty string."""
-    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
-        middles = scene.object_bounds.mean(axis=1)
-    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
-    order = np.argsort(np.nan_to_num(distances_m))
-    if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
-        return ""
-    return f", or remove {scene.names[order[-1]]!r}, which is far from all other objects"
-
-
-def build(
+def prepare(
     scenario: Scenario,
     *,
     plans: bool = True,
     cache: SceneCache | None = None,
     columns: Sequence[str] = (),
-) -> Built:
-    """Read the files of a scenario and build its scene, survey and planning.
+    **fields: Any,
+) -> Prepared:
+    """Read the files of a scenario, and make a job of its scene, survey and planning.
 
     Parameters
     ----------
+    scenario
+        The scenario.
     plans
-        Whether to build the planning.
+        Whether the job includes the planning of the scenario.
     cache
         Static scenes of other scenarios, which this scenario may share.
     columns
-        Names of columns that the cloud gets beside the scenario's columns.
+        Names of columns that the cloud gets in addition to the columns of the scenario.
+    **fields
+        Further fields of the job, such as `name`.
 
     Raises
     ------
@@ -197,86 +131,46 @@ def build(
         If a file cannot be read, or fields contradict each other or the scene.
     """
     with scenario.naming_lost_files():
-        return _build(scenario, plans, cache, columns)
+        _check_sensors(scenario)
+        static = read_static_scene(scenario) if cache is None else cache.find(scenario)
+        return _prepare(scenario, static, plans, columns, fields)
 
 
-def _build(
-    scenario: Scenario, plans: bool, cache: SceneCache | None, columns: Sequence[str]
-) -> Built:
-    """Build as `build`."""
-    _check_sensors(scenario)
-    static = read_static_scene(scenario) if cache is None else cache.find(scenario)
+def _prepare(
+    scenario: Scenario,
+    static: StaticScene,
+    plans: bool,
+    columns: Sequence[str],
+    fields: Mapping[str, Any],
+) -> Prepared:
+    """Prepare a scenario whose static scene was read."""
     findings = static.findings.copy()
-    scene = static.scene
     shapes = Shapes(scenario, findings)
-    epsg = _common_epsg(scenario, findings)
-    with prefixed(scenario.source):  # errors begin with the scenario's name
-        if scenario.world.epsg is not None:
-            check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
-        track = _carrier_track(shapes, static.standing)
-        sensors = _mounted_sensors(shapes)
-    placing: Placing | None = None
-    if scenario.poses is None and track is None and not scenario.scene.has_seed:
-        placing = _placing(scenario, scene, findings, sensors[0])
-        if placing.grid:  # no sensor is given, and the scene is a single object
-            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
-    track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
-    survey_parts = _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg)
+    survey_parts = _survey_parts(shapes, static)
+    track_or_poses = survey_parts.track_or_poses
+    track = track_or_poses if isinstance(track_or_poses, Track) else None
     actors = _build_actors(shapes, static.standing, track)
     vehicles = _build_traffic(survey_parts, shapes, static.standing)
+    scene = static.scene
     if actors or vehicles:
         scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
     mistakes = Mistakes()
     planning = None
-    with mistakes.noted():
-        with prefixed(scenario.source):
-            survey = _build_survey(
-                survey_parts, _materials(scenario, findings, scene, vehicles), columns
-            )
-            unseen_objects(scene, survey)
-        MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     if plans:
         with mistakes.noted(), prefixed(scenario.source):
             planning = _build_planning(scenario, scene)
+    with mistakes.noted(), prefixed(scenario.source):
+        materials = _materials(scenario, findings, scene, vehicles)
+        job = Job(
+            scene=scene.georeferenced(scenario.world.origin),
+            survey=_build_survey(survey_parts, materials, columns),
+            planning=planning,
+            # Results always have a PLY.
+            outputs=tuple(entry for entry in scenario.output.write if entry.format != "ply"),
+            **fields,
+        )
     mistakes.tell()
-    return Built(scenario, scene, survey, planning, placing, findings)
-
-
-@dataclass(frozen=True, eq=False)
-class Built:
-    """Scene, survey and planning of a scenario: the result of `build`.
-
-    Attributes
-    ----------
-    scenario
-        The scenario that was built.
-    scene, survey, planning
-        In the scene's local coordinates; the planning is None if the scenario asks for none. The
-        world coordinates of the scene are the scenario's, without `world.origin`.
-    placing
-        Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
-        or a trajectory, or has the objects of the demo.
-    findings
-        Notes about the files, and their content in words.
-    """
-
-    scenario: Scenario
-    scene: Scene
-    survey: Survey
-    planning: Planning | None
-    placing: Placing | None
-    findings: Findings
-
-    def job(self, **fields: Any) -> Job:
-        """Return scene, survey and planning as a job with further fields, such as `name`.
-
-        The job's scene is where `world.origin` places it. Results always have a PLY, so that PLY is
-        not among the job's outputs.
-        """
-        outputs = tuple(entry for entry in self.scenario.output.write if entry.format != "ply")
-        scene = self.scene.georeferenced(self.scenario.world.origin)
-        with prefixed(self.scenario.source):
-            return Job(scene, self.survey, self.planning, outputs=outputs, **fields)
+    return Prepared(scenario, job, survey_parts.placing, findings)
 
 
 class _SurveyParts(NamedTuple):
@@ -289,6 +183,27 @@ class _SurveyParts(NamedTuple):
     track_or_poses: Track | Sequence[Pose]
     origin: Floats  # (3,), of the scene, world meters
     epsg: int | None  # EPSG code of the rasters' coordinate system
+    placing: Placing | None  # the choice of default poses
+
+
+def _survey_parts(shapes: Shapes, static: StaticScene) -> _SurveyParts:
+    """Return the sensors of a scenario and their poses, which may be chosen."""
+    scenario = shapes.scenario
+    scene = static.scene
+    findings = shapes.findings
+    epsg = _common_epsg(scenario, findings)
+    with prefixed(scenario.source):  # errors begin with the scenario's name
+        if scenario.world.epsg is not None:  # before files of moving objects are read
+            check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
+        track = _carrier_track(shapes, static.standing)
+        sensors = _mounted_sensors(shapes)
+    placing: Placing | None = None
+    if scenario.poses is None and track is None and not scenario.scene.has_seed:
+        placing = _placing(scenario, scene, findings, sensors[0])
+        if placing.grid:  # no sensor is given, and the scene is a single object
+            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
+    track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
+    return _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg, placing)
 
 
 def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:

@@ -1,4 +1,4 @@
-"""Compiled loops against plain Python, pulse by pulse: see twin.py."""
+"""Compiled loops against plain Python, pulse by pulse: see reference.py."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from tests.lidarsim import twin
-from tests.lidarsim.twin import Hit
+from tests.lidarsim import reference
+from tests.lidarsim.reference import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
@@ -110,7 +110,7 @@ def columns_of(pulses, each):
 
 
 def same_returns(found, expected, tolerance=0.0):
-    """Compare returns with those of the twin, {pulse: returns}; pulses have so many."""
+    """Compare returns with those of the reference, {pulse: returns}; pulses have so many."""
     rows = [(pulse, one) for pulse, returns in expected.items() for one in returns]
     assert found.ray.tolist() == [pulse for pulse, _ in rows]
     surfaces = [one.strongest.surface for _, one in rows]
@@ -127,7 +127,7 @@ def test_random_bits_are_those_of_splitmix64():
     for purpose in Purpose.declared.values():
         seed, scan, ray, number = (rng.integers(2**n, size=1) for n in (63, 40, 32, 8))
         key = int(scan[0]), int(ray[0])
-        mine = twin.bits(int(seed[0]), purpose, key, int(number[0]))
+        mine = reference.bits(int(seed[0]), purpose, key, int(number[0]))
         assert raw(seed[0], purpose, scan, ray, number).tolist() == [mine]
 
 
@@ -145,7 +145,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     given = tuple(one[solid] for one in normals) if planes else None
     air = flies._replace(cause=np.full(len(flies.ray), AIR)) if airy else None
     found = separated(ground, GAP, each, given, air)
-    expected = {k: twin.separated(own, GAP, each, planes) for k, own in pulses.items()}
+    expected = {k: reference.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
     assert {0, 1, 2} <= {*counts.tolist()}
     if planes and each > 1:  # surfaces that continue are a part of what is compared
@@ -165,7 +165,9 @@ def test_saturation_is_that_of_the_twin(full, waves):
     if waves:
         returns = returns_in(hits, digitizer, 7, planes)
         width_ns = FWHM * digitizer.sigma_ns
-        given = {k: twin.waveform_returns(own, digitizer, 7, True) for k, own in pulses.items()}
+        given = {
+            k: reference.waveform_returns(own, digitizer, 7, True) for k, own in pulses.items()
+        }
     else:
         solid = hits.triangle != NO_SURFACE
         width_ns = 2 * GAP / LIGHT_M_NS
@@ -173,10 +175,10 @@ def test_saturation_is_that_of_the_twin(full, waves):
         flies = hits.take(~solid)
         flies = flies._replace(cause=np.full(len(flies.ray), AIR))
         returns = separated(hits.take(solid), GAP, 7, ground, flies)
-        given = {k: twin.separated(own, GAP, 7, True) for k, own in pulses.items()}
+        given = {k: reference.separated(own, GAP, 7, True) for k, own in pulses.items()}
     found = saturated(returns, full, width_ns)
     length = width_ns * LIGHT_M_NS / 2
-    expected = {k: twin.saturated(own, full, length, waves) for k, own in given.items()}
+    expected = {k: reference.saturated(own, full, length, waves) for k, own in given.items()}
     found = found._replace(width=found.width / width_ns, velocity=None)
     same_returns(found, expected, 1e-9)
     assert len(found.ray) < len(returns.ray) - 20 and found.amplitude.max() == full
@@ -196,9 +198,11 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
     expected = {}
     for pulse, own in pulses.items():
         key = key_of(FIRST + pulse)
-        returns = twin.separated(own, GAP, 7, True)
-        seen = [one for k, one in enumerate(returns) if twin.detected(one.energy, k, key, noise)]
-        expected[FIRST + pulse] = twin.reported(seen, mode)
+        returns = reference.separated(own, GAP, 7, True)
+        seen = [
+            one for k, one in enumerate(returns) if reference.detected(one.energy, k, key, noise)
+        ]
+        expected[FIRST + pulse] = reference.reported(seen, mode)
     counts = same_returns(found, expected)
     assert mode == "all" or counts.max() == (2 if mode in ("dual", "two_strongest") else 1)
 
@@ -218,14 +222,16 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     number = np.arange(2000) % 4
     distance = rng.uniform(0.01, 200, 2000)
     energy = 0.004 * 10 ** rng.uniform(-0.2, 0.2, 2000)
-    assert noise.threshold == (0.1 * twin.energy_of(1, 50, 0) if noise.detection_range_m else 0)
+    assert noise.threshold == (
+        0.1 * reference.energy_of(1, 50, 0) if noise.detection_range_m else 0
+    )
     seen = detected(noise, energy, *KEYS.scan_and_number(ray), number)
     ranges = noisy_ranges(noise, distance, energy, *KEYS.scan_and_number(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]
-    assert seen.tolist() == [twin.detected(*row, noise) for _, *row in rows]
+    assert seen.tolist() == [reference.detected(*row, noise) for _, *row in rows]
     assert 0.2 < seen.mean() < 0.95
-    assert np.abs(ranges - [twin.range_of(*row, noise) for row in rows]).max() <= tolerance_m
+    assert np.abs(ranges - [reference.range_of(*row, noise) for row in rows]).max() <= tolerance_m
 
 
 @pytest.mark.parametrize("extinction", [0.0, 0.02])
@@ -249,7 +255,7 @@ def test_energies_are_those_of_the_twin(extinction):
     cosine = np.abs(lit.cosines)
     back = np.where(wall == 1, 0.8 * 220, 0.3 * cosine)
     rows = zip(back.tolist(), distance.tolist(), strict=True)
-    expected = [twin.energy_of(*row, extinction) for row in rows]
+    expected = [reference.energy_of(*row, extinction) for row in rows]
     tolerance = 1e-14 if extinction else 0
     assert np.allclose(lit.energy, expected, tolerance, 0)
     assert np.allclose(surfaces.energy(triangle, cosine, distance, light), expected, tolerance, 0)
@@ -290,15 +296,15 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
         for number, (kind, seen) in enumerate(
             zip(survey.particles, caster.detectable_kinds, strict=True)
         ):
-            precipitation = twin.Precipitation(kind, air, noise.threshold)
+            precipitation = reference.Precipitation(kind, air, noise.threshold)
             seed = named_seed(9, "kind 1" if number else "")
             tables = seen.counts, seen.by_range[0]
-            drawn += twin.particles(precipitation, seed, key, own, tables)
+            drawn += reference.particles(precipitation, seed, key, own, tables)
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
             peaks = table - np.arange(len(table))[:, None]
-            cells = twin.FogCells(0.5, cloud.cell_m, peaks)
-            drawn += twin.fog(survey.backscatter_at(905.0), air, 9, key, own, cells)
+            cells = reference.FogCells(0.5, cloud.cell_m, peaks)
+            drawn += reference.fog(survey.backscatter_at(905.0), air, 9, key, own, cells)
         drawn.sort(key=lambda one: one.subray)
         expected += [(pulse * each + one.subray, one.distance, one.energy) for one in drawn]
     ray, distance, energy = map(np.array, zip(*expected, strict=True))
@@ -331,7 +337,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []
-    precipitation = twin.Precipitation(kind, air, noise.threshold)
+    precipitation = reference.Precipitation(kind, air, noise.threshold)
     table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
     stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
@@ -339,9 +345,9 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
         own = far[pulse * each : (pulse + 1) * each].tolist()
         key = key_of(FIRST + pulse)
-        seen = twin.clumps(precipitation, 9, key, own, boxes, (mean, tables[0]))
+        seen = reference.clumps(precipitation, 9, key, own, boxes, (mean, tables[0]))
         clumps += [(pulse * each + one.subray, one.distance, one.energy) for one in seen]
-        left += [twin.veiled(end, boxes, 0.1) for end in own if end < np.inf]
+        left += [reference.veiled(end, boxes, 0.1) for end in own if end < np.inf]
     ray, distance, energy = map(np.array, zip(*clumps, strict=True))
     assert np.array_equal(out[0][:many], ray) and np.array_equal(out[1][:many], distance)
     assert np.allclose(out[2][:many], energy, 1e-5, 0)
@@ -358,7 +364,9 @@ def test_peaks_of_waveforms_are_those_of_the_twin(each, planes):
     hits, normals = columns_of(pulses, each)
     found = returns_in(hits, digitizer, each, normals if planes else None)
     found = found._replace(width=found.width / (FWHM * digitizer.sigma_ns))
-    expected = {k: twin.waveform_returns(own, digitizer, each, planes) for k, own in pulses.items()}
+    expected = {
+        k: reference.waveform_returns(own, digitizer, each, planes) for k, own in pulses.items()
+    }
     same_returns(found, expected, 1e-9)
     assert (found.width > 1.05).sum() > 10
 
@@ -372,7 +380,7 @@ def test_decomposition_gives_pulses_back(each):
     pulses = pulses_of(20 + each, each, airy=True, count=300)
     found = returns_in(columns_of(pulses, each)[0], digitizer, each)
     for pulse, own in pulses.items():
-        truth = twin.separated(own, digitizer.sigma_m / 4, each, False)
+        truth = reference.separated(own, digitizer.sigma_m / 4, each, False)
         places, energies = (np.array([getattr(one, name) for one in truth]) for name in NAMES[:2])
         some = found.take(found.ray == pulse)
         assert some.energy.sum() == pytest.approx(energies.sum(), rel=0.01)

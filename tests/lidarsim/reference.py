@@ -1,7 +1,7 @@
 """A pulse's life in plain Python, one pulse at a time: an independent check of compiled loops.
 
 Formulas are those of docs/what-comes-back.md. Sums are added in the order of hits, so that they
-have the same bits as those of the loops. `test_twin.py` compares the two.
+have the same bits as those of the loops. `test_reference.py` compares the two.
 """
 
 from __future__ import annotations

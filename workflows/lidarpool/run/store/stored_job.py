@@ -1,11 +1,11 @@
-"""A job under way, and how a run reads its committed parts."""
+"""Reads the committed results of a job from the store of its run."""
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -16,56 +16,69 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack
-from ...scenario.build import Job
-from ..pipeline.pipeline_job import PipelineJob
-from ..pipeline.stage_messages import Receipt, samples_of_scan, summary_type
+from ...plan import Trial
+from ...scenario.job import Job
+from ..pipeline.committed_results import CommittedParts, CommittedResults
+from ..pipeline.stage_messages import (
+    SAMPLES_PER_SURVEY,
+    Receipt,
+    ScanFrame,
+    Summaries,
+    samples_of_scan,
+    summary_type,
+)
 from ..progress import Progress
+from .database import RunDatabase
 
-SAMPLE_RAYS = 400  # rays in pictures of a survey, about
 
-
-class JobUnderWay(PipelineJob):
-    """A job from its first batch until it is written, with access to its parts.
+@dataclass(frozen=True, eq=False)
+class StoredJob:
+    """A job whose committed results are in the store of a run.
 
     Parameters
     ----------
     job
         The job.
-    scans
-        Scans of the job that are to be cast.
+    committed
+        Its committed results, which grow during the run.
     storage
         Storage of the job's parts.
-    summaries
-        Returns the summaries of a committed part.
-    has_frames
-        True if scans are handed out as frames, too.
+    db
+        Database of the run.
+    resumed
+        Number of scans whose points come from an earlier run.
     keeper
-        Object that must live as long as the points are in use: the parts are deleted with it.
+        Object that must live as long as the points are in use, because the parts are deleted with
+        it.
     """
 
-    def __init__(
-        self,
-        job: Job,
-        scans: range,
-        storage: Storage,
-        summaries: Callable[[Receipt], bytes],
-        *,
-        has_frames: bool = False,
-        keeper: object = None,
-    ) -> None:
-        super().__init__(job.number, job.scene, job.survey, scans, has_frames=has_frames)
-        self.job = job
-        self.storage = storage
-        self.resumed = 0  # scans whose points are of an earlier run
-        self.is_identified = False  # True if the store knows what the job is made of
-        self._summaries = summaries
-        self._keeper = keeper
+    job: Job
+    committed: CommittedResults
+    storage: Storage
+    db: RunDatabase
+    resumed: int = 0
+    keeper: object = None
+
+    @property
+    def scans(self) -> range:
+        """Scans of the job that are to be cast."""
+        return self.committed.scans
+
+    @property
+    def parts(self) -> CommittedParts:
+        """Committed parts."""
+        return self.committed.parts
+
+    @property
+    def trials(self) -> list[Trial]:
+        """Committed planning trials."""
+        return self.committed.trials
 
     def receipt(self, name: str) -> Receipt | None:
         """Return the receipt of a part in storage, or None if the part is damaged."""
         try:
             data = self.storage.read(name)
-            return Receipt.from_part(unpack(data), self.number, name, len(data))
+            return Receipt.from_part(unpack(data), self.job.number, name, len(data))
         except LidarError:
             return None
         except OSError as error:
@@ -87,41 +100,26 @@ class JobUnderWay(PipelineJob):
     @property
     def complete(self) -> bool:
         """True if all scans and planning trials are committed, and all frames were handed out."""
-        return self.scans_complete and len(self.trials) == self.job.trials
+        return self.committed.scans_complete and len(self.trials) == self.job.trials
 
     def progress(self) -> Progress:
         """Return the progress of a resumed run at its start."""
-        framed = self.frames - self.scans.start
         start = self.scans.start
         stop = self.scans.stop
+        frames = self.committed.frames
+        survey = self.job.survey
         return Progress(
             scans=len(self.scans),
-            generated=framed,
+            generated=frames - start,
             cast=self.parts.scans_done,
-            framed=framed,
+            framed=frames - start,
             collected=self.parts.scans_done,
             points=self.parts.point_count,
             trials=self.job.trials,
             trials_done=len(self.trials),
-            sweeps=self.survey.sweeps_within(start, stop),
-            sweeps_done=self.survey.sweeps_within(start, min(self.frames, stop)),
+            sweeps=survey.sweeps_within(start, stop),
+            sweeps_done=survey.sweeps_within(start, min(frames, stop)),
         )
-
-    def status(self, *, is_writing: bool) -> dict[str, Any]:
-        """Return name, values and progress of the job for a page.
-
-        `stored` is the number of its `scans` in storage, and `points` the number of their points;
-        `seconds` is the casting time so far, and `writing` is True while its files are written.
-        """
-        return {
-            "name": self.job.name,
-            "values": self.job.values,
-            "stored": self.parts.scans_done,
-            "scans": len(self.scans),
-            "points": self.parts.point_count,
-            "seconds": self.seconds,
-            "writing": is_writing,
-        }
 
     def points(self) -> StoredCloud:
         """Return the points that are committed so far."""
@@ -137,7 +135,7 @@ class JobUnderWay(PipelineJob):
             cells=self.parts.cell_box,
             precision_m=job.survey.precision_m,
             origin=job.scene.origin if world else np.zeros(3),
-            keeper=self._keeper,
+            keeper=self.keeper,
             sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
         )
 
@@ -149,6 +147,29 @@ class JobUnderWay(PipelineJob):
         index = scan - part.first
         rows = slice(int(stops[index] - columns.counts[index]), int(stops[index]))
         return self.points().cloud_of(columns, rows)
+
+    def frames(self, summaries: Summaries) -> Iterator[ScanFrame]:
+        """Yield the scans in `summaries` that were not handed out yet as frames."""
+        survey = self.job.survey
+        dtype = summary_type(samples_of_scan(survey.scan_count))
+        for scan, summary in zip(
+            summaries.scans, np.frombuffer(summaries.data, dtype), strict=True
+        ):
+            if scan < self.committed.frames:
+                continue
+            samples = summary["samples"]
+            spec = survey.scan(scan)
+            yield ScanFrame(
+                scan=scan,
+                sensor=survey.carried[spec.sensor].name,
+                rays=spec.ray_count,
+                hit_count=int(summary["hits"]),
+                count=int(summary["points"]),
+                samples=samples[~np.isnan(samples[:, 0])],
+                _triangles=self.job.scene.triangles,
+                _survey=survey,
+                _read=self.points_of_scan,
+            )
 
     def hit_counts(self) -> Ints:
         """Return the committed hits by hit counters of the scene: (counters,).
@@ -167,13 +188,15 @@ class JobUnderWay(PipelineJob):
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
         dtype = summary_type(samples)
-        step = max(1, samples * survey.scan_count // SAMPLE_RAYS)
+        step = max(1, samples * survey.scan_count // SAMPLES_PER_SURVEY)
         rays = [np.empty((0, 2, 3), np.float32)]
         sampled_scans = range(0, survey.scan_count, step)
         chosen = {scan for scan in sampled_scans if not self.parts.missing(scan, scan + 1)}
         parts = {part.first: part for part in map(self.parts.part_of, sorted(chosen))}
         for part in parts.values():
-            for scan, summary in enumerate(np.frombuffer(self._summaries(part), dtype), part.first):
+            for scan, summary in enumerate(
+                np.frombuffer(self.db.summaries(part), dtype), part.first
+            ):
                 end_points = summary["samples"][~np.isnan(summary["samples"][:, 0])]
                 if scan in chosen and len(end_points):
                     start = np.asarray(survey.pose(scan).position, np.float32)

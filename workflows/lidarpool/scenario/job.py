@@ -1,0 +1,136 @@
+"""A job: a survey of a scene, checked as a whole."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.validation import checked_fields
+from lidarsim.media.materials import MaterialTable
+from lidarsim.scene.actors import check_spray
+from lidarsim.scene.scene import Scene
+from lidarsim.simulator.casting.static_bodies import warn_of_reach
+from lidarsim.simulator.casting.surfaces import warn_of_gray
+from lidarsim.simulator.casting.visibility import unseen_objects
+from lidarsim.survey.survey import Survey
+from lidarsim.sweeps.sweeps import Sweeps
+
+from ..clouds.writing import ExportSpec
+from ..plan import Planning
+from .georeference import check_epsg, place_problem
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+@checked_fields
+class Job:
+    """A survey of a scene, optionally with path planning.
+
+    A function that makes the jobs of a `Campaign` sets only the scene, the survey and the values.
+    The campaign sets the number, name and split of each job.
+
+    Parameters
+    ----------
+    scene, survey, planning
+        As for `simulate`, in the local coordinates of the scene.
+    values
+        Values that differ between the jobs of a campaign, as a mapping from names to numbers, text,
+        True or False, or None for an empty cell. All jobs of a campaign have the same names, which
+        are columns of its job table.
+    number, name, split
+        Number of the job in its campaign, its name in files, and the name of its split.
+    outputs
+        Formats of the cloud in addition to PLY.
+    made_of
+        Names and SHA-256 hashes of the files that the job was made from.
+
+    Raises
+    ------
+    LidarError
+        If a field has the wrong type, the precision of the survey is too small for the scene, a
+        material matches no object, an object has no material although others have one, or the
+        coordinate system of the survey is not in true meters at the location of the scene.
+    """
+
+    scene: Scene
+    survey: Survey
+    planning: Planning | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    number: int = 0
+    name: str = ""
+    split: str = ""
+    outputs: Sequence[ExportSpec] = ()
+    made_of: Sequence[tuple[str, str]] = ()
+
+    def __post_init__(self) -> None:
+        scene = self.scene
+        survey = self.survey
+        MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
+        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
+        # Largest local coordinate, of actors too. Divided by the precision it must fit 32-bit
+        # integers.
+        reach_m = float(np.abs(scene.bounds).max(initial=0.0))
+        if survey.spray_g_m3:  # vehicles on a wet road raise spray
+            check_spray(scene.actors)
+        for actor in scene.actors:
+            actor.check(0.0, survey.duration_ns)
+            positions, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
+            reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(actor.bounds).max()))
+        if reach_m / survey.precision_m >= 2**31 - 1:
+            raise LidarError(
+                f"`precision_m` is {survey.precision_m}, which is too small for a scene that "
+                f"extends {reach_m:.0f} m from its origin. Set it to at least {reach_m / 2e9:.2g}"
+                f"{_outlier_advice(scene)}."
+            )
+        if survey.epsg is not None:
+            check_epsg(survey.epsg, scene)
+        if self.place_problem:
+            _log.warning("%s", self.place_problem)
+        warn_of_gray(scene, survey)
+        warn_of_reach(scene, survey)
+
+    @cached_property
+    def place_problem(self) -> str:
+        """Warning that the scene is probably in the wrong place, or an empty string."""
+        return place_problem(self.scene, self.survey.epsg)
+
+    def with_fields(self, **fields: Any) -> Self:
+        """Return a copy with other fields, without the checks of a new job.
+
+        Only for fields that these checks do not concern, such as `number`.
+        """
+        job = copy(self)
+        vars(job).update(fields)
+        return job
+
+    @property
+    def trials(self) -> int:
+        """Number of planning trials."""
+        return self.planning.trials if self.planning else 0
+
+    @cached_property
+    def sweeps(self) -> Sweeps:
+        """Sweeps with their poses and the boxes of actors.
+
+        The computation takes seconds for thousands of poses.
+        """
+        return Sweeps.from_survey(self.survey, self.scene)
+
+
+def _outlier_advice(scene: Scene) -> str:
+    """Return advice to remove the object that is far from all others, or an empty string."""
+    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
+        middles = scene.object_bounds.mean(axis=1)
+    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
+    order = np.argsort(np.nan_to_num(distances_m))
+    if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
+        return ""
+    return f", or remove {scene.names[order[-1]]!r}, which is far from all other objects"
