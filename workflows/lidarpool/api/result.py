@@ -183,11 +183,11 @@ class Result(RunResult):
     @cached_property
     def _images(self) -> str:
         """Pictures of the result as HTML."""
-        from lidarview.cell_pictures import small_png
+        from lidarview.cell_pictures import compress_png
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=PICTURE_SIZE)
-            return "".join(image_of(small_png(path.read_bytes()), path.stem) for path in drawn)
+            return "".join(image_of(compress_png(path.read_bytes()), path.stem) for path in drawn)
 
     def _figures(self) -> Iterator[tuple[str, str]]:
         """Yield names and values of the main figures."""

@@ -149,9 +149,9 @@ def draw_ranges(comparison: Comparison) -> Page:
         page.heading(axes, words)
     ramp = np.linspace(0, 1, 256)
     frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
-    page.color_bar(theme.mapped(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
+    page.color_bar(theme.apply_colormap(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
     frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
-    page.color_bar(theme.mapped(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
+    page.color_bar(theme.apply_colormap(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
     return page
 
 
@@ -165,7 +165,7 @@ def _range_scale(images: RangeImages) -> LogNorm:
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     """Return the colors (r, c, …) of the ranges of A (0) or B (1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
-    colors = theme.mapped(theme.RANGE_COLORS, scale(ranges).filled(0))
+    colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
     colors[~images.returned[index]] = NO_RETURN
     return colors
 
@@ -174,7 +174,7 @@ def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
     """Return the colors (r, c, …) of the residuals, and of cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
     in_a, in_b = images.returned
-    colors = theme.mapped(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
+    colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
     colors[~in_a & ~in_b] = NO_RETURN
     colors[in_a & ~in_b] = ONLY_A
     colors[~in_a & in_b] = ONLY_B
@@ -355,7 +355,7 @@ def draw_above(comparison: Comparison) -> Page:
         page.heading(axes, ("A, distance to B", "B, distance to A")[number])
     frame = (0.875, 0.12, 0.014, chart_height)
     page.color_bar(
-        theme.mapped(DISTANCE_COLORS, np.linspace(0, 1, 256)), scale, "distance, m", frame
+        theme.apply_colormap(DISTANCE_COLORS, np.linspace(0, 1, 256)), scale, "distance, m", frame
     )
     return page
 

@@ -16,7 +16,7 @@ from lidarsim.base.words import plural, rounded, shortened
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
-from lidarview.render.coloring import colors_of
+from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import Figures, Varied
@@ -392,11 +392,11 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        coloring = colors_of(classes, TABLE["class"], value_names({0: "none", **names}))
+        coloring = make_coloring(classes, TABLE["class"], value_names({0: "none", **names}))
         page.legend(coloring.labels, "sensor")
         painted = coloring.paint(classes)
     else:
-        painted = colors_of(points[:, 2], Z).paint(points[:, 2])
+        painted = make_coloring(points[:, 2], Z).paint(points[:, 2])
     reach = 1.0
     if len(points):
         reach = float(np.percentile(np.abs(points[:, :2]).max(axis=1), 100 * SWEEP_SHARE))

@@ -27,11 +27,11 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
-from lidarview.render.coloring import with_composed
+from lidarview.render.coloring import add_composed_columns
 from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
-from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
-from lidarview.render.surface import unit
+from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
+from lidarview.render.surface import normalize
 
 from ..plan.stations import Sight, StationPlan
 from .page.rendering import put_picture
@@ -136,7 +136,7 @@ def _picture_makers(
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
-        columns_by_name = with_composed(
+        columns_by_name = add_composed_columns(
             {name: c for c in (Z, X, Y, *file.table) for name in (c.name, c.in_files)}
         )
         if color not in columns_by_name:
@@ -315,7 +315,7 @@ def draw_stations(plan: StationPlan) -> Page:
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
-    page.numbers(axes, shot)
+    page.number_sensors(axes, shot)
     names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())
     page.legend([*zip(names, COLORS, strict=False)], "station")
@@ -355,7 +355,7 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     )
 
 
-def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: Samples) -> tuple[Ints, Ints]:
+def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) -> tuple[Ints, Ints]:
     """Return HIDDEN or OTHER for each sample (n,), and the indices of samples of targets."""
     is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # of triangles
     on_surface = samples.triangle >= 0
@@ -375,14 +375,14 @@ def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
     return chosen, group
 
 
-def _painted(samples: Samples, kinds: Ints) -> Samples:
+def _painted(samples: RaySamples, kinds: Ints) -> RaySamples:
     """Return samples with kinds (n,) in place of triangles."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
 def _pixel_visibility(
     shot: SurfaceView, plan: StationPlan
-) -> Callable[[Floats, Samples, Ints], Bools]:
+) -> Callable[[Floats, RaySamples, Ints], Bools]:
     """Return a function for the visibility of samples, by the same rules as in the plan's table.
 
     The function returns a mask (k,) of samples, given by their indices (k,), whose drawn side is
@@ -393,9 +393,9 @@ def _pixel_visibility(
     # of samples do not serve, because they are smoothed for shading.
     sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
     a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
-    face_normals = unit(np.cross(b - a, c - a))
+    face_normals = normalize(np.cross(b - a, c - a))
 
-    def visible_from_any(positions: Floats, samples: Samples, indices: Ints) -> Bools:
+    def visible_from_any(positions: Floats, samples: RaySamples, indices: Ints) -> Bools:
         points = samples.position[indices].astype(np.float64)
         normals = face_normals[samples.triangle[indices]]
         facing_away = np.einsum("ij,ij->i", normals, points - shot.camera.eye) > 0
