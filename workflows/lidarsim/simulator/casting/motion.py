@@ -1,4 +1,4 @@
-"""Poses of a carrier or of a sensor's head at each firing, and the motion until the next firing."""
+"""Poses of a carrier or of a sensor head at each firing, and the motion until the next firing."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories
 
-RING_FIRINGS = 16  # firings whose rays `along_rings` orders by rings
+RING_FIRINGS = 16  # number of firings whose rays `along_rings` sorts by ring
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Firing times of rays, in nanoseconds, and the trajectories that are followed meanwhile.
+    """Firing times of rays, and the trajectories that are evaluated at these times.
 
-    The times count from the start of the survey if the trajectories are of actors, and from the
-    start of the station if the trajectory is of the carrier.
+    Times are nanoseconds since the start of the survey for trajectories of actors, and since the
+    start of the station for the trajectory of the carrier.
     """
 
     firing_starts: Floats  # (f,): start of each firing, nanoseconds
-    delays: Floats  # (m,): of each of the m rays of a firing after its start, nanoseconds
+    delays: Floats  # (m,): delay of each ray within a firing, nanoseconds
     trajectories: ActorTrajectories  # trajectories of the actors, or of the carrier alone
-    start: int = 0  # number of the ray that `times` counts from, 0 at the first firing
-    subrays: int = 1  # sub-rays of a ray, as `times` numbers them
+    start: int = 0  # ray that sub-ray 0 of `times` belongs to; ray 0 is the first of the firings
+    subrays: int = 1  # number of sub-rays per ray
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of sub-rays (n,), nanoseconds: (n,).
+        """Return the firing times of sub-rays (n,) in nanoseconds.
 
-        Sub-ray k is of ray ``start + k // subrays``.
+        Sub-ray k belongs to ray ``start + k // subrays``.
         """
-        from . import surface_loops  # not before: numba takes half a second to import
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         times_ns = np.empty(len(ray))
         surface_loops.firing_times(
@@ -55,28 +55,28 @@ class Clock:
         return times_ns
 
     def part(self, start: int, subrays: int) -> Clock:
-        """Return a clock whose `times` takes sub-rays, from 0 at ray `start`, `subrays` a ray."""
+        """Return a clock for sub-rays that are numbered from 0 at ray `start`."""
         return replace(self, start=start, subrays=subrays)
 
 
 @dataclass(frozen=True, eq=False)
 class Firings:
-    """Consecutive firings of a sensor at a station, or their repetitions, in the order of rays."""
+    """Consecutive firings of a sensor at one station, possibly repeated several times."""
 
     sensor: Sensor
-    numbers: Ints  # (f,): counted from the start of the station
+    numbers: Ints  # (f,): firing numbers, counted from the start of the station
     spec: ScanSpec  # scan of the first firing
 
     @classmethod
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
-        """Return the firings of consecutive scans, the whole sequence `repetitions` times."""
+        """Return the firings of consecutive scans, repeated `repetitions` times as a whole."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         if repetitions > 1:
             numbers = np.tile(numbers, repetitions)
         return cls(sensor, numbers, specs[0])
 
     def times(self, ray: Integers) -> Ints:
-        """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,).
+        """Return the firing times of rays (n,) in nanoseconds since the start of the survey.
 
         Rays are numbered from 0 at the first firing.
         """
@@ -89,9 +89,9 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier.
+    """Poses for `RayCaster.scan`, either of the sensor's head or of its carrier.
 
-    Rotations are from the frame of the head or carrier to the scene frame.
+    Rotations map the frame of the head or carrier to the scene frame.
     """
 
     positions: Floats  # (p, 3), or (3,) for all rays, meters
@@ -99,16 +99,16 @@ class CastPoses:
     rays_per_pose: int | None = None  # None for a single pose
     motion: PoseMotion | None = None  # motion from each pose to the next
     clock: Clock | None = None  # clock of the actors; None without actors
-    by_head: bool = False  # whether the poses are of the head
-    carrier: Clock | None = None  # clock of a carrier that moves, for its velocities; else None
-    station: int = 0  # station of the trajectory of `carrier`
+    by_head: bool = False  # whether the poses are poses of the head
+    carrier: Clock | None = None  # clock of a moving carrier, to compute its velocity
+    station: int = 0  # station in the trajectory of `carrier`
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
         """Arguments of `RayCaster.scan` and `pattern_rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
-        # `check_trajectory` has checked them: again would take a fortieth of the casting time.
+        # Use poses that `check_trajectory` has checked. Another check would cost 2.5 % of casting.
         return {
             "positions": raybeam.poses.Poses(
                 self.positions, self.rotations, self.rays_per_pose, self.motion
@@ -121,17 +121,18 @@ class CastPoses:
         return ActorTrajectories() if self.clock is None else self.clock.trajectories
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of rays (n,) for actors, nanoseconds since the survey's start.
+        """Return the firing times of rays, or zeros without actors.
 
-        Zeros without actors.
+        Times are nanoseconds since the start of the survey.
         """
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
     def part(self, start: int, stop: int, subrays: int) -> CastPoses:
-        """Return the poses of the sub-rays of rays `start` to `stop`, `subrays` of each ray.
+        """Return the poses for `subrays` sub-rays of each of the rays `start` to `stop`.
 
-        Sub-rays are numbered from 0 at ray `start`. The rays belong to complete poses: `start`
-        is the first ray of a pose, and `stop` follows the last ray of a pose or of all rays.
+        Sub-rays are numbered from 0 at ray `start`. The range must consist of complete poses:
+        `start` is the first ray of a pose, and `stop` follows the last ray of a pose or of all
+        rays.
         """
         rays_per_pose = self.rays_per_pose
         motion = self.motion
@@ -155,11 +156,12 @@ class CastPoses:
         )
 
     def drift(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities of points of the carrier at origins of rays (n, 3), m/s: (n, 3).
+        """Return the velocities in m/s that the carrier's motion gives to the origins of rays.
 
-        `ray` (n,) are the numbers of the rays, which have the times; origins and velocities are in
-        the scene frame; zeros if the carrier stands. The motion of a rotating head is left out: a
-        sensor corrects its own rotation.
+        `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
+        Origins and velocities are in the scene frame. The velocities are zero if the carrier is
+        stationary. The rotation of the head is not included, because a sensor corrects for its own
+        rotation.
         """
         if self.carrier is None:
             return np.zeros((len(ray), 3))
@@ -170,28 +172,27 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays (n,) of a pattern, in the scene frame: (n, 3) each.
+        """Return origins and directions of rays (n,) of a pattern, in the scene frame.
 
-        Origins are (1, 3) if all rays share one.
-
-        Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`).
+        Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`). Both
+        arrays have shape (n, 3), but the origins have shape (1, 3) if all rays share one.
         """
         return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
 
 def along_rings(ray: Ints, channels: int) -> Indices:
-    """Return the order of rays (n,) that puts neighbors along a ring behind each other.
+    """Return an order in which rays of the same ring follow each other.
 
-    `ray` (n,) are numbers of rays, in the order of firings and channels. The rays of every
-    `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbors
-    are near each other in the scene.
+    `ray` (n,) are ray numbers sorted by firing and channel. Within each block of `RING_FIRINGS`
+    firings, rays are sorted by channel and keep their order within a channel. Consecutive rays are
+    then close to each other in the scene.
     """
     ring = ray // (RING_FIRINGS * channels) * channels + ray % channels
     return np.argsort(ring.astype(np.uint16), kind="stable")  # uint16: a tenth of the time
 
 
 def check_trajectory(path: Trajectory) -> None:
-    """Check the first pose of each station of a trajectory, which may be a user's class.
+    """Check the first pose of each station of a trajectory, which may be a user-defined class.
 
     Raises
     ------
@@ -207,16 +208,17 @@ def poses_of_firings(
 ) -> CastPoses:
     """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
 
-    If a head rotates all beams (`Sensor.spins`), the poses are of the head, and the rays of one
-    firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
-    the first beam of a firing. If all beams start at the same point of a head, the positions are
-    this point's, `Sensor.center`, else of the head frame's origin.
+    If a head rotates all beams (`Sensor.spins`), these are poses of the head, and the rays of one
+    firing are valid for all firings. Otherwise they are poses of the carrier. Each pose is taken at
+    the time of the first beam in a firing. If all beams start at the same point of a head, the
+    positions are those of this point (`Sensor.center`), otherwise of the origin of the head frame.
 
-    Later beams of a firing start from the carrier's position at the time of the beam: the carrier
-    moves evenly from each firing to the next. A pose for each beam would take as long as casting.
+    Later beams of a firing start from the carrier's position at their own time, which is
+    interpolated linearly between firings. Computing a pose for each beam would take as long as
+    casting.
 
-    `motion` is None if the carrier stands, or if all beams of a firing are fired at once.
-    `late_ns` nanoseconds are added to the times of the firings to find the carrier's poses.
+    `motion` is None if the carrier is stationary, or if all beams of a firing are fired at once.
+    `late_ns` nanoseconds are added to the firing times to find the carrier's poses.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
@@ -245,7 +247,7 @@ def poses_of_firings(
     if not path.moves or not delays.any():
         return CastPoses(ray_positions, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
-    seconds[seconds == 0] = np.inf  # a last firing at the very end: the carrier stands
+    seconds[seconds == 0] = np.inf  # the last firing is at the very end; the carrier stops
     motion = PoseMotion(
         delays,
         np.diff(positions, axis=0) / seconds,
@@ -255,10 +257,10 @@ def poses_of_firings(
 
 
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
-    """Return the rotations (k, 3, 3) from the head, turned to its azimuths, to the scene frame.
+    """Return the rotations from the head, at its current azimuth, to the scene frame.
 
-    `rotations` (k, 3, 3) are those from the carrier frame; `spins` (2, k) are the cosines and sines
-    of the head's azimuths.
+    `rotations` (k, 3, 3) map the carrier frame to the scene frame. `spins` (2, k) are the cosines
+    and sines of the head's azimuths.
     """
     if carried.mount.rotation is not None:
         rotations = matmul(rotations, carried.mount.rotation)
@@ -268,7 +270,7 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Return matrices (k, 3, 3) times rotations about z, of cosines and sines `spins` (2, k)."""
+    """Multiply rotations (k, 3, 3) by rotations about z with cosines and sines `spins` (2, k)."""
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
@@ -281,10 +283,10 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 
 
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
-    """Return the rotation vectors (k, 3), radians, from matrices to close matrices (k, 3, 3).
+    """Return the rotation vectors in radians between pairs of nearly equal rotations.
 
-    The vectors are in the scene frame, the target of the matrices. They are half the sum of the
-    cross products of corresponding axes, whose length is the sine of the angle.
+    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each is half the
+    sum of the cross products of corresponding axes; its length is the sine of the rotation angle.
     """
     vectors = np.empty((3, len(earlier))).T
     for axis in range(3):
