@@ -83,9 +83,8 @@ class OnwardOptics(NamedTuple):
 
     specular: Floats  # share of light that is reflected specularly at normal incidence
     passes: Bools  # whether light passes through, as through glass
-    straight: (
-        Bools  # whether light is not refracted because the surface bounds no refracting medium
-    )
+    # Whether light is not refracted because the surface bounds no refracting medium.
+    straight: Bools
     leafy: Bools  # whether the surface bounds leaves and reflects nothing itself
 
 
