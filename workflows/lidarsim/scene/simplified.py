@@ -286,8 +286,9 @@ class _MergedMesh(NamedTuple):
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3), all faces, with the new vertices
     face_indices: Indices  # (k,), faces to keep: with an area, and each only once
-    # (f,), index into `face_indices` of the face that stands for each face; -1 for none.
-    substitutes: Ints
+    substitutes: (
+        Ints  # (f,), index into `face_indices` of the face that stands for each face; -1 for none
+    )
 
 
 def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _MergedMesh:
