@@ -1,8 +1,9 @@
-"""Services over HTTP/1.1, as makers' sensors have them on port 80.
+"""HTTP/1.1 services, as sensors provide them on port 80.
 
-Requests are small and come from few programs on a network without enemies, or from a program that
-is broken: sizes, times and the number of connections have limits, and each connection carries one
-request. Requests of other websites are refused, as the protocols have no password.
+Requests are small and come from few programs on a trusted network, but these programs may be
+broken. Sizes, times and the number of connections are therefore limited, and each connection
+carries one request. Requests from other websites are rejected, because the protocols have no
+password.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from .tcp_service import TcpService
 HTTP_PORT = 80
 _MAX_HEAD_BYTES = 16 << 10  # limit for the request line and headers
 _MAX_BODY_BYTES = 64 << 10
-_WITHIN_S = 5.0  # limit between the connection and the answer
+_WITHIN_S = 5.0  # time limit from the connection to the response
 _METHODS = ("GET", "POST", "PUT", "DELETE", "HEAD")
 _READING = ("GET", "HEAD")
 
@@ -34,7 +35,7 @@ Headers = Mapping[str, str]  # {name in lower case: value}
 
 @dataclass(frozen=True)
 class Request:
-    """A request that was understood."""
+    """A parsed request."""
 
     method: str
     path: str
@@ -45,14 +46,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer: JSON, or text."""
+    """A response with JSON or text."""
 
-    content: Any = None  # plain data for JSON; None for no content
+    content: Any = None  # JSON-serializable data; None for no content
     status: int = HTTPStatus.OK
-    text: str | None = None  # replaces JSON
+    text: str | None = None  # sent instead of JSON if set
 
     def encode(self) -> bytes:
-        """Return the answer as bytes of HTTP."""
+        """Return the response as HTTP bytes."""
         body = b""
         kind = "application/json"
         if self.text is not None:
@@ -69,7 +70,7 @@ class Answer:
 
 
 class RefusedError(Exception):
-    """A request that is answered by an error, and the reason for the client."""
+    """A request that is answered with an error status, and the reason sent to the client."""
 
     def __init__(self, reason: str, status: int = HTTPStatus.BAD_REQUEST) -> None:
         super().__init__(reason)
@@ -77,7 +78,7 @@ class RefusedError(Exception):
 
 
 class HttpService(TcpService):
-    """Answers requests of HTTP, with the parameters of `TcpService`."""
+    """Answers HTTP requests. The parameters are the same as in `TcpService`."""
 
     usual_port = HTTP_PORT
     example_port = 8080
@@ -86,13 +87,13 @@ class HttpService(TcpService):
 
     @abstractmethod
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request.
+        """Return the response to a request.
 
-        Raises RefusedError for what is not understood.
+        Raises RefusedError if the request is not understood.
         """
 
     def changes_state(self, method: str, path: str) -> bool:
-        """Return True if a request may change what the sensor does."""
+        """Return whether a request may change the state of the sensor."""
         return method not in _READING
 
     def __enter__(self) -> Self:
@@ -101,7 +102,7 @@ class HttpService(TcpService):
 
     @property
     def description(self) -> str:
-        """The address, and how a client whose port is 80 reaches another port."""
+        """Address of the service, with a hint for clients that always use port 80."""
         words = f"{self.name} at http://{self.host}:{self.port}"
         if self.port != HTTP_PORT:
             words += f" (for clients: http_proxy=http://{self.host}:{self.port})"
@@ -115,8 +116,8 @@ class HttpService(TcpService):
                     writer.write((await self._answered(reader, writer)).encode())
                     await writer.drain()
                     writer.write_eof()
-                    # What the client still sends must not reset the connection before the
-                    # client has read the answer.
+                    # Read what the client still sends, because unread data would reset the
+                    # connection before the client has read the response.
                     while await reader.read(_MAX_HEAD_BYTES):
                         pass
         finally:
@@ -145,7 +146,7 @@ class HttpService(TcpService):
             return error.answer
 
     def _refuse_other_sites(self, method: str, url: SplitResult, headers: Headers) -> None:
-        """Raise RefusedError for a request of another website."""
+        """Raise RefusedError if a request comes from another website."""
         reason = refusal(
             headers,
             self.names,
@@ -157,11 +158,10 @@ class HttpService(TcpService):
 
 
 def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
-    """Return method, URL and headers of a request.
+    """Return the method, URL and headers of a request.
 
-    Raises RefusedError for other bytes.
-
-    The URL may be in absolute form, as for a proxy.
+    The URL may be in absolute form, as sent to a proxy. Raises RefusedError if the bytes are not a
+    valid request.
     """
     line, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
     words = line.split(" ")
@@ -185,9 +185,9 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
 
 
 def _body_size(headers: Headers) -> int:
-    """Return the size of the body that headers announce.
+    """Return the body size that the headers announce.
 
-    Raises RefusedError for other encodings.
+    Raises RefusedError if the size is missing, invalid or too large.
     """
     if "transfer-encoding" in headers:
         raise RefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
@@ -200,9 +200,9 @@ def _body_size(headers: Headers) -> int:
 
 
 def receiver_of(name: str, value: Any) -> str:
-    """Return the IPv4 address of one receiver.
+    """Return a parameter value that must be the IPv4 address of a single receiver.
 
-    Raises RefusedError for others, with the parameter's `name`.
+    Raises RefusedError for other values. `name` is the name of the parameter.
     """
     try:
         address = IPv4Address(str(value))
@@ -214,9 +214,9 @@ def receiver_of(name: str, value: Any) -> str:
 
 
 def receiver_port(name: str, value: Any) -> int:
-    """Return a port, or 0 for packets that are not sent.
+    """Return a parameter value that must be a port, or 0 for packets that are not sent.
 
-    Raises RefusedError for other values.
+    Raises RefusedError for other values. `name` is the name of the parameter.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 16:
         raise RefusedError(f"{name} is not a port")
