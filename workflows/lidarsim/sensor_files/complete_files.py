@@ -1,4 +1,4 @@
-"""Files of sensors are written completely or not at all."""
+"""Write sensor files so that they are either complete or do not exist."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..base.storage import Storage
 
 @contextmanager
 def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that appears after the body.
+    """Open a file for writing that appears only when the context ends without an error.
 
     Raises LidarError if the file cannot be written.
     """
@@ -25,7 +25,7 @@ def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_text_of(path: Path, text: str) -> None:
-    """Write a text in UTF-8.
+    """Write a text file in UTF-8.
 
     Raises LidarError if the file cannot be written.
     """
@@ -34,5 +34,5 @@ def write_text_of(path: Path, text: str) -> None:
 
 
 def remark(text: str) -> str:
-    """Return a text for a comment of XML, which must not have two hyphens in a row."""
+    """Return a text for an XML comment, which must not contain two consecutive hyphens."""
     return text.replace("--", "- -").rstrip("-")

@@ -1,6 +1,6 @@
-"""Rays as rangefinders of MuJoCo (.xml): a body with a site for each ray.
+"""MuJoCo rangefinders (.xml): a body with a site and a rangefinder for each ray.
 
-A rangefinder measures along the z axis of its site, at each step of the simulation:
+A rangefinder measures along the z axis of its site in each simulation step, see
 https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
 """
 
@@ -16,7 +16,7 @@ from ..base.errors import LidarError
 from .complete_files import remark, write_text_of
 from .fired_rays import AXES, FiredRays
 
-MAX_SITES = 10_000  # MuJoCo casts the rangefinders of each step one by one
+MAX_SITES = 10_000  # limited because MuJoCo casts the rangefinders of each step one by one
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
@@ -63,5 +63,5 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def _numbers(vector: Floats) -> str:
-    """Return a vector (3,) as an attribute has it."""
+    """Return a vector (3,) in the form of an XML attribute."""
     return " ".join(map(repr, vector.tolist()))

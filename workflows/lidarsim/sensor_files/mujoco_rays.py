@@ -1,10 +1,11 @@
-"""Angles of rays for MuJoCo-LiDAR: arrays `theta` and `phi`, as its scan patterns are.
+"""Angle arrays `theta` and `phi` for MuJoCo-LiDAR, in the form of its scan patterns.
 
-An .npz holds the arrays. A Python file (.py) needs NumPy only, and returns the arrays of a frame.
+An .npz file contains the arrays. A Python file (.py) returns the arrays of a frame; it needs only
+NumPy.
 
-`theta` is the azimuth, counter-clockwise from x, and `phi` the elevation above the xy plane, both
-in radians, in the frame of a site: x forward, y left, z up. MuJoCo-LiDAR casts all rays of a call
-at once; the times beside the angles are for programs that cast rays in parts.
+`theta` is the azimuth, counterclockwise from x, and `phi` the elevation above the xy plane. Both
+are in radians in the frame of a site, with x forward, y left and z up. MuJoCo-LiDAR casts all rays
+of a call at once; the times in the file are for programs that cast rays in parts.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write angles and times of rays, with a header or as a Python file."""
+    """Write angles and times of rays as an .npz file with a header, or as a Python file."""
     if path.suffix.lower() == _PYTHON:
         write_text_of(path, _python_text(rays.timed(), left_out))
         return left_out
@@ -58,7 +59,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
-    """Return the text of a Python file of rays with times."""
+    """Return the content of a Python file for rays that have times."""
     arrays = {
         "_THETA": array_code(np.radians(rays.azimuths_deg), "<f8"),
         "_PHI": array_code(np.radians(rays.elevations_deg), "<f8"),

@@ -1,4 +1,4 @@
-"""Rays as arrays of NumPy (.npz): a one-dimensional array for each column, and a header in JSON."""
+"""Rays as NumPy arrays (.npz): a one-dimensional array for each column, and a JSON header."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .ray_header import (
 )
 
 HEADER = "header"
-_ENCRYPTED = 1  # flag of a file in an archive
+_ENCRYPTED = 1  # flag of an archive member
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
@@ -57,20 +57,20 @@ def read(path: Path) -> FiredRays | None:
 def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
     """Remove the header from arrays and return it.
 
-    Raises ValueError if the arrays are not of a file of rays.
+    Raises ValueError if the header is not a JSON object.
     """
     return parsed_header(str(arrays.pop(HEADER, "{}")))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays of an .npz by name.
+    """Return the arrays in an .npz file by name.
 
     Raises
     ------
     ValueError
-        If the file is not an .npz or is encrypted, or an array is not of numbers.
+        If the file is not an .npz file or is encrypted, or an array is not numeric.
     LidarError
-        If the arrays are larger than the memory.
+        If the arrays exceed the memory limit.
     OSError
         If the file cannot be read.
     """

@@ -1,4 +1,4 @@
-"""Rays as a table of Parquet, with the header in the metadata of its schema."""
+"""Rays as a Parquet table, with the header in the schema metadata."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays as a table.
 
-    The metadata of the schema have the header as JSON.
+    The header is stored as JSON in the schema metadata.
     """
     table = pa.table(columns_of(rays)).replace_schema_metadata(
         {_HEADER: json.dumps(header_of(rays, left_out)).encode()}
@@ -68,9 +68,9 @@ def read(path: Path) -> FiredRays | None:
 
 
 def _bytes_of(metadata: pq.FileMetaData) -> int:
-    """Return the memory of all columns, each number in 8 bytes, or of the pages if that is larger.
+    """Return the memory of all columns at 8 bytes per number, or of the pages if that is larger.
 
-    A column of equal values takes some bytes for any number of rows.
+    The pages alone do not suffice, because a column of equal values occupies only a few bytes.
     """
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))

@@ -1,7 +1,8 @@
-"""Rays as the inputs of nodes of RobotecGPULidar (.npz).
+"""Rays as inputs of RobotecGPULidar nodes (.npz).
 
-By its header api/core.h: a ray is a matrix (3, 4) that takes the z axis to the direction of the ray
-and zero to its start; ring ids are int32, time offsets float32 milliseconds, ranges two float32.
+According to its header api/core.h, a ray is a matrix (3, 4) that maps the z axis to the direction
+of the ray and the zero vector to its origin. Ring ids are int32, time offsets are float32
+milliseconds, and ranges are pairs of float32.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 
 _NAMES = ("rays", "ring_ids", "time_offsets", "ranges")
-_STEEP = 0.9  # z component above which a ray is taken as vertical
+_STEEP = 0.9  # z component above which a ray is treated as vertical
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write arrays, each the input of the node that is named after it."""
+    """Write arrays, each of which is the input of the node with its name."""
     times_ns = rays.timed().times_ns
-    assert times_ns is not None  # of timed rays
+    assert times_ns is not None  # `timed` sets the times
     header = {
         "sensor": rays.name,
         "axes": AXES,
@@ -53,9 +54,9 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def _matrices(rays: FiredRays) -> Floats:
-    """Return matrices (n, 3, 4) that take the z axis to the rays.
+    """Return matrices (n, 3, 4) that map the z axis to the rays.
 
-    Their x axes are level and to the right of the rays, or -y for vertical rays.
+    Their x axes are horizontal and point to the right of the rays, or to -y for vertical rays.
     """
     ahead = rays.directions
     up = np.where(np.abs(ahead[:, 2:]) > _STEEP, [[1.0, 0, 0]], [[0.0, 0, 1]])
