@@ -46,7 +46,7 @@ from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.angle_noise import ACROSS
 from lidarsim.simulator.steps.range_noise import RANGE
-from lidarsim.simulator.steps.separation import chosen, separated
+from lidarsim.simulator.steps.separation import reported_mask, separate_hits
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -146,13 +146,13 @@ def test_modes(mode):
         np.arange(5, dtype=np.int32),
         np.array([1.0, 1.0, 2.0, 4.0, 3.0]),
     )
-    returns = separated(hits, 0.5)
-    found = returns.take(chosen(returns, mode))
+    returns = separate_hits(hits, 0.5)
+    found = returns.take(reported_mask(returns, mode))
     assert found.ray.tolist() == [1] + [4] * len(MODES[mode])
     assert found.distance.tolist() == [2.0, *MODES[mode]]
     # Where the strongest is the last, the next strongest is the other one.
-    swapped = separated(hits._replace(energy=np.array([1.0, 9.0, 2.0, 4.0, 3.0])), 0.5)
-    dual = swapped.take(chosen(swapped, "dual"))
+    swapped = separate_hits(hits._replace(energy=np.array([1.0, 9.0, 2.0, 4.0, 3.0])), 0.5)
+    dual = swapped.take(reported_mask(swapped, "dual"))
     assert dual.distance.tolist() == [2.0, 7.0, 9.0]
 
 

@@ -23,8 +23,8 @@ from lidarsim.simulator.steps.particles import AIR, WeatherStep, exponential, se
 from lidarsim.simulator.steps.pulse_loops import SampledHits
 from lidarsim.simulator.steps.random_loops import RandomKeys
 from lidarsim.simulator.steps.range_noise import noisy_ranges
-from lidarsim.simulator.steps.saturation import saturated
-from lidarsim.simulator.steps.separation import Reporting, separated
+from lidarsim.simulator.steps.saturation import apply_saturation
+from lidarsim.simulator.steps.separation import Reporting, separate_hits
 from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
@@ -144,12 +144,12 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     flies = hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
     air = flies._replace(cause=np.full(len(flies.ray), AIR)) if airy else None
-    found = separated(ground, GAP, each, given, air)
+    found = separate_hits(ground, GAP, each, given, air)
     expected = {k: twin.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
     assert {0, 1, 2} <= {*counts.tolist()}
     if planes and each > 1:  # surfaces that continue are a part of what is compared
-        assert counts.sum() < 0.95 * len(separated(ground, GAP, each, None, air).ray)
+        assert counts.sum() < 0.95 * len(separate_hits(ground, GAP, each, None, air).ray)
     if airy:
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
 
@@ -172,9 +172,9 @@ def test_saturation_is_that_of_the_twin(full, waves):
         ground = tuple(one[solid] for one in planes)
         flies = hits.take(~solid)
         flies = flies._replace(cause=np.full(len(flies.ray), AIR))
-        returns = separated(hits.take(solid), GAP, 7, ground, flies)
+        returns = separate_hits(hits.take(solid), GAP, 7, ground, flies)
         given = {k: twin.separated(own, GAP, 7, True) for k, own in pulses.items()}
-    found = saturated(returns, full, width_ns)
+    found = apply_saturation(returns, full, width_ns)
     length = width_ns * LIGHT_M_NS / 2
     expected = {k: twin.saturated(own, full, length, waves) for k, own in given.items()}
     found = found._replace(width=found.width / width_ns, velocity=None)
@@ -192,7 +192,7 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
     pulses = pulses_of(2, 7)
     noise = Noise(**losses, seed=5)
     hits, planes = columns_of(pulses, 7)
-    found = separated(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
+    found = separate_hits(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
     expected = {}
     for pulse, own in pulses.items():
         key = key_of(FIRST + pulse)

@@ -42,7 +42,7 @@ from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
 from .casting.surfaces import Surfaces, sensor_light_of
-from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
+from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, required
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
 from .steps.step_list import setup_of, steps_of
@@ -50,7 +50,7 @@ from .steps.step_list import setup_of, steps_of
 CHUNK_RAYS = 1 << 17  # number of sub-rays that are cast at a time
 
 
-class Scanned(NamedTuple):
+class ScannedReturns(NamedTuple):
     """Kept returns of consecutive scans, and counts of all returns."""
 
     returns: PulseReturns
@@ -78,12 +78,12 @@ class PulseCaster:
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
-    def moved(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
+    def with_moved_instances(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
         """Return a caster for the same scans after instances of the scene have moved."""
         caster = copy(self)
         caster.setup = replace(self.setup, scene=scene)
         caster._surfaces = surfaces
-        caster.steps = [step.moved(caster.setup, surfaces) for step in self.steps]
+        caster.steps = [step.with_moved_instances(caster.setup, surfaces) for step in self.steps]
         return caster
 
     def scan(
@@ -96,7 +96,7 @@ class PulseCaster:
         firings: Firings,
         *,
         tally: bool = True,
-    ) -> Scanned:
+    ) -> ScannedReturns:
         """Cast consecutive scans, count their returns, and keep every n-th return.
 
         Parameters
@@ -142,7 +142,7 @@ class PulseCaster:
             chunks = [
                 self._pulses(batch(k, min(k + chunk_beams, beam_count))) for k in chunk_starts
             ]
-            scanned = self._thin_out(joined(chunks), scan_starts, tally)
+            scanned = self._thin_out(concatenate_returns(chunks), scan_starts, tally)
         else:
             scanned = self._cast_once(all_beams, scan_starts, tally)
         returns = scanned.returns
@@ -151,7 +151,7 @@ class PulseCaster:
                 returns = step.apply(returns, all_beams)
         return self._within_range(scanned._replace(returns=returns), scan_starts)
 
-    def _within_range(self, scanned: Scanned, scan_starts: Ints) -> Scanned:
+    def _within_range(self, scanned: ScannedReturns, scan_starts: Ints) -> ScannedReturns:
         """Remove the returns whose range, including noise, is outside the sensor's range limits.
 
         If `keep_every` is 1, the removed returns are treated as undetected: counts and return
@@ -183,7 +183,7 @@ class PulseCaster:
         renumbered = returns._replace(
             number=number.astype(np.uint8), return_counts=count.astype(np.uint8)
         )
-        return Scanned(renumbered.take(in_range), hit_counts, tally)
+        return ScannedReturns(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
         """Apply all steps that act before thinning to a batch, and return its returns."""
@@ -193,7 +193,7 @@ class PulseCaster:
                 returns = step.apply(returns, batch)
         return returns
 
-    def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> Scanned:
+    def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> ScannedReturns:
         """Cast rays that have at most one return each; the caster counts and thins out the hits.
 
         Energies are computed here only if steps deflect beams before casting (`Role.AIMS`), and
@@ -217,7 +217,7 @@ class PulseCaster:
         returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
         if batch.offsets is not None:
             returns = self._with_light(returns, batch)
-        return Scanned(returns, hits.hit_counts, hits.tally)
+        return ScannedReturns(returns, hits.hit_counts, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add energy, color and velocity to the returns of deflected beams."""
@@ -245,7 +245,7 @@ class PulseCaster:
             color = surfaces.colors(triangle, points, times, poses.actor_trajectories)
             del points  # frees as much memory as the normals need
         sensor_light = sensor_light_of(setup.survey, setup.sensor)
-        lit = surfaces.lit(
+        lit = surfaces.illuminate(
             triangle,
             directions,
             distance=distance,
@@ -256,7 +256,7 @@ class PulseCaster:
         )
         return returns._replace(energy=lit.energy, color=color, velocity=velocity)
 
-    def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> Scanned:
+    def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> ScannedReturns:
         """Count the returns of each scan, and keep every n-th return of each scan."""
         from .steps import pulse_loops  # imported here because numba takes half a second to import
 
@@ -282,6 +282,6 @@ class PulseCaster:
             reported=thinned.distance,
         )
         if not tally:
-            return Scanned(thinned, hit_counts, None)
+            return ScannedReturns(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
-        return Scanned(thinned, hit_counts, self._surfaces.triangles.count(triangle))
+        return ScannedReturns(thinned, hit_counts, self._surfaces.triangles.count(triangle))

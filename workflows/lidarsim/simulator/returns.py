@@ -29,7 +29,7 @@ NO_SURFACE = -1  # triangle and object number of returns that do not come from a
 SURFACE = CAUSES.index("surface")
 
 
-def selected(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
+def select_rows(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
     """Yield the selected rows of each column. A column that is None yields None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
@@ -83,7 +83,7 @@ class PulseReturns(NamedTuple):
         """Return the selected rows of all columns."""
         if row_selection.dtype == np.bool_:  # convert a mask once instead of once per column
             row_selection = np.flatnonzero(row_selection)
-        return PulseReturns(*selected(self, row_selection))
+        return PulseReturns(*select_rows(self, row_selection))
 
     @property
     def height(self) -> Floats:
@@ -106,7 +106,7 @@ def required(column: T | None) -> T:
 _LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
 
 
-def joined(tables: list[PulseReturns]) -> PulseReturns:
+def concatenate_returns(tables: list[PulseReturns]) -> PulseReturns:
     """Concatenate tables of hits.
 
     A column that only some of the tables have is filled with its value in `_LACKING`. All other
@@ -149,11 +149,11 @@ def returns_without_surface(
     )
 
 
-def merged(returns: PulseReturns, additions: PulseReturns) -> PulseReturns:
+def merge_returns(returns: PulseReturns, additions: PulseReturns) -> PulseReturns:
     """Merge two tables of returns, sorted by ray and distance."""
     if not len(additions.ray):
         return returns
-    hits = joined([returns, additions])
+    hits = concatenate_returns([returns, additions])
     return hits.take(np.lexsort((hits.distance, hits.ray)))
 
 
@@ -170,15 +170,15 @@ class Keys:
         return self.scan + index, ray - self.scan_starts[index]
 
 
-def numbers(ray: Integers) -> Ints:
+def number_within_ray(ray: Integers) -> Ints:
     """Return the number of each entry within its ray, starting at 0.
 
     The entries of a ray must be consecutive.
     """
-    return np.arange(len(ray)) - np.repeat(*runs(ray))
+    return np.arange(len(ray)) - np.repeat(*runs_of_rays(ray))
 
 
-def runs(ray: Integers) -> tuple[Ints, Ints]:
+def runs_of_rays(ray: Integers) -> tuple[Ints, Ints]:
     """Return the start and length of each run of returns from the same ray."""
     starts = np.flatnonzero(np.diff(ray, prepend=-1))
     return starts, np.diff(starts, append=len(ray))

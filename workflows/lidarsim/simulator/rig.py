@@ -20,7 +20,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor
 from ..survey.survey import ScanSpec, Survey
 from .casting.actor_trajectories import ActorTrajectories
-from .casting.motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
+from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
 from .casting.surfaces import Surfaces
 from .points.batch_points import BatchPoints
@@ -150,7 +150,7 @@ class Rig:
                 self.scene.actors[number].check(begin_ns, end_ns)  # raises an error with the name
             raise
 
-    def moved(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
+    def with_moved_instances(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
         """Return a rig in which the instances of the objects `owners` have moved to new poses.
 
         `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations (k, 3,
@@ -162,10 +162,12 @@ class Rig:
         rig = copy(self)
         rig.scene = scene = self.scene.moved(instance_indices, positions[index], rotations[index])
         assert scene.instances is not None
-        rig.surfaces = surfaces = self.surfaces.moved(scene)
+        rig.surfaces = surfaces = self.surfaces.with_moved_instances(scene)
         move_instances(rig.scene_casters, surfaces, scene.instances, instance_indices)
-        rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
-        rig._device = self._device and self._device.moved(scene, surfaces)
+        rig.pulse_casters = [
+            pulses.with_moved_instances(scene, surfaces) for pulses in self.pulse_casters
+        ]
+        rig._device = self._device and self._device.with_moved_instances(scene, surfaces)
         return rig
 
     def _prepare(self) -> None:
@@ -245,7 +247,7 @@ class Rig:
         stop = specs[-1].firings[1]
         firings = Firings.from_scans(sensor, specs)
         poses = self._poses(firings, path, late_ns, by_head=by_head)
-        self.scene_casters[number].cover(poses.positions)
+        self.scene_casters[number].ensure_trees(poses.positions)
         if repeated is not None:
             pattern = repeated
             start = first * channels % len(repeated)  # pattern row of the first ray
@@ -291,7 +293,9 @@ class Rig:
         poses = self._with_actor_clock(poses, firings)
         if path.moves:
             firing_starts = carried.sensor.begins_ns(firings.numbers) + late_ns
-            carrier = Clock(firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
+            carrier = FiringClock(
+                firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,))
+            )
             poses = replace(poses, carrier=carrier, station=spec.station)
         return poses
 
@@ -301,7 +305,7 @@ class Rig:
             return poses
         sensor = firings.sensor
         firing_starts = sensor.begins_ns(firings.numbers) + firings.spec.start_ns
-        clock = Clock(firing_starts, sensor.beams.time_ns, self._actor_trajectories)
+        clock = FiringClock(firing_starts, sensor.beams.time_ns, self._actor_trajectories)
         return replace(poses, clock=clock)
 
     def ranges(
@@ -318,7 +322,7 @@ class Rig:
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
         first = specs[0].firings[0]
-        self.scene_casters[number].cover(positions)
+        self.scene_casters[number].ensure_trees(positions)
         pattern = self._pattern_of_firings(number, first, specs[-1].firings[1])
         rays = len(pattern)
         ranges_m = np.full((len(positions), rays), np.inf, np.float32)

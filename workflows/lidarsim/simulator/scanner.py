@@ -481,7 +481,7 @@ class Scanner:
             try:
                 self._lock.wait_for(lambda: not self._casts)
                 moved_actors = self._with_moved(actors)
-                self._rig = self._rig.moved(numbers, positions, rotations)
+                self._rig = self._rig.with_moved_instances(numbers, positions, rotations)
                 if actors:
                     self._follow(moved_actors)
             finally:

@@ -42,7 +42,7 @@ class ActorSurfaces:
         they belong to, and `times` (n,) are in nanoseconds.
         """
         corners, corner_velocities, at_rest = np.empty((3, len(triangle_indices), 3, 3))
-        frames, frame_rates = trajectories.played(actors, times)
+        frames, frame_rates = trajectories.animation_frames(actors, times)
         mesh_numbers = self._triangles.actor_mesh[actors]
         for mesh_number in np.unique(mesh_numbers).tolist():
             mesh = self._triangles.meshes[mesh_number]
@@ -90,7 +90,7 @@ class ActorSurfaces:
             return
         positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
         points[on_actors] = into_axes(points[on_actors] - positions, rotations)
-        if len(deforming := trajectories.deforming(actor)):
+        if len(deforming := trajectories.deforming_rows(actor)):
             deformed_rows = on_actors[deforming]
             deformed = self.deformed(
                 triangle_indices[deformed_rows],
@@ -122,7 +122,7 @@ class ActorSurfaces:
                 positions, _ = trajectory.poses(0, times_ns)
                 velocity, rate = velocities(trajectory, 0, times_ns)
                 result[row_indices] = velocity + np.cross(rate, points[row_indices] - positions)
-        if len(deforming := trajectories.deforming(actor)):
+        if len(deforming := trajectories.deforming_rows(actor)):
             row_indices = on_actors[deforming]
             result[row_indices] += self._deformation_velocities(
                 triangle[row_indices],

@@ -127,14 +127,14 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         }
         return trajectories
 
-    def deforming(self, actors: Integers) -> Indices:
+    def deforming_rows(self, actors: Integers) -> Indices:
         """Return the rows of `actors` whose mesh is deformed by an animation."""
         animated = list(self.animated)
         if not animated:
             return np.zeros(0, np.intp)
         return np.flatnonzero(np.isin(actors, animated))
 
-    def played(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
+    def animation_frames(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
         """Return the animation frames that actors show at given times, and the frame rates.
 
         `actors` (n,) are numbers of actors with an animation, and `times_ns` (n,) are nanoseconds
@@ -204,7 +204,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         table = self.table(number, times_ns)
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
-    def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
+    def pose_runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
         """Return one pose per run of equal rows, and the run that each row belongs to.
 
         A run consists of consecutive rows with the same trajectory and time, which therefore have

@@ -18,7 +18,7 @@ from ...base.arrays import Bools, Floats, Indices, Integers, Ints
 _Corner = tuple[float, float, float]  # x, y, z of a corner
 
 
-class CutMesh(NamedTuple):
+class ClippedMesh(NamedTuple):
     """A mesh clipped to a box."""
 
     vertices: Floats  # (v, 3)
@@ -40,7 +40,7 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
     return np.concatenate([above, below])
 
 
-def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
+def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> ClippedMesh | None:
     """Clip triangles (f, 3) to the inside of all planes, or return None if none is cut."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
@@ -57,7 +57,7 @@ def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
     new_faces = len(vertices) + np.arange(3 * len(cut_triangles)).reshape(-1, 3)
     origin = np.append(face_indices, np.array([part.face for part in cut_triangles], np.intp))
     order = np.argsort(origin, kind="stable")
-    return CutMesh(
+    return ClippedMesh(
         np.concatenate([vertices, new_vertices]),
         np.concatenate([faces[face_indices], new_faces])[order].astype(np.int64),
         origin[order],

@@ -61,7 +61,7 @@ class MediaBodies:
         holds_medium &= self._kinds.material_kinds.object < self._static_objects
         return tuple(np.flatnonzero(holds_medium).tolist())
 
-    def spread_out(self, by_m: float) -> Floats:
+    def offset_vertices(self, by_m: float) -> Floats:
         """Return the vertices of the scene with the surfaces of media moved outwards by `by_m`.
 
         Water that touches its basin, or leaves that touch other leaves, would otherwise coincide

@@ -19,11 +19,11 @@ from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories
 
-RING_FIRINGS = 16  # number of firings whose rays `along_rings` sorts by ring
+RING_FIRINGS = 16  # number of firings whose rays `order_along_rings` sorts by ring
 
 
 @dataclass(frozen=True)
-class Clock:
+class FiringClock:
     """Firing times of rays, and the trajectories that are evaluated at these times.
 
     Times are nanoseconds since the start of the survey for trajectories of actors, and since the
@@ -54,7 +54,7 @@ class Clock:
         )
         return times_ns
 
-    def part(self, start: int, subrays: int) -> Clock:
+    def part(self, start: int, subrays: int) -> FiringClock:
         """Return a clock for sub-rays that are numbered from 0 at ray `start`."""
         return replace(self, start=start, subrays=subrays)
 
@@ -80,7 +80,7 @@ class Firings:
 
         Rays are numbered from 0 at the first firing.
         """
-        clock = Clock(
+        clock = FiringClock(
             self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
         )
         times = clock.times(ray)
@@ -98,9 +98,9 @@ class CastPoses:
     rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays; None for the identity
     rays_per_pose: int | None = None  # None for a single pose
     motion: PoseMotion | None = None  # motion from each pose to the next
-    clock: Clock | None = None  # clock of the actors; None without actors
+    clock: FiringClock | None = None  # clock of the actors; None without actors
     by_head: bool = False  # whether the poses are poses of the head
-    carrier: Clock | None = None  # clock of a moving carrier, to compute its velocity
+    carrier: FiringClock | None = None  # clock of a moving carrier, to compute its velocity
     station: int = 0  # station in the trajectory of `carrier`
 
     @cached_property
@@ -155,7 +155,7 @@ class CastPoses:
             carrier=carrier,
         )
 
-    def drift(self, ray: Integers, origins: Floats) -> Floats:
+    def carrier_velocities(self, ray: Integers, origins: Floats) -> Floats:
         """Return the velocities in m/s that the carrier's motion gives to the origins of rays.
 
         `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
@@ -180,7 +180,7 @@ class CastPoses:
         return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
 
-def along_rings(ray: Ints, channels: int) -> Indices:
+def order_along_rings(ray: Ints, channels: int) -> Indices:
     """Return an order in which rays of the same ring follow each other.
 
     `ray` (n,) are ray numbers sorted by firing and channel. Within each block of `RING_FIRINGS`

@@ -27,12 +27,12 @@ from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, parts_of
 from ...survey.survey import Survey
 from .actor_trajectories import ActorTrajectories
-from .motion import CastPoses, Clock
+from .motion import CastPoses, FiringClock
 from .static_bodies import StaticBodies, largest_range_m, mesh_of
 from .surfaces import Surfaces
 from .visibility import static_key, unseen_objects
 
-AUTO_TAKES = "The backend 'auto' selects one that is available."
+AUTO_ADVICE = "The backend 'auto' selects one that is available."
 _MAX_ROOM_RAYS = 1 << 18  # largest number of rays that are stored for both casts: 13 MB
 _NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
 REACHED = 1e-3  # a ray reaches a point if it gets this close, as a share of the distance
@@ -67,7 +67,7 @@ class CastBodies(NamedTuple):
     shapes: _ActorShapes | None  # None without actors
 
 
-def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
+def check_backend_here(backend: str, advice: str = AUTO_ADVICE) -> None:
     """Raise LidarError, ending with `advice`, if a backend is not available on this machine."""
     # An interrupt during the import of an extension module would look like a missing module.
     with deferred_interrupts():
@@ -97,7 +97,8 @@ class SceneCaster:
         Trees of the static bodies, and shapes of the actors.
     range_m
         Largest range of the sensors in meters. In a scene of hundreds of kilometers, bodies far
-        beyond this range are omitted. Call `cover` with the sensor positions before each scan.
+        beyond this range are omitted. Call `ensure_trees` before
+        each scan.
     unseen
         (objects,): True for objects that rays pass through. `bodies` does not contain the static
         objects among them. None if all objects are visible.
@@ -114,8 +115,8 @@ class SceneCaster:
         self.bodies = bodies
         self.unseen = unseen
         # Casters of all sensors of the survey by sensor number, set by `casters_of_sensors`.
-        self.of_sensors: Sequence[SceneCaster] = ()
-        self.clear_m = _clear_m(scene)
+        self.by_sensor: Sequence[SceneCaster] = ()
+        self.clear_m = _clearance_m(scene)
         self._surfaces = surfaces
         self._instances = scene.instances
         self._face_count = static_triangles = len(scene.faces)
@@ -133,7 +134,7 @@ class SceneCaster:
         # First triangle of each actor.
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def with_moved_instances(self, surfaces: Surfaces, instances: Instances) -> None:
+    def update_instances(self, surfaces: Surfaces, instances: Instances) -> None:
         """Update the surfaces and instances after instances of the scene have moved.
 
         This does not update the trees; use the function `move_instances` for that.
@@ -141,9 +142,9 @@ class SceneCaster:
         self._surfaces = surfaces
         self._instances = instances
 
-    def cover(self, positions: Floats) -> None:
+    def ensure_trees(self, positions: Floats) -> None:
         """Build any missing trees of bodies within range of sensors at positions (p, 3)."""
-        self._static.cover(positions, self._range_m)
+        self._static.ensure_trees(positions, self._range_m)
 
     @property
     def caster(self) -> RayCaster:
@@ -273,7 +274,9 @@ class SceneCaster:
         """
         visible = np.ones(len(distance), np.bool_)
         if len(distance):
-            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            poses = CastPoses(
+                np.zeros(3), clock=FiringClock(times, np.zeros(1), actor_trajectories)
+            )
             hits = self.scan(Pattern(towards / distance[:, None], origins), poses)
             visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - REACHED)
         return visible
@@ -289,7 +292,7 @@ class SceneCaster:
         joined = surface_loops.JoinedHits(
             np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
         )
-        count = surface_loops.merge(
+        count = surface_loops.merge_hits(
             static_hits.ray,
             static_hits.triangle,
             nearest,
@@ -300,7 +303,7 @@ class SceneCaster:
         )
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
-    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
+    def find_actor_hits(self, scan: Scan, poses: CastPoses) -> OtherHits:
         """Find the nearest hits of rays on actors, including actors hidden by static bodies."""
         if self._shapes is None:
             return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
@@ -318,7 +321,7 @@ class SceneCaster:
 
         def frames(actor: Ints, times: Floats) -> Floats:
             """Return the animation frames of actors at given times."""
-            return trajectories.played(actor, times)[0]
+            return trajectories.animation_frames(actor, times)[0]
 
         presence_ns = trajectories.presence_ns
         if self._unseen_actors is not None:
@@ -370,7 +373,7 @@ def casters_of_sensors(
     @cache
     def vertices() -> Floats:
         # Surfaces of media are moved outwards so that light hits both of two touching surfaces.
-        return surfaces.media_bodies.spread_out(1.5 * _clear_m(scene))
+        return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
         """Return the bodies of the scene without the static objects in a mask (objects,)."""
@@ -386,16 +389,16 @@ def casters_of_sensors(
         return CastBodies(static_bodies[key], key, shapes)
 
     casters: dict[bytes, SceneCaster] = {}  # {unseen objects: caster}
-    of_sensors = []
+    by_sensor = []
     for unseen in unseen_objects(scene, survey):
         key = b"" if unseen is None else unseen.tobytes()
         if key not in casters:
             bodies = bodies_without(unseen)
             casters[key] = SceneCaster(scene, surfaces, bodies, range_m, unseen)
-        of_sensors.append(casters[key])
+        by_sensor.append(casters[key])
     for caster in casters.values():
-        caster.of_sensors = of_sensors
-    return tuple(of_sensors)
+        caster.by_sensor = by_sensor
+    return tuple(by_sensor)
 
 
 def move_instances(
@@ -418,10 +421,10 @@ def move_instances(
     for static in dict.fromkeys(caster.bodies.static for caster in casters):
         static.move(instances, instance_indices)
     for caster in dict.fromkeys(casters):
-        caster.with_moved_instances(surfaces, instances)
+        caster.update_instances(surfaces, instances)
 
 
-def _clear_m(scene: Scene) -> float:
+def _clearance_m(scene: Scene) -> float:
     """Return the distance in meters behind a surface at which transmitted light continues.
 
     At this distance, rounding the ray's start cannot make the ray hit the same surface again.

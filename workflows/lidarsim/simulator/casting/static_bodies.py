@@ -20,7 +20,7 @@ from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, MeshPart
 from ...survey.survey import Survey
-from .clipping import CutMesh, box_planes, cut
+from .clipping import ClippedMesh, box_planes, clip_triangles
 
 _log = logging.getLogger(__name__)
 
@@ -165,7 +165,7 @@ class StaticBodies:
         """Whether hits can stay on a CUDA device."""
         return not self._may_cut and self.trees.caster.on_device
 
-    def cover(self, positions: Floats, range_m: float) -> None:
+    def ensure_trees(self, positions: Floats, range_m: float) -> None:
         """Build trees of all bodies within range of sensors at positions (p, 3), if needed.
 
         Casts in progress can continue to use the trees of an earlier region.
@@ -204,7 +204,7 @@ class StaticBodies:
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
         if trees.region is None and is_remote.any() and self._can_cut:
             self._may_cut = True
-            self._trees = None  # `cover` builds them
+            self._trees = None  # `ensure_trees` builds them
             return
         first = trees.face_bodies
         if trees.region is None and self._instance_is_seen is None:  # the tree has all instances
@@ -240,9 +240,9 @@ class StaticBodies:
         caster = RayCaster(faces.vertices, faces.faces, **self._options)
         return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
 
-    def _cut_faces(self, region: Floats) -> CutMesh | None:
+    def _cut_faces(self, region: Floats) -> ClippedMesh | None:
         """Clip the visible faces to a region, or return None if all faces are inside."""
-        cut_mesh = cut(self._vertices, self._faces, box_planes(region))
+        cut_mesh = clip_triangles(self._vertices, self._faces, box_planes(region))
         if cut_mesh is None or self._sees_all_faces:
             return cut_mesh
         seen = np.flatnonzero((cut_mesh.faces != cut_mesh.faces[:, :1]).any(axis=1))
@@ -263,7 +263,7 @@ class StaticBodies:
         return _Trees(caster, None, None, _NO_ROWS, {})
 
     def _build_nested(
-        self, instances: Instances, region: Floats | None, faces: CutMesh | None
+        self, instances: Instances, region: Floats | None, faces: ClippedMesh | None
     ) -> _Trees:
         """Build the trees of faces, which may be clipped, and of instances."""
         bodies: list[Instance] = []
@@ -303,7 +303,7 @@ class StaticBodies:
 
 def _parts_in(
     instances: Instances, region: Floats | None, is_seen: Bools | None
-) -> Iterator[tuple[int, CutMesh | None]]:
+) -> Iterator[tuple[int, ClippedMesh | None]]:
     """Yield the rows of visible instances within a region, with the clipped mesh or None.
 
     `is_seen` (n,) states which instances are visible; None means all. Parts with an opacity mask
@@ -326,7 +326,7 @@ def _parts_in(
         part = instances.mesh_parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
             planes = box_planes(region, instances.transforms[row])
-            cut_part = cut(part.vertices, part.faces, planes)
+            cut_part = clip_triangles(part.vertices, part.faces, planes)
         if cut_part is None or len(cut_part.faces):
             yield row, cut_part
 

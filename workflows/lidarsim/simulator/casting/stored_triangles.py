@@ -62,7 +62,7 @@ class StoredTriangles:
             return np.zeros((0, 3, 3))
         return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
 
-    def moved(self, scene: Scene) -> StoredTriangles:
+    def with_moved_instances(self, scene: Scene) -> StoredTriangles:
         """Return the triangles of a scene in which instances have new transforms."""
         triangles = copy(self)
         triangles._scene = scene

@@ -215,7 +215,7 @@ def _actor_normal(poses, run, x, y, z):
 
 
 @compiled()
-def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
+def compute_incidence(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
     """Write to `output` how rays with directions (3, n) meet surfaces.
 
     `hits` is a `HitSurfaces`, `tables` a `NormalTables`, and `output` an `Incidence`. `reflectance`
@@ -274,14 +274,14 @@ def at_right_angles(distance, extinction):
 
 
 @compiled()
-def fade(distance, extinction, energy):
+def attenuate_energies(distance, extinction, energy):
     """Multiply energies (n,) by `at_right_angles` at the given distances (n,)."""
     for k in range(len(energy)):
         energy[k] *= at_right_angles(distance[k], extinction)
 
 
 @compiled()
-def soak(normals_z, cosines, kinds, shares, water, film, back):
+def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
     """Reduce the energies of hits on wet surfaces, and mark these hits in `film`.
 
     `normals_z` are the z components of the normals, `shares` are the shares of light that surfaces
@@ -386,7 +386,7 @@ def firing_times(ray, start, subrays, firing_starts, delays, times):
 
 
 @compiled()
-def merge(ray, triangle, nearest, actors, output):
+def merge_hits(ray, triangle, nearest, actors, output):
     """Merge hits on static bodies with hits on actors, and return the number of hits.
 
     The nearest hit of each ray is written to `output`, which is a `JoinedHits`. `ray` and

@@ -43,7 +43,7 @@ class SensorLight(NamedTuple):
     wet: float = 0.0  # share of upward-facing surfaces that is covered by water
 
 
-class LitHits(NamedTuple):
+class IlluminatedHits(NamedTuple):
     """Hits of rays on surfaces, with the energy that the sensor receives."""
 
     normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
@@ -109,13 +109,14 @@ class Surfaces:
         """Return the materials by kind of surface at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
-    def moved(self, scene: Scene) -> Surfaces:
+    def with_moved_instances(self, scene: Scene) -> Surfaces:
         """Return the surfaces of a scene in which instances have new transforms."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
-        surfaces.triangles = self.triangles.moved(scene)  # the rest does not depend on transforms
-        surfaces.grids = self.grids and self.grids.moved(scene.instances)
+        # Nothing else depends on transforms.
+        surfaces.triangles = self.triangles.with_moved_instances(scene)
+        surfaces.grids = self.grids and self.grids.with_moved_instances(scene.instances)
         return surfaces
 
     def normals(
@@ -127,10 +128,10 @@ class Surfaces:
         poses at `times` (n,) in nanoseconds.
         """
         directions = np.zeros((len(triangle), 3))
-        incidence, _ = self._meet(triangle, directions, self.materials, times, trajectories)
+        incidence, _ = self._incidence(triangle, directions, self.materials, times, trajectories)
         return incidence.normals.T
 
-    def _meet(
+    def _incidence(
         self,
         triangle: Integers,
         directions: Floats,
@@ -153,8 +154,8 @@ class Surfaces:
         deformed_normals = _NO_NORMALS
         if trajectories:
             actors = objects - np.int64(self.triangles.static_objects)
-            poses, run = trajectories.runs(actors, owned(times))
-            if len(deforming := trajectories.deforming(actors)):
+            poses, run = trajectories.pose_runs(actors, owned(times))
+            if len(deforming := trajectories.deforming_rows(actors)):
                 deformed = self.on_actors.deformed(
                     row[deforming], actors[deforming], times[deforming], trajectories
                 )
@@ -162,7 +163,7 @@ class Surfaces:
                 row[deforming] = ~np.arange(len(deforming))  # rows of `deformed_normals`
         cosines, back = np.empty((2, len(row)))
         incidence = surface_loops.Incidence(np.empty((3, len(row))), cosines, back)
-        surface_loops.meet(
+        surface_loops.compute_incidence(
             surface_loops.HitSurfaces(row, kinds, instance, run),
             owned(directions.T),
             surface_loops.NormalTables(
@@ -174,7 +175,7 @@ class Surfaces:
         )
         return incidence, kinds
 
-    def lit(
+    def illuminate(
         self,
         triangle: Integers,
         directions: Floats,
@@ -183,7 +184,7 @@ class Surfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
         colors: UInts32 | None = None,
-    ) -> LitHits:
+    ) -> IlluminatedHits:
         """Return the normals, cosines, kinds of surfaces and received energies of hits.
 
         Parameters
@@ -204,7 +205,7 @@ class Surfaces:
         from . import surface_loops
 
         table = self.at_wavelength(sensor_light.wavelength_nm)
-        incidence, kinds = self._meet(triangle, directions, table, times, trajectories)
+        incidence, kinds = self._incidence(triangle, directions, table, times, trajectories)
         normals, cosines, back = incidence
         bright = luminance(colors) if table.textured and colors is not None else None
         if table.textured or table.roughness.any():
@@ -214,11 +215,11 @@ class Surfaces:
             film = np.empty(len(cosines), np.bool_)
             water = surface_loops.WaterFilm(LEVEL, sensor_light.wet, table.passes | table.leafy)
             shares = table.shares(kinds, bright)
-            surface_loops.soak(
+            surface_loops.apply_water_film(
                 normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
             )
-        surface_loops.fade(owned(distance), sensor_light.extinction, back)
-        return LitHits(normals.T, cosines, kinds, back, film)
+        surface_loops.attenuate_energies(owned(distance), sensor_light.extinction, back)
+        return IlluminatedHits(normals.T, cosines, kinds, back, film)
 
     def colors(
         self,

@@ -72,7 +72,7 @@ class Grids:
             return None
         return cls(shared)
 
-    def moved(self, shared: Instances) -> Grids:
+    def with_moved_instances(self, shared: Instances) -> Grids:
         """Return the grids with the current transforms of the instances."""
         grids = copy(self)
         grids._place_instances(shared)

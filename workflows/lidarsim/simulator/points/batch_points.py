@@ -24,7 +24,7 @@ from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.surfaces import Surfaces, sensor_light_of
-from ..pulses import Scanned
+from ..pulses import ScannedReturns
 from ..returns import required
 from ..steps.cast import GHOST
 from ..steps.doppler import VELOCITY, radial_velocities
@@ -47,7 +47,7 @@ class BatchPoints:
         survey: Survey,
         surfaces: Surfaces,
         specs: list[ScanSpec],  # scans with consecutive firings
-        scanned: Scanned,  # rays are numbered from 0 at the first firing
+        scanned: ScannedReturns,  # rays are numbered from 0 at the first firing
         *,
         pattern: Pattern,
         start: int,  # row of ray 0 in the pattern
@@ -420,7 +420,7 @@ class BatchPoints:
         colors = self._colors if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            lit = self._surfaces.lit(
+            lit = self._surfaces.illuminate(
                 self.pulse_returns.triangle[block],
                 self.directions[block],
                 distance=self.pulse_returns.distance[block],

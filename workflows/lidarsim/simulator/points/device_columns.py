@@ -30,7 +30,7 @@ from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
-from ..pulses import Scanned
+from ..pulses import ScannedReturns
 from ..returns import SURFACE, PulseReturns
 from .batch_points import BatchPoints
 
@@ -111,7 +111,7 @@ class DevicePoints:
         return cells * self.survey.precision_m
 
 
-class SeenBodies:
+class VisibleBodies:
     """Bodies that a sensor can see, in the numbering of its caster."""
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
@@ -148,11 +148,11 @@ class DeviceColumns:
         # Whether NumPy computes the energies of hits on actors; the device computes all others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
         bodies, _ = surfaces.triangles.bodies()
-        seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
+        seen = {caster: VisibleBodies(caster, bodies) for caster in dict.fromkeys(casters)}
         self._seen_bodies = [seen[caster] for caster in casters]  # one for each sensor
         self._surface_tables: tuple[Any, ...] | None = None
 
-    def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
+    def with_moved_instances(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
         """Return a copy for a scene in which instances have moved.
 
         Tables that do not change stay on the device.
@@ -202,7 +202,9 @@ class DeviceColumns:
         finally:  # otherwise the device could write to memory that has been returned to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hit_counts, None)
+        scanned = ScannedReturns(
+            PulseReturns.single_returns(ray, distance, triangle), hit_counts, None
+        )
         returns = BatchPoints(
             self._scene,
             survey,
@@ -255,7 +257,7 @@ class DeviceColumns:
         for device_image in images:
             device_image.get(out=image)
 
-    def tables(self, cupy: Any, seen: SeenBodies) -> tuple[Any, ...]:
+    def tables(self, cupy: Any, seen: VisibleBodies) -> tuple[Any, ...]:
         """Return the surface tables that columns.cu reads, on the caster's device."""
         if self._surface_tables is None:
             triangles = self._surfaces.triangles
@@ -277,14 +279,14 @@ class DeviceColumns:
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 
 
-def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
+def _actor_hits(seen: VisibleBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
     """Find the hits of a scan on visible actors, or return None without actors.
 
     All actors are the last body, and its triangles are numbered from 0.
     """
     if not poses.actor_trajectories:
         return None
-    hits = seen.caster.on_actors(scan, poses)
+    hits = seen.caster.find_actor_hits(scan, poses)
     return replace(hits, triangle=hits.triangle - np.int32(seen.table[-1, 0]))
 
 
@@ -298,7 +300,7 @@ class _ColumnTransfer:
     def __init__(
         self,
         maker: DeviceColumns,
-        seen: SeenBodies,
+        seen: VisibleBodies,
         specs: list[ScanSpec],
         groups: Ints,
         max_points: int,

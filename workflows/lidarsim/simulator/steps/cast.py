@@ -20,10 +20,10 @@ from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
 from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, Clock, along_rings
+from ..casting.motion import CastPoses, FiringClock, order_along_rings
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces, sensor_light_of
-from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
+from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
 from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -62,7 +62,7 @@ class LightPaths:
 
     def take(self, row_indices: Integers) -> LightPaths:
         """Return the light in the selected rows."""
-        return LightPaths(*selected(vars(self).values(), row_indices))
+        return LightPaths(*select_rows(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
         """Return the optical path lengths from the sensor to points `step_m` from the origins."""
@@ -112,7 +112,7 @@ class VisibleHits(NamedTuple):
     mirrors: Bools  # (n,): whether the surface reflects a part of the light specularly
 
 
-class Crossings(NamedTuple):
+class SurfaceCrossings(NamedTuple):
     """Surfaces that transmit or reflect light. Arrays (n,), vectors (n, 3).
 
     A surface that does both has two rows.
@@ -197,11 +197,11 @@ class CastStep(PulseStep):
             or self._media is not None
         )
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
         """Return the step for a scene with moved instances and updated bounds of media."""
         if self._media is not None:
-            return super().moved(setup, surfaces)
-        return self.repointed(setup, surfaces)
+            return super().with_moved_instances(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -355,7 +355,7 @@ class CastStep(PulseStep):
         if self._colored:
             points = light.origins + step_m[:, None] * light.directions
             color = surfaces.colors(triangle, points, light.times, actor_trajectories)
-        normals, cosines, kinds, energy, film = surfaces.lit(
+        normals, cosines, kinds, energy, film = surfaces.illuminate(
             triangle,
             light.directions,
             distance=distance,
@@ -511,13 +511,15 @@ class CastStep(PulseStep):
         if not len(row_indices):
             return None
         reflected = np.arange(len(row_indices)) >= len(transmitted)
-        order = along_rings(light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels)
+        order = order_along_rings(
+            light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels
+        )
         row_indices, reflected, share = self._divide(
             light, surface_hits, row_indices[order], reflected[order]
         )
         onward = light.take(row_indices)
         onward.share = share
-        crossings = Crossings(
+        crossings = SurfaceCrossings(
             step_m=surface_hits.step_m[row_indices],
             distance=surface_hits.distance[row_indices],
             triangle=surface_hits.triangle[row_indices],
@@ -585,7 +587,7 @@ class CastStep(PulseStep):
         light, start_m, pattern = onward
         max_range_m = self.setup.sensor.max_range_m
         # The travel time of light is neglected: it travels 300 m in a microsecond.
-        clock = Clock(light.times, np.zeros(1), actor_trajectories)
+        clock = FiringClock(light.times, np.zeros(1), actor_trajectories)
         poses = CastPoses(np.zeros(3), clock=clock)
         hits = self.caster.scan(pattern, poses, t_max=self._reach_m)
         row_indices = hits.ray
@@ -617,7 +619,7 @@ class CastStep(PulseStep):
         beams have several sub-rays. `rays` has all sub-rays (`_cast_first`), and `first_light` is
         the light of the sub-rays that hit a surface.
         """
-        hits = joined([visible.hits for visible in hits_by_pass])
+        hits = concatenate_returns([visible.hits for visible in hits_by_pass])
         normals = hits_by_pass[0].normals
         if hits_by_pass[1:]:
             order = np.argsort(hits.ray, kind="stable")
@@ -633,7 +635,7 @@ class CastStep(PulseStep):
             batch.planes = normals, directions
         return hits
 
-    def _cross(self, light: LightPaths, crossings: Crossings) -> OnwardLight:
+    def _cross(self, light: LightPaths, crossings: SurfaceCrossings) -> OnwardLight:
         """Return the light behind surfaces that transmit or reflect it.
 
         The new origins are a small distance behind the surfaces, so that the light does not hit
@@ -673,7 +675,7 @@ class CastStep(PulseStep):
         )
         return OnwardLight(behind, -clear_m, pattern)
 
-    def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
+    def _deflect(self, light: LightPaths, crossings: SurfaceCrossings) -> Deflection:
         """Return directions and shares of light behind surfaces that refract or reflect it.
 
         This moves the light into the media behind the surfaces.

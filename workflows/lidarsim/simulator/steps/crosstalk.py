@@ -20,10 +20,16 @@ from ...media.materials import at_right_angles
 from ...sensor import Sensor
 from ...sensor.optics import LIGHT_M_NS
 from ...survey.survey import ScanSpec, Survey, firing_start_ns
-from ..casting.motion import CastPoses, Clock
+from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, numbers, returns_without_surface
+from ..returns import (
+    RETURN_COLUMNS,
+    PulseReturns,
+    merge_returns,
+    number_within_ray,
+    returns_without_surface,
+)
 from .detection import passes
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
@@ -101,9 +107,9 @@ class CrosstalkStep(PulseStep):
             if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
-        return self.repointed(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -129,11 +135,13 @@ class CrosstalkStep(PulseStep):
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.scan_and_number(ray)
-        detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
+        detected = passes(
+            self.setup.noise, FOREIGN_PULSE, energy, scan, number, number_within_ray(ray)
+        )
         foreign_returns = returns_without_surface(
             returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )
-        return merged(returns, foreign_returns)
+        return merge_returns(returns, foreign_returns)
 
     def received(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
@@ -250,9 +258,11 @@ class CrosstalkStep(PulseStep):
         fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
         origins, directions = self._fired_rays(number, spec.station, firings, firing_starts)
         trajectories = poses.actor_trajectories
-        hits = self.caster.of_sensors[number].scan(
+        hits = self.caster.by_sensor[number].scan(
             Pattern(directions, origins),
-            CastPoses(np.zeros(3), clock=Clock(fired + spec.start_ns, np.zeros(1), trajectories)),
+            CastPoses(
+                np.zeros(3), clock=FiringClock(fired + spec.start_ns, np.zeros(1), trajectories)
+            ),
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
         )

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ...base.arrays import Bools, Floats, Integers
 from ...base.random_numbers import Purpose, normal, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
-from ..returns import PulseReturns, numbers
+from ..returns import PulseReturns, number_within_ray
 from .step import PulseBatch, PulseStep, Role, Setup
 
 DETECTION = Purpose(4, "energy noise of a return")
@@ -33,7 +33,9 @@ class DetectionStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the detected returns."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        detected_mask = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
+        detected_mask = detected(
+            self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)
+        )
         return returns.take(detected_mask)
 
 

@@ -34,7 +34,7 @@ def range_rates_of_origins(
     origins = np.broadcast_to(origins, directions.shape)
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
-        drift = poses.drift(ray[block], origins[block])
+        drift = poses.carrier_velocities(ray[block], origins[block])
         rates[block] = -products(drift.T, directions[block].T)
     return rates
 

@@ -12,7 +12,7 @@ from ...base.random_numbers import Purpose, uniform
 from ...columns.table import CAUSES
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import LIGHT_M_NS
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
+from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 FALSE_ALARM = CAUSES.index("false alarm")
@@ -63,7 +63,7 @@ class FalseAlarmStep(PulseStep):
         alarm_returns = returns_without_surface(
             returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM
         )
-        return merged(returns, alarm_returns)
+        return merge_returns(returns, alarm_returns)
 
 
 def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> FalseAlarms:

@@ -28,10 +28,10 @@ from ...media.leaves import brightness, projection
 from ...media.materials import MaterialTable, fresnel
 from ...scene.scene import Scene
 from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, Clock
+from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
-from ..returns import selected
+from ..returns import select_rows
 
 LEAF = Purpose(30, "depth to which light penetrates leaves")
 CROWN = Purpose(31, "crown that a leaf belongs to, where crowns overlap")
@@ -117,7 +117,7 @@ class RayDifferentials:
 
     def __getitem__(self, row_indices: Integers) -> RayDifferentials:
         """Return the differentials of selected sub-rays."""
-        return RayDifferentials(*selected(vars(self).values(), row_indices))
+        return RayDifferentials(*select_rows(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
         """Advance the light by steps (n,) in meters through an attenuation (n,) in 1/m."""
@@ -265,7 +265,9 @@ class Media:
             if not len(probe_indices):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            poses = CastPoses(
+                np.zeros(3), clock=FiringClock(times, np.zeros(1), actor_trajectories)
+            )
             hits = caster.scan(light, poses)
             probe_indices = probe_indices[hits.ray]
             times = times[hits.ray]
@@ -398,7 +400,7 @@ class LightInMedia:
         """Return the state of selected sub-rays."""
         return LightInMedia(
             self.media,
-            *selected((self.stack, self.differentials, self.remaining_depth), row_indices),
+            *select_rows((self.stack, self.differentials, self.remaining_depth), row_indices),
         )
 
     @property
@@ -536,7 +538,7 @@ class LightInMedia:
         if self.differentials is None:
             return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
         ratio = self.media.index(self.stack) / self.differentials.index
-        refraction = refracted(directions, normals, cosines, ratio)
+        refraction = refract(directions, normals, cosines, ratio)
         keeps_media = refraction.totally_reflected | reflected
         self.stack.kinds[keeps_media] = stack_before.kinds[keeps_media]
         self.stack.triangles[keeps_media] = stack_before.triangles[keeps_media]
@@ -554,7 +556,7 @@ class LightInMedia:
             )
 
 
-def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
+def refract(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
     """Refract light at surfaces according to Snell's law.
 
     `ratio` (n,) is the refractive index behind the surface divided by the index in front of it.

@@ -31,8 +31,8 @@ from ..returns import (
     Keys,
     Planes,
     PulseReturns,
-    joined,
-    numbers,
+    concatenate_returns,
+    number_within_ray,
     returns_without_surface,
 )
 from .doppler import range_rates_of_origins
@@ -122,9 +122,9 @@ class WeatherStep(PulseStep):
             air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
-        return self.repointed(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -224,7 +224,7 @@ class WeatherStep(PulseStep):
         exit_distance = np.full(len(row_indices), np.inf)
         same_ray = ray[1:] == ray[:-1]
         exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
-        enters = (numbers(ray) % 2 == 0) & (
+        enters = (number_within_ray(ray) % 2 == 0) & (
             exit_distance - surface_distance > self.setup.half_pulse_m
         )
         reach = reach.copy()
@@ -272,7 +272,7 @@ def add_air_hits(
         batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
         return batch.hits
     if batch.air is not None:
-        air_hits = joined([batch.air, air_hits])
+        air_hits = concatenate_returns([batch.air, air_hits])
         air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
     batch.air = air_hits
     return returns
@@ -336,7 +336,7 @@ def insert_air_hits(
         no_vectors = np.zeros((len(air_hits.ray), 3))
         normals, directions = (np.concatenate([no_vectors, vectors])[order] for vectors in planes)
         planes = normals, directions
-    return joined([air_hits, hits]).take(order), planes
+    return concatenate_returns([air_hits, hits]).take(order), planes
 
 
 @lru_cache(CACHED_TABLES)

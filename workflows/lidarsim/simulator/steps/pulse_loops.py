@@ -25,7 +25,7 @@ class SampledHits(NamedTuple):
         return SampledHits(self.ray[:count], self.distance[:count], self.energy[:count])
 
 
-class Neighbors(NamedTuple):
+class SubrayNeighbors(NamedTuple):
     """Neighboring sub-rays of a beam, and planes of hits.
 
     If there are no pairs, no surface continues from one sub-ray to the next.
@@ -50,7 +50,7 @@ class PulseHits(NamedTuple):
 
     subray: Ints  # number among the sub-rays of all beams
     distance: Floats  # meters
-    row: Ints  # (n, 2): row among the hits of `Neighbors`, and scratch memory
+    row: Ints  # (n, 2): row among the hits of `SubrayNeighbors`, and scratch memory
     subray_hits: Ints  # scratch memory (n * sub-rays per beam,)
     changes: Ints  # scratch memory (n + 1,)
 
@@ -101,7 +101,7 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 def _half_way(hit, neighbor, inverse_distance, neighbors):
     """Return the range in meters of the plane of a hit, half-way to a neighboring hit.
 
-    `hit` and `neighbor` are rows in `Neighbors`; `inverse_distance` belongs to `hit`, in 1/m.
+    `hit` and `neighbor` are rows in `SubrayNeighbors`; `inverse_distance` belongs to `hit`, in 1/m.
     """
     normals = neighbors.normals
     directions = neighbors.directions

@@ -39,10 +39,10 @@ class SaturationStep(PulseStep):
         pulse_ns = setup.reporting.length_ns(optics)
         if setup.in_waveforms:
             pulse_ns = FWHM * setup.reporting.system_ns(optics)
-        return saturated(returns, setup.noise.full, pulse_ns)
+        return apply_saturation(returns, setup.noise.full, pulse_ns)
 
 
-def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
+def apply_saturation(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
     """Clip returns (n,) at the height `full`, and merge returns that overlap clipped returns.
 
     A Gaussian pulse of height A, clipped at S, exceeds S / 2 for √(1 + log2(A / S)) of its full
@@ -58,7 +58,7 @@ def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseRetur
     unclipped = np.where(width > 0, width, pulse_ns)  # without a waveform, the width is 0
     widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
     early_m = _HALF_WIDTH_M_NS * (widened - unclipped) if in_waveforms else 0.0
-    pulses = saturation_loops.Pulses(
+    pulses = saturation_loops.PulseExtents(
         ray=owned(returns.ray, np.int64),
         clipped=height > full,
         height=owned(height),

@@ -11,7 +11,7 @@ from raybeam.compiled import compiled
 from ...base.arrays import Bools, Floats, Ints
 
 
-class Pulses(NamedTuple):
+class PulseExtents(NamedTuple):
     """Returns of pulses sorted by ray and distance, each array of shape (n,)."""
 
     ray: Ints
@@ -29,7 +29,7 @@ def join_clipped(pulses, remains):
 
     The highest of the merged returns remains, with the total energy of all merged returns, and with
     the outermost edges and the smallest distance of the clipped returns. These values are written
-    to `pulses`, a `Pulses`, and the marks to `remains` (n,).
+    to `pulses`, a `PulseExtents`, and the marks to `remains` (n,).
     """
     height = pulses.height
     front = pulses.front

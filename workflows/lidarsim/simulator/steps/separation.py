@@ -21,13 +21,13 @@ from ..returns import (
     PulseReturns,
     required,
     returns_without_surface,
-    selected,
+    select_rows,
 )
 from .detection import DETECTION, LOSS
 from .step import PulseBatch, PulseStep, Role, Setup
 
 if TYPE_CHECKING:
-    from .pulse_loops import Neighbors
+    from .pulse_loops import SubrayNeighbors
     from .random_loops import RandomKeys
     from .separation_loops import Receiver, ReturnArrays, SubrayHits
 
@@ -45,7 +45,7 @@ class Reporting(NamedTuple):
     first: int = 0  # number in `keys` of the beam to which sub-ray 0 of the hits belongs
 
 
-def separated(
+def separate_hits(
     hits: PulseReturns,
     gap_m: float,
     subrays: int = 1,
@@ -150,7 +150,7 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     row = output.row
     if len(hits.ray):
         columns = hits.triangle, hits.color, hits.cause
-        triangle, color, cause = selected(columns, np.maximum(row, 0))
+        triangle, color, cause = select_rows(columns, np.maximum(row, 0))
         returns = PulseReturns(output.beam, output.distance, triangle, output.energy, color, cause)
     else:
         returns = returns_without_surface(
@@ -184,19 +184,19 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
     )
 
 
-def neighbors_of(subrays: int, planes: Planes | None) -> Neighbors:
+def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
     """Return neighboring sub-rays and planes for compiled loops.
 
     Without planes, no surface continues from sub-ray to sub-ray.
     """
-    from .pulse_loops import Neighbors
+    from .pulse_loops import SubrayNeighbors
 
     if planes is None or subrays == 1:
         no_planes = np.zeros((3, 0))
-        return Neighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
+        return SubrayNeighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
     normals, directions = planes
     pairs = owned(neighbors(subrays), np.int64)
-    return Neighbors(subrays, pairs, owned(normals.T), owned(directions.T))
+    return SubrayNeighbors(subrays, pairs, owned(normals.T), owned(directions.T))
 
 
 class SeparationStep(PulseStep):
@@ -218,7 +218,7 @@ class SeparationStep(PulseStep):
         # If the receiver adds or merges returns, `SelectionStep` selects the reported returns.
         mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
         reporting = Reporting(mode, setup.noise, batch.keys, batch.start)
-        return separated(
+        return separate_hits(
             returns,
             setup.half_pulse_m,
             batch.subrays_per_beam,
@@ -241,10 +241,10 @@ class SelectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the reported returns of a batch."""
-        return returns.take(chosen(returns, self.setup.reporting.mode))
+        return returns.take(reported_mask(returns, self.setup.reporting.mode))
 
 
-def chosen(returns: PulseReturns, mode: Mode) -> Bools:
+def reported_mask(returns: PulseReturns, mode: Mode) -> Bools:
     """Return whether a mode reports each return."""
     from . import separation_loops
 

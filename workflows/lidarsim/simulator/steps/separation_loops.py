@@ -448,10 +448,10 @@ def mark_reported(ray, energy, mode, shown):
 
 @compiled()
 def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the returns of beams to `output`, for `separation.separated`.
+    """Write the returns of beams to `output`, for `separation.separate_hits`.
 
-    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a `Neighbors`,
-    `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a `RandomKeys`, which has
+    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
+    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a `RandomKeys`, which has
     starts if returns can be lost. Beams are numbered from 0 at sub-ray 0; beam 0 is beam
     `keys.first` of the scans in `keys`. Returns the number of returns.
     """

@@ -21,10 +21,16 @@ from ...columns.table import CAUSES
 from ...media.weather import FAINTEST, LARGE, reach, spray
 from ...scene.actors import check_spray
 from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import along_rings
+from ..casting.motion import order_along_rings
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
-from ..returns import RETURN_COLUMNS, PulseReturns, joined, required, returns_without_surface
+from ..returns import (
+    RETURN_COLUMNS,
+    PulseReturns,
+    concatenate_returns,
+    required,
+    returns_without_surface,
+)
 from .particles import (
     add_air_hits,
     exponential,
@@ -36,7 +42,7 @@ from .particles import (
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:
-    from .spray_loops import Crossings, SprayBoxes
+    from .spray_loops import BoxCrossings, SprayBoxes
 
 SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
 SPRAY_SUBRAY = Purpose(17, "sub-ray that hits a clump")
@@ -91,9 +97,9 @@ class SprayStep(PulseStep):
         )
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
-        return self.repointed(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -132,7 +138,7 @@ class SprayStep(PulseStep):
         return add_air_hits(self.setup, returns, batch, clumps)
 
     def _sample_clumps(
-        self, returns: PulseReturns, batch: PulseBatch, crossings: Crossings, reach_m: Floats
+        self, returns: PulseReturns, batch: PulseBatch, crossings: BoxCrossings, reach_m: Floats
     ) -> PulseReturns:
         """Return the hits on clumps in the boxes that beams cross, sorted by sub-ray."""
         from . import spray_loops
@@ -155,10 +161,10 @@ class SprayStep(PulseStep):
                 hits=hits,
             )
             clump_hits.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
-        clumps = joined(clump_hits)
+        clumps = concatenate_returns(clump_hits)
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
-    def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:
+    def _crossings(self, batch: PulseBatch, reach_m: Floats) -> BoxCrossings:
         """Return where the central rays of beams cross boxes.
 
         `reach_m` (beams,) is the range in meters at which each beam ends. The crossings of a beam
@@ -168,7 +174,9 @@ class SprayStep(PulseStep):
 
         assert self._clump_distribution is not None
         # Cells of consecutive rays are narrow if neighbors on a ring are consecutive.
-        ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
+        ring_order = order_along_rings(
+            np.arange(batch.stop - batch.start), self.setup.sensor.channels
+        )
         times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
         spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
         rays = np.concatenate(
@@ -179,14 +187,14 @@ class SprayStep(PulseStep):
             rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
         )
         order = np.argsort(cell, kind="stable")
-        pairs = spray_loops.CellPairs(cell[order], box[order], cell_rays)
+        pairs = spray_loops.BoxPairs(cell[order], box[order], cell_rays)
         room = 0
         count = 1 + cell_rays * len(cell) // 4
         while room < count:  # usually some rays of a cell meet a box
             room = count
-            crossings = spray_loops.Crossings(np.empty(room, np.int64), np.empty((3, room)))
+            crossings = spray_loops.BoxCrossings(np.empty(room, np.int64), np.empty((3, room)))
             count = spray_loops.find_crossings(rays, times, reach_m, pairs, spray_boxes, crossings)
-        return spray_loops.Crossings(
+        return spray_loops.BoxCrossings(
             ring_order[crossings.beam[:count]], owned(crossings.spans[:, :count])
         )
 

@@ -20,7 +20,7 @@ MAX_CLUMPS = 255  # largest number of clumps that a beam can meet, limited by it
 _GUIDE_PARTS = 1024  # number of parts of a lookup table for columns
 
 
-class CellPairs(NamedTuple):
+class BoxPairs(NamedTuple):
     """Pairs of a cell of consecutive rays and a box that may meet, sorted by cell."""
 
     cell: Ints  # (p,): number of the cell
@@ -40,8 +40,8 @@ class SprayBoxes(NamedTuple):
     decay_ns: float  # time until exp(-1) of the density is left
 
 
-class Crossings(NamedTuple):
-    """Crossings of beams and boxes. The crossings of a beam are consecutive."""
+class BoxCrossings(NamedTuple):
+    """BoxCrossings of beams and boxes. The crossings of a beam are consecutive."""
 
     beam: Ints  # (k,): number of the beam in the batch
     # (3, k): ranges in meters at which the beam enters and leaves the box, and the density of the
@@ -117,7 +117,7 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
     """Write where rays cross boxes, and return the number of crossings.
 
     `rays` (6, n) are origins and directions, `times` (n,) are in nanoseconds, and `reach` (n,) are
-    the lengths of the rays in meters. `pairs` is a `CellPairs`, and `spray_boxes` a `SprayBoxes`.
+    the lengths of the rays in meters. `pairs` is a `BoxPairs`, and `spray_boxes` a `SprayBoxes`.
     All crossings are counted, but only as many are written as `crossings` can hold.
     """
     boxes = spray_boxes.boxes

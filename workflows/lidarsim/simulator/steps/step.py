@@ -317,15 +317,15 @@ class PulseStep(ABC):
         self.caster = caster
         self.surfaces = surfaces
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
         """Return the step for a scene in which instances have moved.
 
         By default, a new step is created. A step that takes long to create and stores no surface
-        positions returns `repointed` instead.
+        positions returns `with_setup` instead.
         """
         return type(self)(setup, self.caster, surfaces)
 
-    def repointed(self, setup: Setup, surfaces: Surfaces) -> Self:
+    def with_setup(self, setup: Setup, surfaces: Surfaces) -> Self:
         """Return a copy of the step with a different setup and different surfaces."""
         step = copy(self)
         step.setup = setup

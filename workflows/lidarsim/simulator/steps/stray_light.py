@@ -18,7 +18,7 @@ from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces, sensor_light_of
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
+from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
 from .detection import passes
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
@@ -87,7 +87,7 @@ class StrayLightStep(PulseStep):
         stray = returns_without_surface(
             returns, rays[row], distance[visible], light.energy[row], BLOOMING
         )
-        return merged(returns, stray)
+        return merge_returns(returns, stray)
 
     def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
         """Return the strongest stray light for the central ray of each beam.

@@ -582,8 +582,8 @@ def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
 
     `hits` is a `WaveHits`, whose marks `starts`, `starts_surface` and `searched` are written.
     `sigma_m` is the standard deviation of the system waveform in meters of range, and `neighbors`
-    is a `pulse_loops.Neighbors`. `hit_ranges` (k, 2) receives the first hit, and one past the last
-    hit, of each waveform to search.
+    is a `pulse_loops.SubrayNeighbors`. `hit_ranges` (k, 2) receives the first hit, and one past
+    the last hit, of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
@@ -704,7 +704,7 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
 def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
-    `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.Neighbors`, and
+    `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.SubrayNeighbors`, and
     `output` a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in
     range. A return starts at each mark in `starts`, unless the hit continues a surface; these marks
     are cleared. Hits of a return form one Gaussian with their mean and variance. Returns the number

@@ -13,7 +13,7 @@ from ...base.random_numbers import Purpose, normal, raw
 from ...columns.waveforms import FAINTEST, ZERO, record
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
-from ..returns import Keys, PulseReturns, numbers, required
+from ..returns import Keys, PulseReturns, number_within_ray, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
@@ -74,7 +74,7 @@ class RecordingStep(PulseStep):
         for start in range(0, len(windows.beam), size):
             block = windows.take(slice(start, start + size))
             samples = _signal_samples(batch, digitizer, block, count)
-            steps, exponents = digitized(self._received(samples, block, batch))
+            steps, exponents = digitize(self._received(samples, block, batch))
             first, stop = np.searchsorted(window_of_return, [start, start + size])
             window_indices = window_of_return[first:stop] - start
             records["samples"][first:stop] = steps[window_indices]
@@ -118,7 +118,7 @@ def _windows(
     returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
 ) -> tuple[Windows, Ints]:
     """Return windows of `count` samples, and the row of each return's window."""
-    return_number = numbers(returns.ray)
+    return_number = number_within_ray(returns.ray)
     begin = _window_starts(returns.distance, return_number, digitizer, count)
     starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
     beam = returns.ray[starts_window] - batch.start
@@ -150,7 +150,7 @@ def _signal_samples(
     return samples.reshape(len(hit_counts), count).astype(np.float64)
 
 
-def digitized(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+def digitize(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
     """Round samples (n, k) to integers around `ZERO`, with a power-of-two step for each row.
 
     Returns the integers as uint16 (n, k), and the exponents of the steps (n,).
