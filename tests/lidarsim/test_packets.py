@@ -126,7 +126,7 @@ def test_firings_that_fill_no_packet_are_carried_over():
     carry = CarryOver(24)
     parts = [carry.whole_packets(part) for part in (shots[:10], shots[10:80], shots[80:])]
     assert [len(part) for part in parts] == [0, 72, 24]
-    joined = Shots.joined(parts)
+    joined = Shots.concatenate(parts)
     assert (joined.firings == np.arange(96)).all()
     assert np.array_equal(joined.range_m, shots.range_m[:, :96], equal_nan=True)
     assert carry.rest().firings.tolist() == [96, 97, 98, 99, 100] and carry.rest() is None
@@ -175,7 +175,7 @@ def test_results_without_all_rays_are_refused():
     thinned = vlp16_survey(keep_every=2)
     cloud, sweeps = points_of(thinned, room())
     with pytest.raises(LidarError, match=r"all rays and returns .* keep_every 1") as raised:
-        PacketSource.of_sensor(sweeps, 0)
+        PacketSource.for_sensor(sweeps, 0)
     assert one_line(raised)
     cloud, sweeps = points_of(vlp16_survey(columns=("ray", "range")), room())
     (points,) = sweeps.points(cloud)

@@ -15,7 +15,7 @@ from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Air, spray
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
-from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
+from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
 from lidarsim.simulator.steps.detection import detected
@@ -235,7 +235,7 @@ def test_energies_are_those_of_the_twin(extinction):
     corners = rng.normal(size=(2, 3, 3))
     materials = (Material("0", 0.3), RETRO)
     meshes = [quad(f"{k}", a, b, c, c + a - b) for k, (a, b, c) in enumerate(corners)]
-    surfaces = Surfaces(Scene.from_meshes(meshes), materials)
+    surfaces = SceneSurfaces(Scene.from_meshes(meshes), materials)
     light = SensorLight(905.0, extinction)
     wall = rng.integers(0, 2, 1000)
     distance = rng.uniform(0.5, 200, 1000)
@@ -267,7 +267,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
-    surfaces = Surfaces(scene, survey.materials)
+    surfaces = SceneSurfaces(scene, survey.materials)
     caster = WeatherStep(setup_of(scene, survey, 0), None, surfaces)
     # Sub-rays hit nothing, a wall, a pane, or a pane a meter before a wall.
     rng = np.random.default_rng(7)

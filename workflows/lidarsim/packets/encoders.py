@@ -69,7 +69,7 @@ class PacketSource:
         return settings_of(self.sensor)
 
     @classmethod
-    def of_sensor(cls, sweeps: Sweeps, number: int) -> PacketSource:
+    def for_sensor(cls, sweeps: Sweeps, number: int) -> PacketSource:
         """Return the packet source for sensor `number` of a survey.
 
         Raises LidarError if the survey does not keep every return, or if the sensor has no packet
@@ -107,7 +107,7 @@ class PacketEncoder(ABC):
     destination: ClassVar[str] = "255.255.255.255"
     default_ports: ClassVar[Mapping[str, int]] = {}  # {packet kind: port}, starting with returns
     # Whether receivers distinguish sensors on the same port by their addresses or serial numbers.
-    told_apart: ClassVar[bool] = False
+    distinguished_by_receivers: ClassVar[bool] = False
     # Whether the manufacturer's software ignores datagrams from the receiver's own address.
     has_own_address: ClassVar[bool] = False
 

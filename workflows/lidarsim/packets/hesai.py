@@ -16,7 +16,7 @@ from ..base.words import did_you_mean
 from ..sensor.beams import Mirror, Spin
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
-from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, Layout
+from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, HesaiPacketLayout
 from .hesai_ptc import PtcDevice, PtcService
 from .service import Destination
 from .shots import CarryOver, Shots, last_and_strongest
@@ -54,7 +54,7 @@ class HesaiEncoder(PacketEncoder):
         if source.mode not in layout.modes:
             modes = ", ".join(layout.modes)
             raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
-        self._lasers = LaserTable.of_sensor(source.sensor, layout)
+        self._lasers = LaserTable.from_sensor(source.sensor, layout)
         self._planes = 2 if source.mode == "dual" else 1
         self._firings = layout.blocks // self._planes
         self._port = self.port("data", DATA_PORT)
@@ -109,7 +109,7 @@ class HesaiEncoder(PacketEncoder):
         """Rotation rate in revolutions per minute."""
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
-    def _layout_of_model(self) -> Layout:
+    def _layout_of_model(self) -> HesaiPacketLayout:
         """Return the packet layout of the model, or raise LidarError if the model is unknown."""
         model = self.text("model")
         if model not in LAYOUTS:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..sensor import Sensor
-from .hesai_layouts import Layout
+from .hesai_layouts import HesaiPacketLayout
 
 _NEAR_M = "2.85"  # range below which a Pandar128 fires differently, as in the original file
 
@@ -19,13 +19,13 @@ _NEAR_M = "2.85"  # range below which a Pandar128 fires differently, as in the o
 class LaserTable(NamedTuple):
     """Lasers in the manufacturer's order."""
 
-    layout: Layout
+    layout: HesaiPacketLayout
     elevation_deg: Floats  # (c,)
     azimuth_deg: Floats  # (c,): clockwise relative to the head
     time_us: Floats  # (c,): time after the reference of the block
 
     @classmethod
-    def of_sensor(cls, sensor: Sensor, layout: Layout) -> LaserTable:
+    def from_sensor(cls, sensor: Sensor, layout: HesaiPacketLayout) -> LaserTable:
         """Return the laser table of a sensor."""
         channels = sensor.packets.channels  # type: ignore[union-attr]
         beams = sensor.beams

@@ -30,7 +30,7 @@ _SEQUENCE = ("sequence", "<u4")
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class HesaiPacketLayout:
     """Packet layout of a model.
 
     The reference of a block is the time at which the block's azimuth is the azimuth of the head.
@@ -164,7 +164,7 @@ STANDARD_STATE = 2  # operational state in which all lasers fire in each block
 _FLAGS_128 = _SEQUENCE_FLAG | _IMU_FLAG | _SAFETY_FLAG
 
 LAYOUTS = {
-    "PandarXT-32": Layout(
+    "PandarXT-32": HesaiPacketLayout(
         channels=32,
         blocks=8,
         firing_us=50.0,
@@ -186,7 +186,7 @@ LAYOUTS = {
         dual_header=_DUAL_NUMBERED,
         return_byte=0xFF,
     ),
-    "Pandar40P": Layout(
+    "Pandar40P": HesaiPacketLayout(
         channels=40,
         blocks=10,
         firing_us=500 / 9,
@@ -199,7 +199,7 @@ LAYOUTS = {
         block_start=0xEEFF,
         has_epoch_seconds=False,
     ),
-    "Pandar64": Layout(
+    "Pandar64": HesaiPacketLayout(
         channels=64,
         blocks=6,
         firing_us=500 / 9,
@@ -212,7 +212,7 @@ LAYOUTS = {
         header=(*_SOP, 64, 6, 0, UNIT_MM, 0, 0),
         has_epoch_seconds=False,
     ),
-    "PandarQT": Layout(
+    "PandarQT": HesaiPacketLayout(
         channels=64,
         blocks=4,
         firing_us=500 / 3,
@@ -226,7 +226,7 @@ LAYOUTS = {
         header=_numbered((3, 1), 0, 64, 4, _SEQUENCE_FLAG),
         stamps_first_block=True,
     ),
-    "Pandar128": Layout(
+    "Pandar128": HesaiPacketLayout(
         channels=128,
         blocks=2,
         firing_us=500 / 9,
@@ -242,7 +242,7 @@ LAYOUTS = {
         listed_states=(0, 0, 0, 0, 2, 2, 3, 3),
         lists_distances=True,
     ),
-    "OT128": Layout(
+    "OT128": HesaiPacketLayout(
         channels=128,
         blocks=2,
         firing_us=500 / 9,

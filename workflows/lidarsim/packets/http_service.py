@@ -69,7 +69,7 @@ class Answer:
         return head.encode() + body
 
 
-class RefusedError(Exception):
+class RequestRefusedError(Exception):
     """A request that is answered with an error status, and the reason sent to the client."""
 
     def __init__(self, reason: str, status: int = HTTPStatus.BAD_REQUEST) -> None:
@@ -89,7 +89,7 @@ class HttpService(TcpService):
     def answer(self, request: Request) -> Answer:
         """Return the response to a request.
 
-        Raises RefusedError if the request is not understood.
+        Raises RequestRefusedError if the request is not understood.
         """
 
     def changes_state(self, method: str, path: str) -> bool:
@@ -129,7 +129,7 @@ class HttpService(TcpService):
             try:
                 head = await reader.readuntil(b"\r\n\r\n")
             except asyncio.LimitOverrunError as error:
-                raise RefusedError(
+                raise RequestRefusedError(
                     "the headers are too long", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
                 ) from error
             method, url, headers = _parsed(head)
@@ -142,11 +142,11 @@ class HttpService(TcpService):
             peer = writer.get_extra_info("peername")[0]
             answer = self.answer(Request(method, path, url.query, body, peer))
             return Answer(status=answer.status) if method == "HEAD" else answer
-        except RefusedError as error:
+        except RequestRefusedError as error:
             return error.answer
 
     def _refuse_other_sites(self, method: str, url: SplitResult, headers: Headers) -> None:
-        """Raise RefusedError if a request comes from another website."""
+        """Raise RequestRefusedError if a request comes from another website."""
         reason = refusal(
             headers,
             self.names,
@@ -154,21 +154,21 @@ class HttpService(TcpService):
             changes_state=self.changes_state(method, url.path),
         )
         if reason:
-            raise RefusedError(reason, HTTPStatus.FORBIDDEN)
+            raise RequestRefusedError(reason, HTTPStatus.FORBIDDEN)
 
 
 def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
     """Return the method, URL and headers of a request.
 
-    The URL may be in absolute form, as sent to a proxy. Raises RefusedError if the bytes are not a
-    valid request.
+    The URL may be in absolute form, as sent to a proxy. Raises RequestRefusedError if the bytes
+    are not a valid request.
     """
     line, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
     words = line.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):
-        raise RefusedError("this is not an HTTP/1.1 request")
+        raise RequestRefusedError("this is not an HTTP/1.1 request")
     if words[0] not in _METHODS:
-        raise RefusedError(
+        raise RequestRefusedError(
             f"the method must be {' or '.join(_METHODS)}", HTTPStatus.METHOD_NOT_ALLOWED
         )
     headers: dict[str, str] = {}
@@ -176,48 +176,48 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
         name, separator, value = entry.partition(":")
         name = name.strip().lower()
         if not separator or not name:
-            raise RefusedError("a header has no colon")
+            raise RequestRefusedError("a header has no colon")
         headers[name] = f"{headers[name]},{value.strip()}" if name in headers else value.strip()
     try:
         return words[0], urlsplit(words[1]), headers
     except ValueError as error:
-        raise RefusedError("the URL is invalid") from error
+        raise RequestRefusedError("the URL is invalid") from error
 
 
 def _body_size(headers: Headers) -> int:
     """Return the body size that the headers announce.
 
-    Raises RefusedError if the size is missing, invalid or too large.
+    Raises RequestRefusedError if the size is missing, invalid or too large.
     """
     if "transfer-encoding" in headers:
-        raise RefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
+        raise RequestRefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
     size = headers.get("content-length", "0")
     if not (size.isascii() and size.isdecimal()):
-        raise RefusedError("Content-Length must be a number")
+        raise RequestRefusedError("Content-Length must be a number")
     if len(size) > 9 or int(size) > _MAX_BODY_BYTES:
-        raise RefusedError("the body is too large", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        raise RequestRefusedError("the body is too large", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
     return int(size)
 
 
 def receiver_of(name: str, value: Any) -> str:
     """Return a parameter value that must be the IPv4 address of a single receiver.
 
-    Raises RefusedError for other values. `name` is the name of the parameter.
+    Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """
     try:
         address = IPv4Address(str(value))
     except AddressValueError as error:
-        raise RefusedError(f"{name} is not an IPv4 address") from error
+        raise RequestRefusedError(f"{name} is not an IPv4 address") from error
     if not is_single_receiver(address):
-        raise RefusedError(f"{name} is not the address of a single receiver")
+        raise RequestRefusedError(f"{name} is not the address of a single receiver")
     return str(address)
 
 
 def receiver_port(name: str, value: Any) -> int:
     """Return a parameter value that must be a port, or 0 for packets that are not sent.
 
-    Raises RefusedError for other values. `name` is the name of the parameter.
+    Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 16:
-        raise RefusedError(f"{name} is not a port")
+        raise RequestRefusedError(f"{name} is not a port")
     return value

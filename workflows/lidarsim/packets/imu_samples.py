@@ -21,7 +21,7 @@ class ImuBatch(NamedTuple):
     forces: Floats  # (n, 3): specific forces, m/s²
 
 
-class ImuSamples:
+class PacketImuSamples:
     """IMU samples of the platform in chronological order; there are none without an IMU."""
 
     def __init__(self, source: PacketSource) -> None:

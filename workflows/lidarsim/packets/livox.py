@@ -17,7 +17,7 @@ from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
 from ..base.vectors import applied, inverse, matmul
 from ..motion.rotations import matrices
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
-from .imu_samples import ImuBatch, ImuSamples
+from .imu_samples import ImuBatch, PacketImuSamples
 from .service import Destination, Service
 from .shots import CarryOver, Shots
 
@@ -126,7 +126,7 @@ class LivoxEncoder(PacketEncoder):
     optional_identifiers = ("data_type",)
     address = "192.168.1.100"
     destination = "192.168.1.5"
-    told_apart = True
+    distinguished_by_receivers = True
     has_own_address = True
 
     def __init__(self, source: PacketSource) -> None:
@@ -153,7 +153,7 @@ class LivoxEncoder(PacketEncoder):
         self._carry = CarryOver(self._firings)
         self._frame = 0
         self._packets_of_frame = 0
-        self._samples = ImuSamples(source)
+        self._samples = PacketImuSamples(source)
         self._to_sensor = _imu_axes(source)
 
     def encode(self, shots: Shots) -> list[Datagrams]:

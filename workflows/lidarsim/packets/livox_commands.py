@@ -82,7 +82,7 @@ class Key(IntEnum):
     HEALTH_CODES = 0x8011
 
 
-class Frame(NamedTuple):
+class CommandFrame(NamedTuple):
     """A parsed request."""
 
     command: int
@@ -91,14 +91,14 @@ class Frame(NamedTuple):
 
 
 @dataclass
-class RefusedError(Exception):
+class CommandRefusedError(Exception):
     """A request that is answered with an error code, and the key of the invalid parameter."""
 
     code: Code
     key: int = 0
 
 
-def parse_request(content: bytes) -> Frame | None:
+def parse_request(content: bytes) -> CommandFrame | None:
     """Return the request in a datagram, or None if the frame or its checksums are invalid."""
     if len(content) < _HEAD_BYTES:
         return None
@@ -110,7 +110,7 @@ def parse_request(content: bytes) -> Frame | None:
         return None
     if head_checksum != crc_hqx(content[: _HEAD.size], 0xFFFF) or data_checksum != _checksum(data):
         return None
-    return Frame(command, number, data)
+    return CommandFrame(command, number, data)
 
 
 def answer_frame(command: int, number: int, data: bytes) -> bytes:
@@ -135,7 +135,7 @@ def _checksum(data: bytes) -> int:
 
 
 def parse_values(data: bytes) -> dict[int, bytes]:
-    """Return the parameters in a set request, or raise RefusedError if they are truncated.
+    """Return the parameters in a set request, or raise CommandRefusedError if they are truncated.
 
     The result maps keys to values.
     """
@@ -143,26 +143,26 @@ def parse_values(data: bytes) -> dict[int, bytes]:
     offset = _COUNT.size
     for _ in range(_key_count(data)):
         if offset + _ENTRY.size > len(data):
-            raise RefusedError(Code.WRONG_KEY_NUMBER)
+            raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
         key, length = _ENTRY.unpack_from(data, offset)
         offset += _ENTRY.size + length
         if offset > len(data):
-            raise RefusedError(Code.INVALID_LENGTH, key)
+            raise CommandRefusedError(Code.INVALID_LENGTH, key)
         values[key] = data[offset - length : offset]
     return values
 
 
 def parse_keys(data: bytes) -> Sequence[int]:
-    """Return the keys in a get request, or raise RefusedError if they are truncated."""
+    """Return the keys in a get request, or raise CommandRefusedError if they are truncated."""
     count = _key_count(data)
     if _COUNT.size + count * _KEY.size > len(data):
-        raise RefusedError(Code.WRONG_KEY_NUMBER)
+        raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
     return [_KEY.unpack_from(data, _COUNT.size + n * _KEY.size)[0] for n in range(count)]
 
 
 def _key_count(data: bytes) -> int:
     if len(data) < _COUNT.size:
-        raise RefusedError(Code.WRONG_KEY_NUMBER)
+        raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
     count: int = _COUNT.unpack_from(data)[0]
     return count
 

@@ -25,9 +25,9 @@ from .livox_commands import (
     MAX_FRAME_BYTES,
     Code,
     Command,
-    Frame,
+    CommandFrame,
+    CommandRefusedError,
     Key,
-    RefusedError,
     answer_frame,
     packed_count,
     packed_values,
@@ -214,7 +214,7 @@ class LivoxService(Service):
 
     # -- answers ---------------------------------------------------------------------------------
 
-    def answer(self, request: Frame) -> bytes:
+    def answer(self, request: CommandFrame) -> bytes:
         """Return the data of the response to a request."""
         if request.command == Command.SEARCH:
             return self._search_answer()
@@ -238,7 +238,7 @@ class LivoxService(Service):
         """Return the parameters that a get request asks for, skipping unknown parameters."""
         try:
             keys = parse_keys(data)
-        except RefusedError as error:
+        except CommandRefusedError as error:
             return _GET_ANSWER.pack(error.code, 0)
         parameters = self._all_values()
         values = {key: parameters[key] for key in keys if key in parameters}
@@ -250,7 +250,7 @@ class LivoxService(Service):
             values = parse_values(data)
             for key, value in values.items():
                 self._check(key, value)
-        except RefusedError as error:
+        except CommandRefusedError as error:
             return _SET_ANSWER.pack(error.code, error.key)
         self._values |= values
         if Key.DATA_TYPE in values:
@@ -260,17 +260,17 @@ class LivoxService(Service):
         return _SET_ANSWER.pack(Code.SUCCESS, 0)
 
     def _check(self, key: int, value: bytes) -> None:
-        """Raise RefusedError if a parameter cannot be set to the given value."""
+        """Raise CommandRefusedError if a parameter cannot be set to the given value."""
         if key not in _LENGTHS:
             is_known = key in self._all_values()
-            raise RefusedError(Code.READ_ONLY if is_known else Code.NOT_SUPPORTED, key)
+            raise CommandRefusedError(Code.READ_ONLY if is_known else Code.NOT_SUPPORTED, key)
         if len(value) != _LENGTHS[key]:
-            raise RefusedError(Code.INVALID_LENGTH, key)
+            raise CommandRefusedError(Code.INVALID_LENGTH, key)
         if key in (Key.STATE_HOST, Key.POINTS_HOST, Key.IMU_HOST):
             _check_host(key, value)
         allowed = {Key.DATA_TYPE: self._state.data_types, Key.WORK_MODE: _WORK_MODES}
         if key in allowed and value[0] not in allowed[Key(key)]:
-            raise RefusedError(Code.OUT_OF_RANGE, key)
+            raise CommandRefusedError(Code.OUT_OF_RANGE, key)
 
     def _redirect(self) -> None:
         """Send the datagrams to the host that the parameters specify for points."""
@@ -329,10 +329,10 @@ class LivoxService(Service):
 
 
 def _check_host(key: int, value: bytes) -> None:
-    """Raise RefusedError unless a value is the address of a single receiver."""
+    """Raise CommandRefusedError unless a value is the address of a single receiver."""
     try:
         address = IPv4Address(value[:4])
     except AddressValueError as error:
-        raise RefusedError(Code.OUT_OF_RANGE, key) from error
+        raise CommandRefusedError(Code.OUT_OF_RANGE, key) from error
     if not is_single_receiver(address):
-        raise RefusedError(Code.OUT_OF_RANGE, key)
+        raise CommandRefusedError(Code.OUT_OF_RANGE, key)

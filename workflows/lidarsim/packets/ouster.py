@@ -32,7 +32,7 @@ from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from .capture import ENDINGS, Capture
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
-from .imu_samples import ImuBatch, ImuSamples
+from .imu_samples import ImuBatch, PacketImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
 from .pcap import write_datagrams
 from .service import Destination, Service
@@ -264,7 +264,7 @@ class OusterEncoder(PacketEncoder):
     address = "192.168.1.200"
     destination = "192.168.1.100"
     default_ports: ClassVar[Mapping[str, int]] = {"lidar": LIDAR_PORT, "imu": IMU_PORT}
-    told_apart = True
+    distinguished_by_receivers = True
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -280,7 +280,7 @@ class OusterEncoder(PacketEncoder):
         self._rest: Shots | None = None  # shots that do not fill a packet yet
         self._next_firing = 0
         self._frame_offset = 0  # number of a frame minus the number of its revolution
-        self._samples = ImuSamples(source)
+        self._samples = PacketImuSamples(source)
 
     def _profile_of_mode(self) -> Profile:
         """Return the profile that the identifiers or the return mode select.
@@ -339,7 +339,7 @@ class OusterEncoder(PacketEncoder):
             next_frame = -(-self._next_firing // self._columns) + self._frame_offset
             self._frame_offset = next_frame - first // self._columns
         self._next_firing = int(shots.firings[-1]) + 1
-        joined = shots if self._rest is None else Shots.joined([self._rest, shots])
+        joined = shots if self._rest is None else Shots.concatenate([self._rest, shots])
         count = self._next_firing // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
         count = max(count - int(joined.firings[0]), 0)
         self._rest = joined[count:] if count < len(joined) else None

@@ -14,7 +14,14 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs
 
-from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
+from .http_service import (
+    Answer,
+    HttpService,
+    Request,
+    RequestRefusedError,
+    receiver_of,
+    receiver_port,
+)
 from .service import Destination
 
 _ROOT = "/api/v1/"
@@ -62,11 +69,11 @@ class OusterApi(HttpService):
     def answer(self, request: Request) -> Answer:
         """Return the response to a request.
 
-        Raises RefusedError if the sensor does not provide the requested resource.
+        Raises RequestRefusedError if the sensor does not provide the requested resource.
         """
         path = request.path.rstrip("/")
         if not path.startswith(_ROOT):
-            raise RefusedError("the interface is at /api/v1", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError("the interface is at /api/v1", HTTPStatus.NOT_FOUND)
         resource = path.removeprefix(_ROOT)
         if resource == "sensor/config":
             return self._config(request)
@@ -75,7 +82,9 @@ class OusterApi(HttpService):
         if resource.startswith("sensor/cmd/"):
             return self._command(resource.removeprefix("sensor/cmd/"), request)
         if request.method not in ("GET", "HEAD"):
-            raise RefusedError(f"{resource} cannot be changed", HTTPStatus.METHOD_NOT_ALLOWED)
+            raise RequestRefusedError(
+                f"{resource} cannot be changed", HTTPStatus.METHOD_NOT_ALLOWED
+            )
         return Answer(self._document(resource))
 
     def changes_state(self, method: str, path: str) -> bool:
@@ -111,7 +120,7 @@ class OusterApi(HttpService):
             "sensor/alerts": {"active": [], "log": []},
         }
         if resource not in documents:
-            raise RefusedError(f"there is no {resource}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no {resource}", HTTPStatus.NOT_FOUND)
         return documents[resource]
 
     def _user(self, request: Request) -> Answer:
@@ -119,7 +128,7 @@ class OusterApi(HttpService):
         if request.method == "PUT":
             text = _json(request.body)
             if not isinstance(text, str):
-                raise RefusedError("user data must be text")
+                raise RequestRefusedError("user data must be text")
             self._user_data = text
             return Answer(status=HTTPStatus.NO_CONTENT)
         if request.method == "DELETE":
@@ -135,7 +144,9 @@ class OusterApi(HttpService):
         if request.method in ("GET", "HEAD"):
             return Answer(self._staged if options.get("staging") == "true" else self._active)
         if request.method == "DELETE":
-            raise RefusedError("the configuration cannot be deleted", HTTPStatus.METHOD_NOT_ALLOWED)
+            raise RequestRefusedError(
+                "the configuration cannot be deleted", HTTPStatus.METHOD_NOT_ALLOWED
+            )
         self._stage(_json(request.body) if request.body else {}, request.peer)
         if options.get("reinit", "true") == "true":
             self._apply()
@@ -146,7 +157,7 @@ class OusterApi(HttpService):
         arguments = parse_qs(request.query).get("args", [""])[-1]
         if command == "get_config_param":
             if arguments not in ("active", "staged"):
-                raise RefusedError("args must be active or staged")
+                raise RequestRefusedError("args must be active or staged")
             return Answer(self._active if arguments == "active" else self._staged)
         if command == "set_config_param":
             name, _, value = arguments.partition(" ")  # parse_qs decodes + as a space
@@ -158,16 +169,16 @@ class OusterApi(HttpService):
         elif command == "reinitialize":
             self._apply()
         elif command != "save_config_params":
-            raise RefusedError(f"there is no command {command}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no command {command}", HTTPStatus.NOT_FOUND)
         return Answer({})
 
     def _stage(self, values: Any, peer: str) -> None:
         """Change the staged configuration.
 
-        Raises RefusedError if a parameter cannot be set.
+        Raises RequestRefusedError if a parameter cannot be set.
         """
         if not isinstance(values, dict):
-            raise RefusedError("the body must be a JSON object of parameters")
+            raise RequestRefusedError("the body must be a JSON object of parameters")
         staged = dict(self._staged)
         for name, value in values.items():
             if name == "udp_dest":
@@ -177,9 +188,9 @@ class OusterApi(HttpService):
             elif name == "operating_mode" and value in _MODES:
                 staged[name] = value
             elif name not in staged:
-                raise RefusedError(f"there is no parameter {name}")
+                raise RequestRefusedError(f"there is no parameter {name}")
             elif value != staged[name]:
-                raise RefusedError(
+                raise RequestRefusedError(
                     f"{name} is {staged[name]} in this simulated sensor. Set it in the scenario"
                 )
         self._staged = staged
@@ -196,11 +207,11 @@ class OusterApi(HttpService):
 
 
 def _json(body: bytes) -> Any:
-    """Parse JSON, or raise RefusedError if it is invalid."""
+    """Parse JSON, or raise RequestRefusedError if it is invalid."""
     try:
         return json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise RefusedError("the body is not valid JSON") from error
+        raise RequestRefusedError("the body is not valid JSON") from error
 
 
 def _loose(value: str) -> Any:

@@ -89,7 +89,7 @@ def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.vo
 
 
 @dataclass(frozen=True)
-class Model:
+class RobosenseModel:
     """Packet layout of a model, and the values that readers assume."""
 
     lasers: int
@@ -103,7 +103,7 @@ class Model:
 
 # Keys are names of LidarType in rs_driver. Positions are in bytes.
 MODELS = {
-    "RS16": Model(
+    "RS16": RobosenseModel(
         lasers=16,
         unit_m=0.005,
         type_code=1,
@@ -115,7 +115,7 @@ MODELS = {
             "elevations": (1165, ("u1", (16, 3))),  # unsigned, in 0.0001 degrees
         }),
     ),
-    "RSHELIOS": Model(
+    "RSHELIOS": RobosenseModel(
         lasers=32,
         unit_m=0.0025,
         type_code=6,

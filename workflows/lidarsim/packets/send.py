@@ -249,7 +249,7 @@ def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
 
 
 @dataclass(frozen=True)
-class Address:
+class ReceiverAddress:
     """An IPv4 address that a user specifies as HOST or HOST:PORT."""
 
     host: str  # numeric address
@@ -257,7 +257,7 @@ class Address:
     name: str = field(default="", compare=False)  # host name as specified, if it is not numeric
 
     @classmethod
-    def parse(cls, text: str) -> Address:
+    def parse(cls, text: str) -> ReceiverAddress:
         """Parse the IPv4 address of a single receiver.
 
         Raises LidarError if the text is not such an address.
@@ -319,7 +319,7 @@ def _resolved(host: str, text: str) -> IPv4Address:
     return IPv4Address(entries[0][4][0])
 
 
-def check_reachable(address: Address) -> None:
+def check_reachable(address: ReceiverAddress) -> None:
     """Raise LidarError if no datagrams can be sent to an address, for example without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

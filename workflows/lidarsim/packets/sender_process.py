@@ -91,7 +91,7 @@ def _open_socket(source: str, port: int) -> socket.socket:
     return opened
 
 
-class Outbox:
+class SendQueue:
     """Datagrams that wait for their due times, and statistics of those that were sent."""
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class Outbox:
         self._failures: dict[str, int] = {}  # {error: number of datagrams that were not sent}
         self._rest = b""  # beginning of a record that has not completely arrived
 
-    def take(self, content: bytes) -> None:
+    def parse_records(self, content: bytes) -> None:
         """Parse the records in further bytes from stdin."""
         content = self._rest + content
         start = 0
@@ -191,20 +191,20 @@ def raise_priority() -> None:
             os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
 
 
-def serve(outbox: Outbox) -> None:
+def serve(queue: SendQueue) -> None:
     """Send datagrams at their due times until all are sent after END."""
-    while not outbox.ended or outbox.waiting:
-        next_ns = outbox.next_ns()
+    while not queue.ended or queue.waiting:
+        next_ns = queue.next_ns()
         wait_s = None if next_ns is None else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
-        is_full = outbox.ended or outbox.waiting_bytes > _MAX_WAITING_BYTES
+        is_full = queue.ended or queue.waiting_bytes > _MAX_WAITING_BYTES
         readable, _, _ = select.select([] if is_full else [0], [], [], wait_s)
         if next_ns is not None and time.monotonic_ns() >= next_ns:
-            outbox.send_next()
+            queue.send_next()
         elif readable:
             content = os.read(0, _READ_BYTES)
             if not content:
                 sys.exit(1)
-            outbox.take(content)
+            queue.parse_records(content)
 
 
 def main() -> None:
@@ -216,11 +216,11 @@ def main() -> None:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     raise_priority()
-    outbox = Outbox()
+    queue = SendQueue()
     report({"ready": True})
     with suppress(Stop):
-        serve(outbox)
-    report(outbox.summary())
+        serve(queue)
+    report(queue.summary())
 
 
 if __name__ == "__main__":

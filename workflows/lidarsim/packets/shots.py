@@ -47,7 +47,7 @@ class Shots:
         return ~np.isnan(self.range_m)
 
     @classmethod
-    def joined(cls, tables: list[Shots]) -> Shots:
+    def concatenate(cls, tables: list[Shots]) -> Shots:
         """Concatenate one or more parts, which must have the same columns."""
         if len(tables) == 1:
             return tables[0]
@@ -119,7 +119,7 @@ class Shots:
             columns={name: in_laser_order(points[name], 0) for name in names},
         )
 
-    def later(self, shift_ns: int) -> Shots:
+    def shifted(self, shift_ns: int) -> Shots:
         """Return the shots with all times shifted, as in a survey that is repeated."""
         if not shift_ns:
             return self
@@ -193,7 +193,7 @@ class CarryOver:
         """
         if len(shots) and shots.firings[0] == 0:
             self._rest = None
-        joined = shots if self._rest is None else Shots.joined([self._rest, shots])
+        joined = shots if self._rest is None else Shots.concatenate([self._rest, shots])
         count = len(joined) // self.firings_per_packet * self.firings_per_packet
         self._rest = joined[count:]
         return joined[:count]

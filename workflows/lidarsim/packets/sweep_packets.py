@@ -82,7 +82,7 @@ class Packets:
         self._prepare(survey)
 
     @classmethod
-    def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
+    def for_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
         """Create an encoder for the sensor of a scanner.
 
         `start` has the same meaning as in `Packets`.

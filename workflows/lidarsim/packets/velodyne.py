@@ -82,7 +82,7 @@ class VelodyneEncoder(PacketEncoder):
         data = self._data(whole)
         last = slice(self._firings - 1, None, self._firings)
         stamps_ns = whole.stamps_ns[last] + self.firing_interval_ns
-        positions = self._positions.beside(data.due_ns, stamps_ns)
+        positions = self._positions.following(data.due_ns, stamps_ns)
         dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
         return [data.without(np.asarray(dropped)), positions]
 

@@ -14,7 +14,14 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from ..base.ports import port_number
-from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
+from .http_service import (
+    Answer,
+    HttpService,
+    Request,
+    RequestRefusedError,
+    receiver_of,
+    receiver_port,
+)
 from .service import Destination
 
 _PORTS = ("dport", "tport")  # ports of data and position packets
@@ -65,7 +72,7 @@ class VelodyneApi(HttpService):
     def answer(self, request: Request) -> Answer:
         """Return the response to a request.
 
-        Raises RefusedError if the sensor does not provide the requested resource.
+        Raises RequestRefusedError if the sensor does not provide the requested resource.
         """
         documents: dict[str, Callable[[], Mapping[str, Any]]] = {
             "/cgi/info.json": self._info,
@@ -76,14 +83,14 @@ class VelodyneApi(HttpService):
         if request.method in ("GET", "HEAD") and request.path in documents:
             return Answer(documents[request.path]())
         if request.method != "POST" or not request.path.startswith("/cgi/"):
-            raise RefusedError(f"there is no {request.path}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no {request.path}", HTTPStatus.NOT_FOUND)
         values = dict(parse_qsl(request.body.decode("latin-1"), keep_blank_values=True))
         if request.path == "/cgi/setting/host":
             self._set_receiver(values)
         elif request.path == "/cgi/setting":
             self._set(values)
         elif request.path != "/cgi/save":
-            raise RefusedError(f"{request.path} cannot be set", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"{request.path} cannot be set", HTTPStatus.NOT_FOUND)
         return Answer(status=HTTPStatus.NO_CONTENT)
 
     def _info(self) -> Mapping[str, Any]:
@@ -122,7 +129,7 @@ class VelodyneApi(HttpService):
             elif name in ports:
                 ports[name] = receiver_port(name, port_number(value))
             else:
-                raise RefusedError(f"the host has no {name}")
+                raise RequestRefusedError(f"the host has no {name}")
         self._host = host
         self._host_ports = ports
         self._apply()
@@ -130,7 +137,7 @@ class VelodyneApi(HttpService):
     def _set(self, values: Mapping[str, str]) -> None:
         """Switch the laser on or off.
 
-        Raises RefusedError if another setting would change.
+        Raises RequestRefusedError if another setting would change.
         """
         current = {"returns": self._state.return_mode, "rpm": str(self._state.rpm)}
         laser = self._laser
@@ -138,9 +145,9 @@ class VelodyneApi(HttpService):
             if name == "laser" and value.title() in ("On", "Off"):
                 laser = value.title()
             elif name not in current:
-                raise RefusedError(f"there is no setting {name}")
+                raise RequestRefusedError(f"there is no setting {name}")
             elif value != current[name]:
-                raise RefusedError(
+                raise RequestRefusedError(
                     f"{name} is {current[name]} in this simulated sensor. Set it in the scenario"
                 )
         if laser != self._laser:

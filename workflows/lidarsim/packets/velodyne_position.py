@@ -54,10 +54,10 @@ class PositionPackets:
         self._source = source
         self._port = port
         self._count = 0  # number of data packets so far
-        self._fixes = _Fixes.of_source(source)
+        self._fixes = _Fixes.from_source(source)
         self._sentences: dict[int, bytes] = {}  # {second since 1970: sentence}
 
-    def beside(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
+    def following(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
         """Return the position packets that follow data packets sent at `due_ns` (n,).
 
         `stamps_ns` (n,) are the same times on the sensor's clock.
@@ -91,7 +91,7 @@ class _Fixes(NamedTuple):
     longitudes_deg: Floats  # (n,)
 
     @classmethod
-    def of_source(cls, source: PacketSource) -> _Fixes | None:
+    def from_source(cls, source: PacketSource) -> _Fixes | None:
         """Return the fixes of the platform, or None if it has none with latitudes."""
         instruments = source.instruments
         rows = [] if instruments is None else list(instruments.rows(GNSS_FILE))

@@ -9,7 +9,7 @@ import numpy as np
 from ..base.arrays import Floats
 
 
-def rows_of(text: str, skip: int, columns: int) -> Floats:
+def parse_rows(text: str, skip: int, columns: int) -> Floats:
     """Return the numbers in the lines after a header, with shape (n, columns).
 
     `skip` is the number of header lines.

@@ -28,7 +28,7 @@ class Light(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FiredRays:
+class RayList:
     """Rays of a sensor, in the sensor frame with x forward, y left and z up.
 
     Attributes
@@ -92,7 +92,7 @@ class FiredRays:
         """Origins of the rays (n, 3) in meters, which are zero if all start at the center."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
-    def timed(self) -> FiredRays:
+    def with_times(self) -> RayList:
         """Return the rays with times, which are spread evenly over a frame if they are unknown."""
         if self.times_ns is not None:
             return self

@@ -16,7 +16,7 @@ from ..base.extras import need
 from ..base.words import did_you_mean
 
 if TYPE_CHECKING:
-    from .fired_rays import FiredRays
+    from .fired_rays import RayList
 
 # Properties besides directions that a format can store. {name: phrase for a missing property}
 PROPERTIES = {
@@ -46,7 +46,7 @@ class SensorFormat:
         Dotted name of the module that implements the format. Its function
         `write(path, rays, left_out)` writes rays and returns phrases for everything that the file
         does not store, starting with `left_out`, which come from `PROPERTIES`. Its function
-        `read(path)` returns `FiredRays`, or None if the file has another format. If `describes` is
+        `read(path)` returns `RayList`, or None if the file has another format. If `describes` is
         set, the function is `write(path, sensor, duration_s, left_out)` instead, for a pattern that
         lasts `duration_s` seconds.
     words
@@ -207,7 +207,7 @@ def _choices(ending: str) -> str:
     )
 
 
-def read_rays(path: Path) -> FiredRays | None:
+def read_rays(path: Path) -> RayList | None:
     """Return the rays in a file, or None if no format that can be read has its extension.
 
     Raises
@@ -221,7 +221,7 @@ def read_rays(path: Path) -> FiredRays | None:
     """
     rows = [row for row in FORMATS if row.reads and path.suffix.lower() in row.endings]
     for row in rows:
-        rays: FiredRays | None = row.function("read")(path)
+        rays: RayList | None = row.function("read")(path)
         if rays is not None:
             return rays
     return None

@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 
 from ..base.textfile import read_text
-from .comma_rows import rows_of
-from .complete_files import write_text_of
-from .fired_rays import FiredRays, directions_of
+from .comma_rows import parse_rows
+from .complete_files import write_complete_text
+from .fired_rays import RayList, directions_of
 
 HEADER = "Time/s,Azimuth/deg,Zenith/deg"
 _DECIMALS = 9
 _SECOND_NS = 1_000_000_000
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays in firing order.
 
     The format has no comments, so missing properties are only returned.
     """
-    times_ns = rays.timed().times_ns
-    assert times_ns is not None  # `timed` sets the times
+    times_ns = rays.with_times().times_ns
+    assert times_ns is not None  # `with_times` sets the times
     azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # + 0.0 avoids -0.0
     zeniths = np.round(90 - rays.elevations_deg, _DECIMALS)
     rows = zip(times_ns.tolist(), azimuths.tolist(), zeniths.tolist(), strict=True)
@@ -36,7 +36,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         f"{time_ns // _SECOND_NS}.{time_ns % _SECOND_NS:09d},{azimuth!r},{zenith!r}"
         for time_ns, azimuth, zenith in rows
     ]
-    write_text_of(path, "\n".join([HEADER, *lines]) + "\n")
+    write_complete_text(path, "\n".join([HEADER, *lines]) + "\n")
     return left_out
 
 
@@ -46,13 +46,13 @@ def is_livox(text: str) -> bool:
     return words == HEADER.lower().split(",")
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a Livox scan pattern, or return None if the file has another format."""
     text = read_text(path)
     return rays_of_text(text) if is_livox(text) else None
 
 
-def rays_of_text(text: str) -> FiredRays:
+def rays_of_text(text: str) -> RayList:
     """Return the rays in a list, without times if these are only row numbers.
 
     Raises
@@ -60,15 +60,15 @@ def rays_of_text(text: str) -> FiredRays:
     ValueError
         If numbers are missing or not finite, or if times decrease.
     """
-    times_s, azimuths_deg, zeniths_deg = rows_of(text, 1, 3).T
+    times_s, azimuths_deg, zeniths_deg = parse_rows(text, 1, 3).T
     backward_rows = np.flatnonzero(np.diff(times_s) < 0)
     if len(backward_rows):
         raise ValueError(f"times decrease in line {backward_rows[0] + 3}")
     directions = directions_of(azimuths_deg, 90 - zeniths_deg)
     if times_s[-1] == times_s[0] or (np.diff(times_s) == 1).all():
-        return FiredRays(directions)
+        return RayList(directions)
     times_ns = np.rint(times_s * _SECOND_NS).astype(np.int64)
     # The first beam of a firing may be fired after its start, but before the start of the next
     # firing. If a list starts later than that, its times come from a clock.
     is_clock = times_ns[0] < 0 or times_ns[0] > np.diff(times_ns).max()
-    return FiredRays(directions, times_ns - times_ns[0] if is_clock else times_ns)
+    return RayList(directions, times_ns - times_ns[0] if is_clock else times_ns)

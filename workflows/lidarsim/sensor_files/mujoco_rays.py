@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .complete_files import write_bytes_of, write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import open_complete, write_complete_text
+from .fired_rays import AXES, RayList
 from .python_file import array_code, python_text, times_code
 from .ray_header import TIME_COLUMN, check_names, columns_of, header_of, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
@@ -41,13 +41,13 @@ def times_ns(frame=0):
 _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write angles and times of rays as an .npz file with a header, or as a Python file."""
     if path.suffix.lower() == _PYTHON:
-        write_text_of(path, _python_text(rays.timed(), left_out))
+        write_complete_text(path, _python_text(rays.with_times(), left_out))
         return left_out
     header = np.array(json.dumps(header_of(rays, left_out, azimuth="theta", elevation="phi")))
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(
             file,
             allow_pickle=False,
@@ -58,7 +58,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     return left_out
 
 
-def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
+def _python_text(rays: RayList, left_out: Sequence[str]) -> str:
     """Return the content of a Python file for rays that have times."""
     arrays = {
         "_THETA": array_code(np.radians(rays.azimuths_deg), "<f8"),
@@ -69,7 +69,7 @@ def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
     return python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays)
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from the arrays `theta` and `phi`.
 
     The result is None for a Python file, and for a file that contains neither of these arrays.

@@ -17,8 +17,8 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Ints
 from ..base.errors import LidarError
-from .complete_files import write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text
+from .fired_rays import AXES, RayList
 
 CORE = "omni:sensor:Core:"
 STATE = f"{CORE}emitterState:"
@@ -27,7 +27,7 @@ MIN_RATE_HZ = 1  # scanRateBaseHz is an integer
 _PER_LINE = 500  # characters per line of an array
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a stage with an OmniLidar prim.
 
     Raises
@@ -58,11 +58,11 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         *(line for number, frame in enumerate(frames, 1) for line in _state(rays, number, frame)),
         "}",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
-def _remark(rays: FiredRays, left_out: Sequence[str]) -> str:
+def _remark(rays: RayList, left_out: Sequence[str]) -> str:
     """Return the comment in the file: the sensor, its axes, and missing properties."""
     lacks = f" Not in this file: {'; '.join(left_out)}." if left_out else ""
     return f"{rays.name}. Axes: {AXES}; azimuths from x, counter-clockwise.{lacks}"
@@ -80,7 +80,7 @@ def _state_name(number: int) -> str:
     return f"s{number:03d}"
 
 
-def _frames(rays: FiredRays) -> list[Ints]:
+def _frames(rays: RayList) -> list[Ints]:
     """Return the indices of the rays in each scan.
 
     Raises
@@ -88,8 +88,8 @@ def _frames(rays: FiredRays) -> list[Ints]:
     LidarError
         If scans have different numbers of rays, or there are more than `MAX_STATES` scans.
     """
-    rays = rays.timed()
-    assert rays.times_ns is not None and rays.cycle_ns is not None  # `timed` sets both
+    rays = rays.with_times()
+    assert rays.times_ns is not None and rays.cycle_ns is not None  # `with_times` sets both
     count = max(round(rays.cycle_ns * rays.rate_hz / 1e9), 1)
     if count > MAX_STATES:
         raise LidarError(
@@ -107,7 +107,7 @@ def _frames(rays: FiredRays) -> list[Ints]:
     return frames
 
 
-def _settings(rays: FiredRays, frames: Sequence[Ints]) -> Iterator[str]:
+def _settings(rays: RayList, frames: Sequence[Ints]) -> Iterator[str]:
     """Yield the attributes that apply to the whole sensor."""
     rate = f"{rays.rate_hz:.0f}"
     min_range_m, max_range_m = rays.range_m
@@ -134,10 +134,10 @@ def _settings(rays: FiredRays, frames: Sequence[Ints]) -> Iterator[str]:
         yield f"float {CORE}waveLengthNm = {rays.light.wavelength_nm:.9g}"
 
 
-def _state(rays: FiredRays, number: int, frame: Ints) -> Iterator[str]:
+def _state(rays: RayList, number: int, frame: Ints) -> Iterator[str]:
     """Yield the attributes of an emitter state, which has the rays of one scan."""
-    timed = rays.timed()
-    assert timed.times_ns is not None  # `timed` sets the times
+    timed = rays.with_times()
+    assert timed.times_ns is not None  # `with_times` sets the times
     start_ns = round((number - 1) * 1e9 / rays.rate_hz)
     yield from _array(number, "float[]", "azimuthDeg", rays.azimuths_deg[frame])
     yield from _array(number, "float[]", "elevationDeg", rays.elevations_deg[frame])

@@ -11,7 +11,7 @@ from math import isfinite
 import numpy as np
 
 from ..base.arrays import AnyArray
-from .fired_rays import FiredRays
+from .fired_rays import RayList
 
 _WIDTH = 96  # characters per line of packed numbers
 
@@ -50,7 +50,7 @@ _ARRAY = '''_unpacked(
 
 
 def python_text(
-    rays: FiredRays,
+    rays: RayList,
     title: str,
     words: str,
     left_out: Sequence[str],
@@ -99,7 +99,7 @@ def array_code(values: AnyArray, dtype: str) -> str:
     return _ARRAY.format(packed="\n".join(textwrap.wrap(packed, _WIDTH)), dtype=dtype)
 
 
-def times_code(rays: FiredRays) -> str:
+def times_code(rays: RayList) -> str:
     """Return an expression that evaluates to the int64 times of rays in nanoseconds."""
     assert rays.times_ns is not None  # the caller sets the times
     steps_code = array_code(np.diff(rays.times_ns, prepend=0), "<i8")

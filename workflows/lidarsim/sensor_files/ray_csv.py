@@ -14,8 +14,8 @@ from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.time_units import SECONDS
 from ..columns.column_names import ALIASES, TIMES
-from .complete_files import write_text_of
-from .fired_rays import FiredRays
+from .complete_files import write_complete_text
+from .fired_rays import RayList
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
 
 _DECIMALS = 9  # of angles; directions are written with all digits
@@ -30,7 +30,7 @@ QUANTITIES = (
 )
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays as a table with a header in comment lines."""
     columns: dict[str, Any] = columns_of(rays)
     for name in ("azimuth_deg", "elevation_deg"):
@@ -40,7 +40,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     ]
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [*remarks, ",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows)]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
@@ -50,12 +50,12 @@ def is_ray_table(text: str) -> bool:
     return TIME_COLUMN in next(lines, "").split(",")
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a text table, as described in `rays_of_text`."""
     return rays_of_text(read_text(path))
 
 
-def rays_of_text(text: str) -> FiredRays:
+def rays_of_text(text: str) -> RayList:
     """Return the rays in a table with azimuths and elevations, or with directions.
 
     Column names and units may have other spellings, such as "Azimuth [rad]". Times in tables of

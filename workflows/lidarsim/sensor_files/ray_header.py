@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..base.errors import reason_of
 from ..base.words import printable
-from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, FiredRays, directions_of
+from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, RayList, directions_of
 
 KIND = "rays of a sensor"
 # Column names of a table. Directions take precedence; the angles repeat them in degrees.
@@ -23,7 +23,7 @@ COLUMNS = (TIME_COLUMN, "channel", "azimuth_deg", "elevation_deg", *DIRECTION, *
 
 
 def header_of(
-    rays: FiredRays,
+    rays: RayList,
     left_out: Sequence[str],
     *,
     azimuth: str = "azimuth_deg",
@@ -70,17 +70,17 @@ def parsed_header(text: str | bytes) -> dict[str, Any]:
     return header
 
 
-def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
+def columns_of(rays: RayList) -> dict[str, Floats | Ints]:
     """Return the columns in `COLUMNS` for rays."""
-    timed = rays.timed()
-    assert timed.times_ns is not None  # `timed` sets the times
+    timed = rays.with_times()
+    assert timed.times_ns is not None  # `with_times` sets the times
     angles = (rays.azimuths_deg, rays.elevations_deg)
     vectors = (*rays.directions.T, *rays.origins_or_center.T)
     values = (timed.times_ns, rays.channels, *angles, *vectors)
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
+def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> RayList:
     """Create rays from columns and a header.
 
     The columns are those in `COLUMNS`, of which either the directions or both angles are required.
@@ -115,7 +115,7 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     channels = np.asarray(columns.get("channel", np.zeros(len(directions))), np.int64)
     max_range_m = header.get("max_range_m")
     cycle_ns = header.get("cycle_ns")
-    rays = FiredRays(
+    rays = RayList(
         directions=directions,
         times_ns=times_ns,
         channels=channels,
@@ -155,7 +155,7 @@ def not_numbers(name: str, kind: object) -> ValueError:
     return ValueError(f"its column {name} must contain real numbers, but has the type {shown}")
 
 
-def check_times(rays: FiredRays) -> None:
+def check_times(rays: RayList) -> None:
     """Raise ValueError if times decrease, or if the cycle ends before the last ray."""
     times_ns = rays.times_ns
     if times_ns is None:

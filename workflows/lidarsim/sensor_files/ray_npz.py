@@ -12,8 +12,8 @@ import numpy as np
 
 from ..base.allowance import Allowance
 from ..base.input_files import check_input
-from .complete_files import write_bytes_of
-from .fired_rays import FiredRays
+from .complete_files import open_complete
+from .fired_rays import RayList
 from .ray_header import (
     COLUMNS,
     check_names,
@@ -28,15 +28,15 @@ HEADER = "header"
 _ENCRYPTED = 1  # flag of an archive member
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays with a header."""
     arrays = {HEADER: np.array(json.dumps(header_of(rays, left_out))), **columns_of(rays)}
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return left_out
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from an .npz file, or return None if its arrays have another format.
 
     Raises

@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 from ..base.allowance import Allowance
 from ..base.errors import message_of
 from ..base.input_files import check_input, open_input
-from .complete_files import write_bytes_of
-from .fired_rays import FiredRays
+from .complete_files import open_complete
+from .fired_rays import RayList
 from .ray_header import (
     COLUMNS,
     check_names,
@@ -28,7 +28,7 @@ _HEADER = b"lidarpool"
 _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays as a table.
 
     The header is stored as JSON in the schema metadata.
@@ -36,12 +36,12 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     table = pa.table(columns_of(rays)).replace_schema_metadata(
         {_HEADER: json.dumps(header_of(rays, left_out)).encode()}
     )
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         pq.write_table(table, file)
     return left_out
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a Parquet table.
 
     Raises

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import Floats
-from .complete_files import write_bytes_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import open_complete
+from .fired_rays import AXES, RayList
 from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 
@@ -25,10 +25,10 @@ _NAMES = ("rays", "ring_ids", "time_offsets", "ranges")
 _STEEP = 0.9  # z component above which a ray is treated as vertical
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write arrays, each of which is the input of the node with its name."""
-    times_ns = rays.timed().times_ns
-    assert times_ns is not None  # `timed` sets the times
+    times_ns = rays.with_times().times_ns
+    assert times_ns is not None  # `with_times` sets the times
     header = {
         "sensor": rays.name,
         "axes": AXES,
@@ -40,7 +40,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "cycle_ns": rays.cycle_ns,
         "not_in_this_file": list(left_out),
     }
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(
             file,
             allow_pickle=False,
@@ -53,7 +53,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     return left_out
 
 
-def _matrices(rays: FiredRays) -> Floats:
+def _matrices(rays: RayList) -> Floats:
     """Return matrices (n, 3, 4) that map the z axis to the rays.
 
     Their x axes are horizontal and point to the right of the rays, or to -y for vertical rays.
@@ -65,7 +65,7 @@ def _matrices(rays: FiredRays) -> Floats:
     return np.stack([right, np.cross(ahead, right), ahead, rays.origins_or_center], axis=2)
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from RGL arrays, or return None if the arrays have another format.
 
     Raises

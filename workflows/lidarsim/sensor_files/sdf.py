@@ -15,8 +15,8 @@ import numpy as np
 
 from ..base.arrays import Floats, Ints
 from ..base.errors import LidarError
-from .complete_files import remark, write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text, xml_comment
+from .fired_rays import AXES, RayList
 
 _SLACK_DEG = 1e-4  # tolerance of even spacing
 _SAME_DEG = 1e-6  # angles that differ by less are treated as equal
@@ -31,7 +31,7 @@ class _Angles(NamedTuple):
     samples: int
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a model with a sensor.
 
     Raises
@@ -44,8 +44,8 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     lines = [
         '<?xml version="1.0"?>',
         '<sdf version="1.9">',
-        f"  <!-- {remark(rays.name)}. Axes: {AXES}. -->",
-        *(f"  <!-- Not in this file: {remark(clause)}. -->" for clause in left_out),
+        f"  <!-- {xml_comment(rays.name)}. Axes: {AXES}. -->",
+        *(f"  <!-- Not in this file: {xml_comment(clause)}. -->" for clause in left_out),
         '  <model name="lidar">',
         '    <link name="lidar">',
         f'      <sensor name={quoteattr(rays.name or "lidar")} type="gpu_lidar">',
@@ -64,7 +64,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "  </model>",
         "</sdf>",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
@@ -80,7 +80,7 @@ def _scan(name: str, angles: _Angles) -> list[str]:
     ]
 
 
-def _grid(rays: FiredRays) -> tuple[_Angles, _Angles]:
+def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
     """Return the azimuths and elevations of a regular grid.
 
     Raises

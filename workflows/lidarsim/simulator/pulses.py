@@ -41,7 +41,7 @@ from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
-from .casting.surfaces import Surfaces, sensor_light_of
+from .casting.surfaces import SceneSurfaces, sensor_light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, required
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
@@ -68,7 +68,7 @@ class PulseCaster:
         caster: SceneCaster,
         scene: Scene,
         survey: Survey,
-        surfaces: Surfaces,
+        surfaces: SceneSurfaces,
     ) -> None:
         self.setup = setup = setup_of(scene, survey, sensor_number)
         self._caster = caster
@@ -78,7 +78,7 @@ class PulseCaster:
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
-    def with_moved_instances(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
+    def with_moved_instances(self, scene: Scene, surfaces: SceneSurfaces) -> PulseCaster:
         """Return a caster for the same scans after instances of the scene have moved."""
         caster = copy(self)
         caster.setup = replace(self.setup, scene=scene)

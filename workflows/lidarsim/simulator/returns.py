@@ -52,10 +52,11 @@ class PulseReturns(NamedTuple):
     ray: Integers
     distance: Floats  # meters, without noise
     triangle: Ints32
-    # Received energy (`Surfaces.energy`); None if `BatchPoints` computes it from the reported rays.
+    # Received energy (`SceneSurfaces.energy`); None if `BatchPoints` computes it from the
+    # reported rays.
     energy: Floats | None = None
-    # Packed color (`Surfaces.colors`); None if no column needs it, or if `BatchPoints` looks it up
-    # at the end points of the rays.
+    # Packed color (`SceneSurfaces.colors`); None if no column needs it, or if `BatchPoints` looks
+    # it up at the end points of the rays.
     color: UInts32 | None = None
     cause: Bytes | None = None  # indices into `CAUSES`; None if all hits are on surfaces
     velocity: Floats | None = None  # radial, m/s, if a column stores it; NaN if unknown

@@ -22,7 +22,7 @@ from ..survey.survey import ScanSpec, Survey
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
-from .casting.surfaces import Surfaces
+from .casting.surfaces import SceneSurfaces
 from .points.batch_points import BatchPoints
 from .points.device_columns import DeviceColumns, DevicePoints
 from .pulses import PulseCaster
@@ -87,7 +87,7 @@ class Rig:
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         # These parts are public so that other tools can inspect them.
-        self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
+        self.surfaces = SceneSurfaces(scene, tuple(survey.materials), sorted(wavelengths))
         # Casters by sensor number.
         self.scene_casters = casters_of_sensors(
             scene, survey, self.surfaces, known_casters, **options

@@ -29,7 +29,7 @@ from ...survey.survey import Survey
 from .actor_trajectories import ActorTrajectories
 from .motion import CastPoses, FiringClock
 from .static_bodies import StaticBodies, largest_range_m, mesh_of
-from .surfaces import Surfaces
+from .surfaces import SceneSurfaces
 from .visibility import static_key, unseen_objects
 
 AUTO_ADVICE = "The backend 'auto' selects one that is available."
@@ -107,7 +107,7 @@ class SceneCaster:
     def __init__(
         self,
         scene: Scene,
-        surfaces: Surfaces,
+        surfaces: SceneSurfaces,
         bodies: CastBodies,
         range_m: float = np.inf,
         unseen: Bools | None = None,
@@ -134,7 +134,7 @@ class SceneCaster:
         # First triangle of each actor.
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def update_instances(self, surfaces: Surfaces, instances: Instances) -> None:
+    def update_instances(self, surfaces: SceneSurfaces, instances: Instances) -> None:
         """Update the surfaces and instances after instances of the scene have moved.
 
         This does not update the trees; use the function `move_instances` for that.
@@ -340,7 +340,7 @@ class SceneCaster:
 def casters_of_sensors(
     scene: Scene,
     survey: Survey,
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     known: Iterable[SceneCaster] = (),
     **options: Any,
 ) -> tuple[SceneCaster, ...]:
@@ -403,7 +403,7 @@ def casters_of_sensors(
 
 def move_instances(
     casters: Sequence[SceneCaster],
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     instances: Instances,
     instance_indices: Indices,
 ) -> None:

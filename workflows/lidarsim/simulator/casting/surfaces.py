@@ -49,7 +49,7 @@ class IlluminatedHits(NamedTuple):
     normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
     cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # (n,): kinds of surfaces, which are rows of the material table
-    energy: Floats  # (n,), as in `Surfaces.energy`, but reduced by a film of water
+    energy: Floats  # (n,), as in `SceneSurfaces.energy`, but reduced by a film of water
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 
@@ -70,7 +70,7 @@ def warn_of_gray(scene: Scene, survey: Survey) -> None:
         )
 
 
-class Surfaces:
+class SceneSurfaces:
     """Optical properties of the triangles in a scene.
 
     `StoredTriangles` numbers the triangles, and `TriangleKinds` maps them to kinds of surfaces,
@@ -109,7 +109,7 @@ class Surfaces:
         """Return the materials by kind of surface at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
-    def with_moved_instances(self, scene: Scene) -> Surfaces:
+    def with_moved_instances(self, scene: Scene) -> SceneSurfaces:
         """Return the surfaces of a scene in which instances have new transforms."""
         assert scene.instances is not None
         surfaces = copy(self)

@@ -23,7 +23,7 @@ from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
-from ..casting.surfaces import Surfaces, sensor_light_of
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..pulses import ScannedReturns
 from ..returns import required
 from ..steps.cast import GHOST
@@ -45,7 +45,7 @@ class BatchPoints:
         self,
         scene: Scene,
         survey: Survey,
-        surfaces: Surfaces,
+        surfaces: SceneSurfaces,
         specs: list[ScanSpec],  # scans with consecutive firings
         scanned: ScannedReturns,  # rays are numbered from 0 at the first firing
         *,
@@ -435,14 +435,14 @@ class BatchPoints:
 
     @cached_property
     def intensity(self) -> Floats:
-        """Received energy, on the scale of `Surfaces.energy`."""
+        """Received energy, on the scale of `SceneSurfaces.energy`."""
         if self.pulse_returns.energy is not None:
             return self.pulse_returns.energy
         return self._lit[1]
 
     @cached_property
     def _colors(self) -> UInts32:
-        """Packed colors of the surfaces, from `Surfaces.colors`."""
+        """Packed colors of the surfaces, from `SceneSurfaces.colors`."""
         if self.pulse_returns.color is not None:
             return self.pulse_returns.color
         points = self._scene_positions
@@ -524,7 +524,7 @@ class BatchPoints:
     def amplitude(self) -> Floats:
         """Height of the pulse in the waveform, or `intensity` without waveforms.
 
-        Both are on the scale of `Surfaces.energy`.
+        Both are on the scale of `SceneSurfaces.energy`.
         """
         return (
             self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude

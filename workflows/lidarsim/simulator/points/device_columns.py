@@ -29,7 +29,7 @@ from ...scene.scene import Scene
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..pulses import ScannedReturns
 from ..returns import SURFACE, PulseReturns
 from .batch_points import BatchPoints
@@ -131,7 +131,7 @@ class DeviceColumns:
     """
 
     def __init__(
-        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: Surfaces
+        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: SceneSurfaces
     ) -> None:
         self._scene = scene
         self._surfaces = surfaces
@@ -152,7 +152,7 @@ class DeviceColumns:
         self._seen_bodies = [seen[caster] for caster in casters]  # one for each sensor
         self._surface_tables: tuple[Any, ...] | None = None
 
-    def with_moved_instances(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
+    def with_moved_instances(self, scene: Scene, surfaces: SceneSurfaces) -> DeviceColumns:
         """Return a copy for a scene in which instances have moved.
 
         Tables that do not change stay on the device.

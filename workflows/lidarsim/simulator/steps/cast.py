@@ -22,7 +22,7 @@ from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, FiringClock, order_along_rings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, sensor_light_of
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
 from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
@@ -93,11 +93,11 @@ class SurfaceHits(NamedTuple):
     step_m: Floats  # distance from the origin of the last segment, meters
     triangle: Ints32  # for a hit on a leaf, the triangle where the light entered the crown
     distance: Floats  # optical path length from the sensor, meters
-    color: UInts32 | None  # packed (`Surfaces.colors`); None if not needed
+    color: UInts32 | None  # packed (`SceneSurfaces.colors`); None if not needed
     normals: Floats  # unit vectors in the scene frame; for a leaf, the direction of the light
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # kinds of surfaces, rows of the material table
-    energy: Floats  # received energy, in the unit of `Surfaces.energy`
+    energy: Floats  # received energy, in the unit of `SceneSurfaces.energy`
     film: Bools | None  # whether there may be a film of water; None if no surface is wet
     leaves: Indices  # (l,): rows where light hits a leaf within a crown
     velocities: Floats  # velocities of the surfaces; shape (0, 3) if they are not needed
@@ -172,7 +172,7 @@ class CastStep(PulseStep):
     causes = (GHOST,)
     purposes = LEAF, CROWN
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
@@ -197,7 +197,7 @@ class CastStep(PulseStep):
             or self._media is not None
         )
 
-    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return the step for a scene with moved instances and updated bounds of media."""
         if self._media is not None:
             return super().with_moved_instances(setup, surfaces)

@@ -22,7 +22,7 @@ from ...sensor.optics import LIGHT_M_NS
 from ...survey.survey import ScanSpec, Survey, firing_start_ns
 from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     PulseReturns,
@@ -94,7 +94,7 @@ class CrosstalkStep(PulseStep):
     causes = (CROSSTALK,)
     purposes = (FOREIGN_PULSE,)
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._survey = setup.survey
         self._sensor = setup.sensor
@@ -107,7 +107,7 @@ class CrosstalkStep(PulseStep):
             if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
-    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
         return self.with_setup(setup, surfaces)
 

@@ -14,7 +14,7 @@ from ...base.random_numbers import Purpose
 from ...base.vectors import products
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 
 VELOCITY = Purpose(40, "radial velocity noise of a return")
 BLOCK_HITS = 1 << 13  # number of hits that are computed at a time, to fit a cache
@@ -40,7 +40,7 @@ def range_rates_of_origins(
 
 
 def radial_velocities(
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     poses: CastPoses,
     ray: Integers,
     rays: tuple[Floats, Floats],
@@ -74,7 +74,7 @@ def radial_velocities(
 
 
 def velocities_of_ends(
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     actor_trajectories: ActorTrajectories,
     rays: tuple[Floats, Floats],
     distance: Floats,

@@ -30,7 +30,7 @@ from ...scene.scene import Scene
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import select_rows
 
 LEAF = Purpose(30, "depth to which light penetrates leaves")
@@ -173,7 +173,11 @@ class Media:
     """
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air_extinction: float = 0.0
+        self,
+        scene: Scene,
+        surfaces: SceneSurfaces,
+        table: MaterialTable,
+        air_extinction: float = 0.0,
     ) -> None:
         self._surfaces = surfaces
         self.air_extinction = air_extinction

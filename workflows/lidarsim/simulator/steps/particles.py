@@ -24,7 +24,7 @@ from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ...media.weather import reach as reach_of
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     SURFACE,
@@ -101,7 +101,7 @@ class WeatherStep(PulseStep):
         PARTICLE_DIAMETER,
     )
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         sensor = setup.sensor
         noise = setup.noise
@@ -122,7 +122,7 @@ class WeatherStep(PulseStep):
             air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
-    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
         return self.with_setup(setup, surfaces)
 
@@ -233,7 +233,7 @@ class WeatherStep(PulseStep):
 
 
 def light_reach(
-    materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
+    materials: MaterialTable, surfaces: SceneSurfaces, hits: PulseReturns, count: int
 ) -> Floats:
     """Return the ranges in meters that the light of `count` sub-rays reaches.
 

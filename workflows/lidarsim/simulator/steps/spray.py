@@ -23,7 +23,7 @@ from ...scene.actors import check_spray
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import order_along_rings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     PulseReturns,
@@ -73,7 +73,7 @@ class SprayStep(PulseStep):
     causes = (SPRAY,)
     purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
@@ -97,7 +97,7 @@ class SprayStep(PulseStep):
         )
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
-    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
         return self.with_setup(setup, surfaces)
 

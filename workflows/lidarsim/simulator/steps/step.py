@@ -28,7 +28,7 @@ from ...survey.faults import Fault, FaultKind
 from ...survey.survey import Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import Keys, Planes, PulseReturns
 
 
@@ -312,12 +312,12 @@ class PulseStep(ABC):
         if not getattr(cls, "role", None):
             raise TypeError(f"step {cls.__name__} has no role. Set `role` to flags of `Role`")
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         self.setup = setup
         self.caster = caster
         self.surfaces = surfaces
 
-    def with_moved_instances(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return the step for a scene in which instances have moved.
 
         By default, a new step is created. A step that takes long to create and stores no surface
@@ -325,7 +325,7 @@ class PulseStep(ABC):
         """
         return type(self)(setup, self.caster, surfaces)
 
-    def with_setup(self, setup: Setup, surfaces: Surfaces) -> Self:
+    def with_setup(self, setup: Setup, surfaces: SceneSurfaces) -> Self:
         """Return a copy of the step with a different setup and different surfaces."""
         step = copy(self)
         step.setup = setup

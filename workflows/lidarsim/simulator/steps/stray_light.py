@@ -17,7 +17,7 @@ from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, sensor_light_of
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
 from .detection import passes
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -42,7 +42,7 @@ class StrayLightStep(PulseStep):
     causes = (BLOOMING,)
     purposes = (STRAY,)
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._sensor_light = sensor_light_of(setup.survey, setup.sensor)
         self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
@@ -190,7 +190,7 @@ class _RetroCluster:
 
 
 def _retro_clusters(
-    scene: Scene, surfaces: Surfaces, unseen: Bools | None
+    scene: Scene, surfaces: SceneSurfaces, unseen: Bools | None
 ) -> Iterator[_RetroCluster]:
     """Yield the retroreflectors of a scene, its instances and its actors, in clusters.
 
