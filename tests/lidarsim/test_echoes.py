@@ -158,7 +158,7 @@ def test_modes(mode):
 
 def test_a_surface_that_continues_takes_hits_between_its_hits():
     """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
-    from lidarsim.simulator.steps.pulse_loops import Neighbors
+    from lidarsim.simulator.steps.pulse_loops import SubrayNeighbors
     from lidarsim.simulator.steps.random_loops import RandomKeys
     from lidarsim.simulator.steps.separation_loops import (
         ALL,
@@ -181,7 +181,7 @@ def test_a_surface_that_continues_takes_hits_between_its_hits():
         air=SubrayHits(
             np.zeros(1, np.int64), np.array([8.0]), np.array([0.4]), np.zeros(0), np.zeros(0, bool)
         ),
-        neighbors=Neighbors(4, pairs, normals.T.copy(), directions.T.copy()),
+        neighbors=SubrayNeighbors(4, pairs, normals.T.copy(), directions.T.copy()),
         receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
         keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
         output=found,

@@ -243,7 +243,7 @@ def test_energies_are_those_of_the_twin(extinction):
     normals = np.cross(*np.diff(corners, axis=1).swapaxes(0, 1))
     ahead, normals = (v / np.linalg.norm(v, axis=1)[:, None] for v in (ahead, normals))
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
-    lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
+    lit = surfaces.illuminate(triangle, ahead, distance, light, np.zeros(1000), ())
     assert lit.kinds.tolist() == wall.tolist()
     assert np.allclose(lit.cosines, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
     cosine = np.abs(lit.cosines)
@@ -324,7 +324,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     hits = np.flatnonzero(far < np.inf)
     place = far[hits]
     light = np.ones(len(hits))
-    crossings = spray_loops.Crossings(beam, crossed)
+    crossings = spray_loops.BoxCrossings(beam, crossed)
     spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
     begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
     keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)

@@ -18,7 +18,7 @@ from .arrays import Floats, Ints
 _FLAT = 16 * 2.0**-52
 
 
-def turned(vectors: Floats, rotation: Floats | None) -> Floats:
+def rotate(vectors: Floats, rotation: Floats | None) -> Floats:
     """Rotate vectors (n, 3) by a matrix (k, 3), or return them unchanged if it is None."""
     if rotation is None:
         return vectors
@@ -26,7 +26,7 @@ def turned(vectors: Floats, rotation: Floats | None) -> Floats:
     return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)
 
 
-def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
+def rotate_into_frames(vectors: Floats, rotations: Floats | None) -> Floats:
     """Rotate vectors (m, 3) from the scene frame to the frames with the given rotations (m, 3, 3).
 
     Vectors are returned unchanged if `rotations` is None.
@@ -41,7 +41,7 @@ def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
     return rotated
 
 
-def products(first: Floats, second: Floats) -> Floats:
+def dot(first: Floats, second: Floats) -> Floats:
     """Return the dot products of two arrays of vectors.
 
     Both arrays have shape (3, ...), and the result has shape (...).
@@ -87,12 +87,12 @@ def _components_first(matrices: Floats, axes: int) -> Floats:
     return np.ascontiguousarray(matrices.transpose(axes - 2, axes - 1, *range(axes - 2)))
 
 
-def applied(matrices: ArrayLike, vectors: ArrayLike) -> Floats:
+def matvec(matrices: ArrayLike, vectors: ArrayLike) -> Floats:
     """Multiply matrices (..., i, j) by vectors (..., j)."""
     return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
 
 
-def length(vectors: Floats) -> Any:
+def norm(vectors: Floats) -> Any:
     """Return the Euclidean norms of vectors along the last axis."""
     squares = vectors * vectors
     total = squares[..., 0]
@@ -117,7 +117,7 @@ def adjugates(matrices: Floats) -> tuple[Floats, Floats]:
         [b * f - c * e, c * d - a * f, a * e - b * d],
     ]
     adjugate = np.moveaxis(np.array(columns), (0, 1), (-1, -2))
-    return adjugate, products(rows[0], np.array(columns[0]))
+    return adjugate, dot(rows[0], np.array(columns[0]))
 
 
 def inverse(matrices: Floats) -> Floats:
@@ -139,8 +139,8 @@ def rank(matrices: Floats) -> Ints:
     largest = np.abs(matrices).reshape(shape).max(axis=-1)
     unit = matrices / np.where(largest > 0, largest, 1)[..., None, None]
     cofactors, size = adjugates(unit)
-    lengths = length(unit.reshape(shape))
-    areas = length(cofactors.reshape(shape))
+    lengths = norm(unit.reshape(shape))
+    areas = norm(cofactors.reshape(shape))
     thin = ~(areas > _FLAT * lengths * lengths)
     flat = thin | ~(np.abs(size) > _FLAT * lengths * areas)
     return np.asarray(3 - flat.astype(np.int64) - thin)

@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
-from ..base.vectors import applied, inverse, matmul
+from ..base.vectors import inverse, matmul, matvec
 from ..motion.rotations import matrices
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, PacketImuSamples
@@ -273,8 +273,8 @@ class LivoxEncoder(PacketEncoder):
         packets["data_type"] = IMU_DATA
         self._write_header(packets, batch.stamps_ns)
         samples = packets["data"]
-        samples["rate"] = applied(self._to_sensor, batch.rates)[:, None]
-        samples["acceleration"] = (applied(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
+        samples["rate"] = matvec(self._to_sensor, batch.rates)[:, None]
+        samples["acceleration"] = (matvec(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
             :, None
         ]
         payloads = _with_checksums(packets)

@@ -26,7 +26,7 @@ from ..base.elementary import sin_cos
 from ..base.errors import LidarError
 from ..base.extras import reading
 from ..base.input_files import input_size
-from ..base.vectors import applied, inverse, matmul
+from ..base.vectors import inverse, matmul, matvec
 from ..motion.rotations import matrices
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
@@ -486,7 +486,7 @@ class OusterEncoder(PacketEncoder):
         on_carrier = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
         mount = self.source.mount
         to_sensor = inverse(mount[:3, :3])
-        pose = matmul(affine(to_sensor, -applied(to_sensor, mount[:3, 3])), on_carrier)
+        pose = matmul(affine(to_sensor, -matvec(to_sensor, mount[:3, 3])), on_carrier)
         pose[:3, 3] *= 1000
         return pose
 

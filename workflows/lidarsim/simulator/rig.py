@@ -13,7 +13,7 @@ from raybeam import Pattern
 
 from ..base.arrays import Floats, Floats32, Integers
 from ..base.errors import LidarError
-from ..base.vectors import turned
+from ..base.vectors import rotate
 from ..motion.trajectory import Trajectory
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -206,9 +206,9 @@ class Rig:
         carried = self.survey.carried[number]
         mount = carried.mount
         origins = carried.sensor.origins(firings)
-        directions = turned(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
+        directions = rotate(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
         if origins is not None:
-            origins = turned(origins.reshape(-1, 3), mount.rotation)
+            origins = rotate(origins.reshape(-1, 3), mount.rotation)
         if any(mount.position):
             origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
         return Pattern(directions, origins, step=carried.sensor.ring_step)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...base.arrays import Floats, Indices, Integers, Ints
-from ...base.vectors import applied, into_axes, products
+from ...base.vectors import dot, matvec, rotate_into_frames
 from ...motion.trajectory import velocities
 from .actor_trajectories import ActorTrajectories
 from .stored_triangles import StoredTriangles
@@ -89,7 +89,7 @@ class ActorSurfaces:
         if not len(on_actors):
             return
         positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
-        points[on_actors] = into_axes(points[on_actors] - positions, rotations)
+        points[on_actors] = rotate_into_frames(points[on_actors] - positions, rotations)
         if len(deforming := trajectories.deforming_rows(actor)):
             deformed_rows = on_actors[deforming]
             deformed = self.deformed(
@@ -99,7 +99,7 @@ class ActorSurfaces:
                 trajectories,
             )
             weights = _weights(deformed.corners, points[deformed_rows])
-            points[deformed_rows] = applied(deformed.at_rest.transpose(0, 2, 1), weights)
+            points[deformed_rows] = matvec(deformed.at_rest.transpose(0, 2, 1), weights)
 
     def velocities(
         self,
@@ -151,8 +151,8 @@ class ActorSurfaces:
         deformed = self.deformed(
             self._triangles.locate(triangle).row, actor, times_ns, trajectories
         )
-        weights = _weights(deformed.corners, into_axes(points - positions, rotations))
-        return applied(rotations, applied(deformed.velocities.transpose(0, 2, 1), weights))
+        weights = _weights(deformed.corners, rotate_into_frames(points - positions, rotations))
+        return matvec(rotations, matvec(deformed.velocities.transpose(0, 2, 1), weights))
 
 
 def _weights(corners: Floats, points: Floats) -> Floats:
@@ -161,11 +161,11 @@ def _weights(corners: Floats, points: Floats) -> Floats:
     edge_1 = b - a
     edge_2 = c - a
     offset = points.T - a
-    square_1 = products(edge_1, edge_1)
-    edge_product = products(edge_1, edge_2)
-    square_2 = products(edge_2, edge_2)
-    product_1 = products(offset, edge_1)
-    product_2 = products(offset, edge_2)
+    square_1 = dot(edge_1, edge_1)
+    edge_product = dot(edge_1, edge_2)
+    square_2 = dot(edge_2, edge_2)
+    product_1 = dot(offset, edge_1)
+    product_2 = dot(offset, edge_2)
     area = np.maximum(square_1 * square_2 - edge_product * edge_product, 1e-300)
     v = (square_2 * product_1 - edge_product * product_2) / area
     w = (square_1 * product_2 - edge_product * product_1) / area

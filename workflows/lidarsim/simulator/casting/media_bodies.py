@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers
-from ...base.vectors import applied, inverse, length
+from ...base.vectors import inverse, matvec, norm
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from .triangle_kinds import TriangleKinds
@@ -83,14 +83,14 @@ class MediaBodies:
             corners = vertex_position[corners.reshape(-1)].reshape(-1, 3)
             a, b, c = positions[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[kind] else 1)
-            normals /= np.maximum(length(normals)[:, None], 1e-300)
+            normals /= np.maximum(norm(normals)[:, None], 1e-300)
             # Least squares: move each vertex so that all its triangles are `by_m` further out.
             squares = np.zeros((len(positions), 3, 3))
             sums = np.zeros((len(positions), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
             np.add.at(sums, corners, normals[:, None])
             squares += 1e-3 * np.eye(3)
-            step = by_m * applied(inverse(squares), sums)
+            step = by_m * matvec(inverse(squares), sums)
             positions += np.clip(step, -4 * by_m, 4 * by_m)
             vertices[vertex_rows] = positions[vertex_position]
         return vertices

@@ -13,7 +13,7 @@ import raybeam.poses
 from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ...base.arrays import Floats, Indices, Integers, Ints, owned
-from ...base.vectors import into_axes, matmul
+from ...base.vectors import matmul, rotate_into_frames
 from ...motion.trajectory import Trajectory, velocities
 from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
@@ -237,12 +237,14 @@ def poses_of_firings(
         mount_position = carried.mount.position
         if any(mount_position):
             mount_positions = np.broadcast_to(mount_position, positions.shape)
-            positions = positions + into_axes(mount_positions, carrier_rotations.transpose(0, 2, 1))
+            positions = positions + rotate_into_frames(
+                mount_positions, carrier_rotations.transpose(0, 2, 1)
+            )
         rotations = _head_rotations(carried, rotations, spins)
     ray_positions = positions[:-1]
     if spins is not None and sensor.center is not None and sensor.center.any():
         center = np.broadcast_to(sensor.center, ray_positions.shape)
-        ray_positions = ray_positions + into_axes(center, rotations.transpose(0, 2, 1))
+        ray_positions = ray_positions + rotate_into_frames(center, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
         return CastPoses(ray_positions, rotations, sensor.channels, by_head=spins is not None)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...base.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
-from ...base.vectors import inverse, length
+from ...base.vectors import inverse, norm
 from ...scene.actors import distinct_meshes
 from ...scene.colors import Colors
 from ...scene.scene import Scene
@@ -196,4 +196,4 @@ def normals_of(corners: Floats) -> Floats32:
     """Return the unit normals of triangles (n, 3, 3) in single precision."""
     a, b, c = corners.transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
-    return (normals / np.maximum(length(normals)[:, None], 1e-300)).astype(np.float32)
+    return (normals / np.maximum(norm(normals)[:, None], 1e-300)).astype(np.float32)

@@ -147,7 +147,7 @@ class TrackTable(NamedTuple):
 
 @inlined
 def _product(x, y, z, a, b, c):
-    """Return a dot product, with the order of operations of `vectors.products`."""
+    """Return a dot product, with the order of operations of `vectors.dot`."""
     return (x * a + y * b) + z * c
 
 

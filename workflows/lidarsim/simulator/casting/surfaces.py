@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
-from ...base.vectors import into_axes
+from ...base.vectors import rotate_into_frames
 from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
 from ...scene.scene import Scene
@@ -259,7 +259,7 @@ class SceneSurfaces:
             from_origins = (
                 points[on_instances] - self._scene.instances.transforms[instance_numbers, :, 3]
             )
-            points[on_instances] = into_axes(from_origins, normal_matrices)
+            points[on_instances] = rotate_into_frames(from_origins, normal_matrices)
         self.on_actors.move_to_rest(points, triangle, stored_rows, times, trajectories)
         return self._lookup.colors_at(stored_rows, points)
 

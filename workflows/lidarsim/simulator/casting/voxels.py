@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Indices
-from ...base.vectors import applied, inverse, matmul
+from ...base.vectors import inverse, matmul, matvec
 from ...scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # number of rays that are followed at a time, to fit a cache
@@ -83,7 +83,7 @@ class Grids:
         self._part = shared.part
         to_scene = shared.transforms
         matrices = self._matrices[self._part]
-        self._origins = applied(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
+        self._origins = matvec(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
         self._to_grid = inverse(matmul(to_scene[:, :, :3], matrices[:, :, :3]))
 
     def through(

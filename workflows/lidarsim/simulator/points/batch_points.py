@@ -13,7 +13,7 @@ from ...base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts
 from ...base.elementary import arccos, arcsin, arctan2
 from ...base.errors import LidarError
 from ...base.random_numbers import normal
-from ...base.vectors import products, turned
+from ...base.vectors import dot, rotate
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...media.materials import at_right_angles
@@ -197,8 +197,8 @@ class BatchPoints:
         frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
         if frozen_pose == current_pose:
             return points
-        in_sensor = turned(np.subtract(points, frozen_pose.position), frozen_pose.rotation_matrix.T)
-        return turned(in_sensor, current_pose.rotation_matrix) + current_pose.position
+        in_sensor = rotate(np.subtract(points, frozen_pose.position), frozen_pose.rotation_matrix.T)
+        return rotate(in_sensor, current_pose.rotation_matrix) + current_pose.position
 
     @cached_property
     def ray_origins(self) -> Floats:
@@ -301,16 +301,16 @@ class BatchPoints:
             cos, sin = (values.take(self._firing_in_run) for values in spins)
             x, y, z = vectors.T
             in_head = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
-            return turned(in_head, self.sensor.axes)
+            return rotate(in_head, self.sensor.axes)
         mount = self.carried.mount.rotation
-        return turned(vectors, None if mount is None else mount.T)
+        return rotate(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
         """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
         in_carrier = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
-            in_carrier[axis] = products(vectors.T, axes.T)
+            in_carrier[axis] = dot(vectors.T, axes.T)
         return self._to_sensor(in_carrier.T)
 
     @cached_property
@@ -373,7 +373,7 @@ class BatchPoints:
             facing = surfaces.normals(
                 triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
             )
-            signed_cosines = products(facing.T, self.directions[block].T)
+            signed_cosines = dot(facing.T, self.directions[block].T)
             facing[signed_cosines > 0] *= -1
             normals[block] = facing
             cosines[block] = np.abs(signed_cosines)

@@ -15,7 +15,7 @@ from raybeam import Pattern
 
 from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
 from ...base.random_numbers import Purpose, raw
-from ...base.vectors import into_axes, products
+from ...base.vectors import dot, rotate_into_frames
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
 from ...scene.colors import luminance
@@ -453,7 +453,7 @@ class CastStep(PulseStep):
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
-            along_ray = products(surface_hits.velocities.T, light.directions.T)
+            along_ray = dot(surface_hits.velocities.T, light.directions.T)
             velocity = light.range_rate + light.index * along_ray
         cause = None
         mirrored = light.mirrored
@@ -470,7 +470,7 @@ class CastStep(PulseStep):
         )
         normals = surface_hits.normals
         if light.mirror_matrices is not None:
-            normals = into_axes(normals, light.mirror_matrices)
+            normals = rotate_into_frames(normals, light.mirror_matrices)
         transmits = materials.passes[surface_hits.kinds]
         mirrors = np.zeros(len(surface_hits.kinds), np.bool_)
         if mirrored is not None:
@@ -647,14 +647,14 @@ class CastStep(PulseStep):
         normals = crossings.normals
         mirror_matrices = light.mirror_matrices
         if mirror_matrices is not None:
-            normals_as_seen = into_axes(normals, mirror_matrices)
+            normals_as_seen = rotate_into_frames(normals, mirror_matrices)
             reflections = deflection.twice_normals[:, :, None] * normals_as_seen[:, None]
             mirror_matrices = mirror_matrices - reflections
         cosines = np.abs(crossings.cosines)
         in_media = light.in_media
         if in_media is not None:
             in_media.deflect(light.directions, outgoing, normals, deflection.mirrored)
-            cosines = np.abs(products(normals.T, outgoing.T))
+            cosines = np.abs(dot(normals.T, outgoing.T))
         range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
         clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
         pattern, origins = _pattern_behind(light, crossings.step_m, clear_m, outgoing)
@@ -714,8 +714,8 @@ def _range_rate_behind(
     """
     if light.range_rate is None or velocities is None:
         return light.range_rate
-    incoming_speed = products(velocities.T, light.directions.T)
-    outgoing_speed = products(velocities.T, outgoing.T)
+    incoming_speed = dot(velocities.T, light.directions.T)
+    outgoing_speed = dot(velocities.T, outgoing.T)
     return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
 
 

@@ -14,7 +14,7 @@ from ...base.arrays import Floats, Indices, Ints, Ints32, owned
 from ...base.elementary import arccos, exp
 from ...base.elementary_scalars import sin_cos_of
 from ...base.random_numbers import Purpose
-from ...base.vectors import into_axes, length, products, turned
+from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import at_right_angles
 from ...sensor import Sensor
@@ -220,7 +220,7 @@ class CrosstalkStep(PulseStep):
         times = waiting.fired[waiting.order]
         nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
         towards = spots.position - waiting.origins[waiting.order[nearest_firing]]
-        distance = np.sqrt(products(towards.T, towards.T))
+        distance = np.sqrt(dot(towards.T, towards.T))
         arrival = spots.time + distance / LIGHT_M_NS
         first = np.searchsorted(times, arrival - waiting.gate[1] - SLACK_NS)
         stop = np.searchsorted(times, arrival - waiting.gate[0] + SLACK_NS, side="right")
@@ -228,7 +228,7 @@ class CrosstalkStep(PulseStep):
         with np.errstate(invalid="ignore", divide="ignore"):
             slack = SLACK_NS * LIGHT_M_NS / distance  # rays of a cell have different origins
         spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
-        angles = arccos(np.clip(products(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
+        angles = arccos(np.clip(dot(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
         in_view = ~(angles > opening[cell] + slack[spot])
         spot = spot[in_view]
         cell = cell[in_view]
@@ -242,9 +242,9 @@ class CrosstalkStep(PulseStep):
         """
         cell_starts = np.arange(0, len(directions), CELL_RAYS)
         sums = np.add.reduceat(directions, cell_starts, axis=0)
-        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
+        axes = sums / np.maximum(norm(sums), 1e-9)[:, None]
         min_cosine = np.minimum.reduceat(
-            products(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
+            dot(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
         )
         return axes, arccos(np.clip(min_cosine, -1, 1)) + arccos(self._cosine)
 
@@ -293,14 +293,14 @@ class CrosstalkStep(PulseStep):
         directions = sensor.directions(firings)
         origins = sensor.origins(firings)
         origins = np.zeros_like(directions) if origins is None else origins
-        directions = turned(directions.reshape(-1, 3), carried.mount.rotation)
-        origins = turned(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
+        directions = rotate(directions.reshape(-1, 3), carried.mount.rotation)
+        origins = rotate(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
         times = np.minimum(firing_starts + sensor.lead_ns, path.duration_ns)
         positions, rotations = path.poses(station, times)
         if rotations is not None:
             inverse = np.repeat(rotations.transpose(0, 2, 1), sensor.channels, axis=0)
-            directions = into_axes(directions, inverse)
-            origins = into_axes(origins, inverse)
+            directions = rotate_into_frames(directions, inverse)
+            origins = rotate_into_frames(origins, inverse)
         return origins + np.repeat(positions, sensor.channels, axis=0), directions
 
     def _energy(self, spots: _Spots, spot: Indices, towards: Floats, path_m: Floats) -> Floats:
@@ -311,7 +311,7 @@ class CrosstalkStep(PulseStep):
         """
         surfaces = self.surfaces
         triangle = spots.triangle[spot]
-        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / path_m
+        cosine = np.abs(dot(spots.normal[spot].T, towards.T)) / path_m
         # Optical depth of the air from the other sensor to the spot and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...base.arrays import Floats, Integers, Ints, Ints32
 from ...base.random_numbers import Purpose
-from ...base.vectors import products
+from ...base.vectors import dot
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
 from ..casting.surfaces import SceneSurfaces
@@ -35,7 +35,7 @@ def range_rates_of_origins(
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
         drift = poses.carrier_velocities(ray[block], origins[block])
-        rates[block] = -products(drift.T, directions[block].T)
+        rates[block] = -dot(drift.T, directions[block].T)
     return rates
 
 
@@ -69,7 +69,7 @@ def radial_velocities(
         velocity = velocities_of_ends(
             surfaces, poses.actor_trajectories, rays, distance, triangle, times
         )
-        rates += products(velocity.T, directions.T)
+        rates += dot(velocity.T, directions.T)
     return rates
 
 

@@ -23,7 +23,7 @@ from ...base.elementary import exp, log
 from ...base.elementary_scalars import log_of
 from ...base.errors import LidarError
 from ...base.random_numbers import Purpose
-from ...base.vectors import applied, products
+from ...base.vectors import dot, matvec
 from ...media.leaves import brightness, projection
 from ...media.materials import MaterialTable, fresnel
 from ...scene.scene import Scene
@@ -151,15 +151,15 @@ class RayDifferentials:
         Directions change from `incoming` to `outgoing` (n, 3). `index` (n,) is the refractive index
         behind the surfaces, for light that is not reflected.
         """
-        incoming_cosine = _away_from_zero(products(incoming.T, normals.T))
-        outgoing_cosine = _away_from_zero(products(outgoing.T, normals.T))
+        incoming_cosine = _away_from_zero(dot(incoming.T, normals.T))
+        outgoing_cosine = _away_from_zero(dot(outgoing.T, normals.T))
         # Neighboring rays cross the plane of the surface before or after the central ray.
-        shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
+        shift = matvec(self.position_derivatives, normals) / incoming_cosine[:, None]
         self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
         # A mirror reverses the component along the normal, which changes it by twice its size.
         bend = np.where(mirrored, 2.0, ratio - ratio**2 * incoming_cosine / outgoing_cosine)
-        slope = bend[:, None] * applied(self.direction_derivatives, normals)
+        slope = bend[:, None] * matvec(self.direction_derivatives, normals)
         derivatives = ratio[:, None, None] * self.direction_derivatives
         self.direction_derivatives = derivatives - slope[..., None] * normals[:, None]
         self.index = np.where(mirrored, self.index, index)
@@ -277,7 +277,7 @@ class Media:
             times = times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + skip_m) * up
             normals = self._surfaces.normals(hits.triangle, times, actor_trajectories)
-            cosines = products(normals.T, up[:, None])
+            cosines = dot(normals.T, up[:, None])
             self._cross_probes(entered, surrounding, probe_indices, hits.triangle, cosines)
         return surrounding
 

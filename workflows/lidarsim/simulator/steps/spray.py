@@ -16,7 +16,7 @@ from raybeam.moving import near_boxes
 
 from ...base.arrays import Floats, Ints, owned
 from ...base.random_numbers import Purpose
-from ...base.vectors import into_axes, length
+from ...base.vectors import norm, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.weather import FAINTEST, LARGE, reach, spray
 from ...scene.actors import check_spray
@@ -238,11 +238,11 @@ class SprayStep(PulseStep):
         positions, rotations = trajectories.poses(actor, pose_ns)
         earlier, _ = trajectories.poses(actor, pose_ns - STEP_NS)
         velocity = (positions - earlier) / (STEP_NS / 1e9)
-        speed_m_s = length(velocity)
+        speed_m_s = norm(velocity)
         axes = rotations.transpose(0, 2, 1)  # rows are the axes of the actor in the scene frame
         lowest_corner, half_sides = self._mesh_boxes[actor].transpose(1, 0, 2).copy()
         half_sides[:, 0] = speed_m_s * (BOX_NS / 2e9)
         driven_m = velocity * ((created_ns - pose_ns) / 1e9)[:, None]
-        middle = positions + driven_m + into_axes(lowest_corner + half_sides, axes)
+        middle = positions + driven_m + rotate_into_frames(lowest_corner + half_sides, axes)
         boxes = np.concatenate([middle, (axes * half_sides[:, :, None]).reshape(-1, 9)], axis=1)
         return boxes, speed_m_s

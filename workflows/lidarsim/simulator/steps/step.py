@@ -20,7 +20,7 @@ from raybeam import Pattern, SubRays
 
 from ...base.arrays import Floats, Indices, Ints
 from ...base.random_numbers import Purpose
-from ...base.vectors import turned
+from ...base.vectors import rotate
 from ...columns.table import VELOCITY
 from ...scene.scene import Scene
 from ...sensor import Noise, Returns, Sensor
@@ -169,8 +169,8 @@ class Emitter:
         carried = setup.survey.carried[setup.number]
         # Rotation axis of the head in the carrier frame. The sub-rays of an oval beam are spread
         # perpendicular to the axis and along it.
-        axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
-        self._axis = turned(axis, carried.mount.rotation)[0]
+        axis = rotate(np.array([[0.0, 0, 1]]), setup.sensor.axes)
+        self._axis = rotate(axis, carried.mount.rotation)[0]
         self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:

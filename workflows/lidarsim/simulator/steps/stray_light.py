@@ -12,7 +12,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
 from ...base.random_numbers import Purpose
-from ...base.vectors import into_axes, length, products, turned
+from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
@@ -73,7 +73,7 @@ class StrayLightStep(PulseStep):
         row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
         scan, number = batch.keys.scan_and_number(rays[row])
         row = row[passes(noise, STRAY, light.energy[row], scan, number)]
-        distance = np.sqrt(products(light.points[row].T, light.points[row].T))
+        distance = np.sqrt(dot(light.points[row].T, light.points[row].T))
         in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
         row = row[in_range]
         distance = distance[in_range]
@@ -116,7 +116,8 @@ class StrayLightStep(PulseStep):
             if actor is not None:
                 positions, rotations = batch.subray_poses.actor_trajectories[actor].poses(0, times)
             cells = _ray_cells(
-                into_axes(origins - positions, rotations), into_axes(directions, rotations)
+                rotate_into_frames(origins - positions, rotations),
+                rotate_into_frames(directions, rotations),
             )
             light.new[:] = False
             for cluster in clusters:
@@ -125,7 +126,7 @@ class StrayLightStep(PulseStep):
             if rotations is not None:  # rotate back to the scene frame
                 row_indices = np.flatnonzero(light.new)
                 to_scene = rotations[row_indices].transpose(0, 2, 1)
-                light.points[row_indices] = into_axes(light.points[row_indices], to_scene)
+                light.points[row_indices] = rotate_into_frames(light.points[row_indices], to_scene)
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
@@ -185,7 +186,7 @@ class _RetroCluster:
         """Centers and bounding sphere of the triangles."""
         a, b, c = self.corners.transpose(1, 0, 2)
         center = self.corners.reshape(-1, 3).mean(axis=0)
-        radius = float(length(self.corners.reshape(-1, 3) - center).max())
+        radius = float(norm(self.corners.reshape(-1, 3) - center).max())
         return _Bounds(((a + b) + c) / 3, center, radius)
 
 
@@ -221,7 +222,7 @@ def _retro_clusters(
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
             mesh = shared.mesh_parts[part]
             if has_retro[owner]:
-                vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
+                vertices = rotate(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
                 yield from clusters_of(mesh.faces, vertices, first)
             first += len(mesh.faces)
     for number, actor in enumerate(scene.actors):
