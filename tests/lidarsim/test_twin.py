@@ -19,7 +19,12 @@ from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
 from lidarsim.simulator.steps.detection import detected
-from lidarsim.simulator.steps.particles import AIR, WeatherStep, exponential, seen_by_range
+from lidarsim.simulator.steps.particles import (
+    AIR,
+    WeatherStep,
+    exponential_quantiles,
+    seen_by_range,
+)
 from lidarsim.simulator.steps.pulse_loops import SampledHits
 from lidarsim.simulator.steps.random_loops import RandomKeys
 from lidarsim.simulator.steps.range_noise import noisy_ranges
@@ -332,7 +337,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     clumps = []
     left = []
     precipitation = twin.Precipitation(kind, air, noise.threshold)
-    table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
+    table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential_quantiles())
     stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):

@@ -298,8 +298,8 @@ def _imu_axes(source: PacketSource) -> Floats:
     """Return the rotation (3, 3) from the axes of the platform's IMU to the sensor's axes."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
-    on_carrier = matrices(np.array([source.instruments.imu.quaternion]))[0]
-    return matmul(inverse(source.mount[:3, :3]), on_carrier)
+    on_platform = matrices(np.array([source.instruments.imu.quaternion]))[0]
+    return matmul(inverse(source.mount[:3, :3]), on_platform)
 
 
 def _with_checksums(packets: Records) -> Bytes:

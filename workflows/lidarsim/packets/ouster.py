@@ -483,10 +483,10 @@ class OusterEncoder(PacketEncoder):
         if instruments is None or instruments.imu is None:
             return np.eye(4)
         imu = instruments.imu
-        on_carrier = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
+        on_platform = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
         mount = self.source.mount
         to_sensor = inverse(mount[:3, :3])
-        pose = matmul(affine(to_sensor, -matvec(to_sensor, mount[:3, 3])), on_carrier)
+        pose = matmul(affine(to_sensor, -matvec(to_sensor, mount[:3, 3])), on_platform)
         pose[:3, 3] *= 1000
         return pose
 

@@ -106,7 +106,7 @@ class OusterApi(HttpService):
         documents: dict[str, Any] = {
             "system/firmware": {"fw": sensor["image_rev"], "commit_pending": False},
             "system/network": {
-                "carrier": True,
+                "platform": True,
                 "duplex": "full",
                 "ethaddr": "02:00:00:00:00:01",
                 "hostname": f"os-{sensor['prod_sn']}",

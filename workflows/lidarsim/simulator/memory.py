@@ -164,7 +164,7 @@ def _returns_per_pulse(setup: Setup) -> float:
     """Estimate the mean number of reported returns for a pulse that hits a surface."""
     subrays = setup.reporting.subrays
     mode = setup.reporting.mode
-    added_by_step = [step.added(setup) for step in steps_of(setup)]
+    added_by_step = [step.added_returns(setup) for step in steps_of(setup)]
     reports_two = mode in TWO_RETURNS
     added = 0.0
     if mode == "all":

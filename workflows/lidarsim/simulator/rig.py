@@ -40,16 +40,16 @@ class _Rays(NamedTuple):
 
     pattern: Pattern | None  # one firing, or one period of the head; None if the rays do not repeat
     # True if the rays are one firing in the head frame, with a pose for each firing. Otherwise they
-    # are in the carrier frame.
+    # are in the platform frame.
     by_head: bool = False
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
     """Return whether a sensor's rays are computed once, and whether they are cast by head.
 
-    `moves` states whether the carrier moves. Rays that are cast by head are the rays of one firing
+    `moves` states whether the platform moves. Rays that are cast by head are the rays of one firing
     in the head frame, with a pose for each firing. Other repeated rays are the rays of one head
-    period in the carrier frame.
+    period in the platform frame.
     """
     fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
     by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
@@ -94,7 +94,7 @@ class Rig:
         )
         self._prepare()
         check_trajectory(survey.path)
-        # {(sensor number, whether the carrier moves): rays}
+        # {(sensor number, whether the platform moves): rays}
         self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
         # {(sensor number, first firing, stop of firings): rays}
         self._patterns: dict[tuple[int, int, int], Pattern] = {}
@@ -104,7 +104,7 @@ class Rig:
     def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
         """Return the rays of a sensor that are cast repeatedly, which are computed on first use.
 
-        `moves` states whether the carrier moves.
+        `moves` states whether the platform moves.
         """
         rays = self._repeated_rays.get((number, moves))
         if rays is None:
@@ -198,7 +198,7 @@ class Rig:
         return self.scene_casters[0].caster.device_lost
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings `first` to `stop` of a sensor, in the carrier frame.
+        """Return the rays of firings `first` to `stop` of a sensor, in the platform frame.
 
         The rays are sorted by firing and beam. Firings are counted from the start of the station.
         """
@@ -235,7 +235,7 @@ class Rig:
     ) -> BatchPoints | DevicePoints:
         """Cast consecutive scans of one sensor and station, and return their points.
 
-        For a firing `t` nanoseconds after the start of the station, the carrier has the pose of
+        For a firing `t` nanoseconds after the start of the station, the platform has the pose of
         `path` at time `t + late_ns`, and actors have their poses at the time of the firing. If
         `tally` is set, the hits of each triangle are counted.
         """
@@ -278,8 +278,8 @@ class Rig:
     ) -> CastPoses:
         """Return the poses of consecutive firings on a path, with the clocks of moving bodies.
 
-        If `by_head` is set, these are poses of the head, otherwise of the carrier. `late_ns`
-        nanoseconds are added to the firing times to find the carrier's poses, but not for actors.
+        If `by_head` is set, these are poses of the head, otherwise of the platform. `late_ns`
+        nanoseconds are added to the firing times to find the platform's poses, but not for actors.
         """
         spec = firings.spec
         carried = self.survey.carried[spec.sensor]
@@ -293,10 +293,10 @@ class Rig:
         poses = self._with_actor_clock(poses, firings)
         if path.moves:
             firing_starts = carried.sensor.begins_ns(firings.numbers) + late_ns
-            carrier = FiringClock(
+            platform = FiringClock(
                 firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,))
             )
-            poses = replace(poses, carrier=carrier, station=spec.station)
+            poses = replace(poses, platform=platform, station=spec.station)
         return poses
 
     def _with_actor_clock(self, poses: CastPoses, firings: Firings) -> CastPoses:
@@ -311,11 +311,11 @@ class Rig:
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Return the ranges that the same firings measure from several poses of a static carrier.
+        """Return the ranges that the same firings measure from several poses of a static platform.
 
         `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
         increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
-        from the carrier frame to the scene frame; they are not checked here. The result is a
+        from the platform frame to the scene frame; they are not checked here. The result is a
         float32 array of shape (k, firings, channels) with the range of the nearest reported return
         in meters, or inf if there is no return.
         """
@@ -346,7 +346,7 @@ class Rig:
     ) -> None:
         """Write the ranges that the same firings measure from several poses into `image`.
 
-        `pattern` has the rays of the firings in the carrier frame. `image` has shape (poses *
+        `pattern` has the rays of the firings in the platform frame. `image` has shape (poses *
         rays,), with all rays of the first pose first. `first_scan` is added to the scan number of
         `specs[0]` to seed the random numbers.
         """
@@ -381,7 +381,7 @@ class Rig:
             image[returns.ray[nearest]] = returns.reported[nearest]
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings in the carrier frame, stored for later calls."""
+        """Return the rays of firings in the platform frame, stored for later calls."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first

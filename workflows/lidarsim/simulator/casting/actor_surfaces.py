@@ -29,7 +29,7 @@ class ActorSurfaces:
     def __init__(self, triangles: StoredTriangles) -> None:
         self._triangles = triangles
 
-    def deformed(
+    def deformed_corners(
         self,
         triangle_indices: Indices,
         actors: Integers,
@@ -92,7 +92,7 @@ class ActorSurfaces:
         points[on_actors] = rotate_into_frames(points[on_actors] - positions, rotations)
         if len(deforming := trajectories.deforming_rows(actor)):
             deformed_rows = on_actors[deforming]
-            deformed = self.deformed(
+            deformed = self.deformed_corners(
                 triangle_indices[deformed_rows],
                 actor[deforming],
                 times[deformed_rows],
@@ -148,7 +148,7 @@ class ActorSurfaces:
         """
         times_ns = times.astype(np.float64)
         positions, rotations = trajectories.poses(actor, times_ns)
-        deformed = self.deformed(
+        deformed = self.deformed_corners(
             self._triangles.locate(triangle).row, actor, times_ns, trajectories
         )
         weights = _weights(deformed.corners, rotate_into_frames(points - positions, rotations))

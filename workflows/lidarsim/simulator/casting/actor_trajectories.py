@@ -109,7 +109,7 @@ def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightT
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of all actors by actor number, or the trajectory of a carrier alone.
+    """Trajectories of all actors by actor number, or the trajectory of a platform alone.
 
     Only trajectories made by `from_actors` have deforming actors in `animated`.
     """

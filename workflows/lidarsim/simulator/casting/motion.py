@@ -1,4 +1,4 @@
-"""Poses of a carrier or of a sensor head at each firing, and the motion until the next firing."""
+"""Poses of a platform or of a sensor head at each firing, and the motion until the next firing."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class FiringClock:
     """Firing times of rays, and the trajectories that are evaluated at these times.
 
     Times are nanoseconds since the start of the survey for trajectories of actors, and since the
-    start of the station for the trajectory of the carrier.
+    start of the station for the trajectory of the platform.
     """
 
     firing_starts: Floats  # (f,): start of each firing, nanoseconds
     delays: Floats  # (m,): delay of each ray within a firing, nanoseconds
-    trajectories: ActorTrajectories  # trajectories of the actors, or of the carrier alone
+    trajectories: ActorTrajectories  # trajectories of the actors, or of the platform alone
     start: int = 0  # ray that sub-ray 0 of `times` belongs to; ray 0 is the first of the firings
     subrays: int = 1  # number of sub-rays per ray
 
@@ -54,7 +54,7 @@ class FiringClock:
         )
         return times_ns
 
-    def part(self, start: int, subrays: int) -> FiringClock:
+    def for_subrays(self, start: int, subrays: int) -> FiringClock:
         """Return a clock for sub-rays that are numbered from 0 at ray `start`."""
         return replace(self, start=start, subrays=subrays)
 
@@ -89,9 +89,9 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """Poses for `RayCaster.scan`, either of the sensor's head or of its carrier.
+    """Poses for `RayCaster.scan`, either of the sensor's head or of its platform.
 
-    Rotations map the frame of the head or carrier to the scene frame.
+    Rotations map the frame of the head or platform to the scene frame.
     """
 
     positions: Floats  # (p, 3), or (3,) for all rays, meters
@@ -100,8 +100,8 @@ class CastPoses:
     motion: PoseMotion | None = None  # motion from each pose to the next
     clock: FiringClock | None = None  # clock of the actors; None without actors
     by_head: bool = False  # whether the poses are poses of the head
-    carrier: FiringClock | None = None  # clock of a moving carrier, to compute its velocity
-    station: int = 0  # station in the trajectory of `carrier`
+    platform: FiringClock | None = None  # clock of a moving platform, to compute its velocity
+    station: int = 0  # station in the trajectory of `platform`
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class CastPoses:
         """
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
-    def part(self, start: int, stop: int, subrays: int) -> CastPoses:
+    def for_subrays(self, start: int, stop: int, subrays: int) -> CastPoses:
         """Return the poses for `subrays` sub-rays of each of the rays `start` to `stop`.
 
         Sub-rays are numbered from 0 at ray `start`. The range must consist of complete poses:
@@ -136,10 +136,10 @@ class CastPoses:
         """
         rays_per_pose = self.rays_per_pose
         motion = self.motion
-        clock = None if self.clock is None else self.clock.part(start, subrays)
-        carrier = None if self.carrier is None else self.carrier.part(start, subrays)
+        clock = None if self.clock is None else self.clock.for_subrays(start, subrays)
+        platform = None if self.platform is None else self.platform.for_subrays(start, subrays)
         if rays_per_pose is None:
-            return replace(self, clock=clock, carrier=carrier)
+            return replace(self, clock=clock, platform=platform)
         poses = slice(start // rays_per_pose, -(-stop // rays_per_pose))
         if motion is not None:
             delays = np.repeat(motion.delays, subrays)
@@ -152,21 +152,21 @@ class CastPoses:
             rays_per_pose=rays_per_pose * subrays,
             motion=motion,
             clock=clock,
-            carrier=carrier,
+            platform=platform,
         )
 
-    def carrier_velocities(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities in m/s that the carrier's motion gives to the origins of rays.
+    def platform_velocities(self, ray: Integers, origins: Floats) -> Floats:
+        """Return the velocities in m/s that the platform's motion gives to the origins of rays.
 
         `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
-        Origins and velocities are in the scene frame. The velocities are zero if the carrier is
+        Origins and velocities are in the scene frame. The velocities are zero if the platform is
         stationary. The rotation of the head is not included, because a sensor corrects for its own
         rotation.
         """
-        if self.carrier is None:
+        if self.platform is None:
             return np.zeros((len(ray), 3))
-        (path,) = self.carrier.trajectories
-        times = self.carrier.times(ray)
+        (path,) = self.platform.trajectories
+        times = self.platform.times(ray)
         velocity, rate = velocities(path, self.station, times)
         positions, _ = path.poses(self.station, times)
         return velocity + np.cross(rate, origins - positions)
@@ -209,36 +209,36 @@ def poses_of_firings(
     """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
 
     If a head rotates all beams (`Sensor.spins`), these are poses of the head, and the rays of one
-    firing are valid for all firings. Otherwise they are poses of the carrier. Each pose is taken at
-    the time of the first beam in a firing. If all beams start at the same point of a head, the
+    firing are valid for all firings. Otherwise they are poses of the platform. Each pose is taken
+    at the time of the first beam in a firing. If all beams start at the same point of a head, the
     positions are those of this point (`Sensor.center`), otherwise of the origin of the head frame.
 
-    Later beams of a firing start from the carrier's position at their own time, which is
+    Later beams of a firing start from the platform's position at their own time, which is
     interpolated linearly between firings. Computing a pose for each beam would take as long as
     casting.
 
-    `motion` is None if the carrier is stationary, or if all beams of a firing are fired at once.
-    `late_ns` nanoseconds are added to the firing times to find the carrier's poses.
+    `motion` is None if the platform is stationary, or if all beams of a firing are fired at once.
+    `late_ns` nanoseconds are added to the firing times to find the platform's poses.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns + late_ns, path.duration_ns)
-    positions, carrier_rotations = path.poses(station, times)
+    positions, platform_rotations = path.poses(station, times)
     positions = raybeam.poses.by_component(positions)
-    carrier_rotations = (
+    platform_rotations = (
         np.broadcast_to(np.eye(3), (len(times), 3, 3))
-        if carrier_rotations is None
-        else carrier_rotations
+        if platform_rotations is None
+        else platform_rotations
     )
-    carrier_rotations = raybeam.poses.by_component(carrier_rotations)
+    platform_rotations = raybeam.poses.by_component(platform_rotations)
     spins = sensor.spins(firings[:-1])
-    rotations = carrier_rotations[:-1]
+    rotations = platform_rotations[:-1]
     if spins is not None:
         mount_position = carried.mount.position
         if any(mount_position):
             mount_positions = np.broadcast_to(mount_position, positions.shape)
             positions = positions + rotate_into_frames(
-                mount_positions, carrier_rotations.transpose(0, 2, 1)
+                mount_positions, platform_rotations.transpose(0, 2, 1)
             )
         rotations = _head_rotations(carried, rotations, spins)
     ray_positions = positions[:-1]
@@ -249,11 +249,11 @@ def poses_of_firings(
     if not path.moves or not delays.any():
         return CastPoses(ray_positions, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
-    seconds[seconds == 0] = np.inf  # the last firing is at the very end; the carrier stops
+    seconds[seconds == 0] = np.inf  # the last firing is at the very end; the platform stops
     motion = PoseMotion(
         delays,
         np.diff(positions, axis=0) / seconds,
-        _rotation_vectors(carrier_rotations[:-1], carrier_rotations[1:]) / seconds,
+        _rotation_vectors(platform_rotations[:-1], platform_rotations[1:]) / seconds,
     )
     return CastPoses(ray_positions, rotations, sensor.channels, motion, by_head=spins is not None)
 
@@ -261,7 +261,7 @@ def poses_of_firings(
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
     """Return the rotations from the head, at its current azimuth, to the scene frame.
 
-    `rotations` (k, 3, 3) map the carrier frame to the scene frame. `spins` (2, k) are the cosines
+    `rotations` (k, 3, 3) map the platform frame to the scene frame. `spins` (2, k) are the cosines
     and sines of the head's azimuths.
     """
     if carried.mount.rotation is not None:

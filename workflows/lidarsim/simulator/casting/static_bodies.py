@@ -31,7 +31,7 @@ MAX_REACH_M = 50_000.0
 # move this far before trees are rebuilt.
 MARGIN_M = 10_000.0
 _NO_ROWS = np.zeros(0, np.int64)
-_SLACK_M = 200.0  # part of the margin reserved for sensors mounted away from their carrier
+_SLACK_M = 200.0  # part of the margin reserved for sensors mounted away from their platform
 
 
 def largest_range_m(survey: Survey) -> float:

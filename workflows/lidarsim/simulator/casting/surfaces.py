@@ -156,7 +156,7 @@ class SceneSurfaces:
             actors = objects - np.int64(self.triangles.static_objects)
             poses, run = trajectories.pose_runs(actors, owned(times))
             if len(deforming := trajectories.deforming_rows(actors)):
-                deformed = self.on_actors.deformed(
+                deformed = self.on_actors.deformed_corners(
                     row[deforming], actors[deforming], times[deforming], trajectories
                 )
                 deformed_normals = normals_of(deformed.corners)

@@ -86,7 +86,7 @@ class Grids:
         self._origins = matvec(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
         self._to_grid = inverse(matmul(to_scene[:, :, :3], matrices[:, :, :3]))
 
-    def through(
+    def follow(
         self,
         instances: Indices,
         starts: Floats,
@@ -114,7 +114,7 @@ class Grids:
             (n,): optical depth after which the light hits a leaf.
         """
         passages = [
-            self._block_through(
+            self._follow_block(
                 instances[block],
                 starts[block],
                 directions=directions[block],
@@ -131,7 +131,7 @@ class Grids:
             return passages[0]
         return GridPassage(*map(np.concatenate, zip(*passages, strict=True)))
 
-    def _block_through(
+    def _follow_block(
         self,
         instances: Indices,
         starts: Floats,
@@ -141,7 +141,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
-        """Follow a block of light for `through`."""
+        """Follow a block of light for `follow`."""
         passage = GridPassage(
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
@@ -193,7 +193,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return the light of a block in the voxels at its start, for `through`."""
+        """Return the light of a block in the voxels at its start, for `follow`."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]

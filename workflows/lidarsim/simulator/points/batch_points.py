@@ -293,7 +293,7 @@ class BatchPoints:
         """Rotate vectors (n, 3), one per return, from the pattern frame to the sensor frame.
 
         The pattern is in the head frame if it is a single firing that each pose rotates
-        (`CastPoses.by_head`), otherwise in the carrier frame.
+        (`CastPoses.by_head`), otherwise in the platform frame.
         """
         if self._poses.by_head:
             spins = self.sensor.spins(self._firings.numbers)
@@ -307,11 +307,11 @@ class BatchPoints:
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
         """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
-        in_carrier = np.empty(vectors.shape[::-1])
+        in_platform = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
-            in_carrier[axis] = dot(vectors.T, axes.T)
-        return self._to_sensor(in_carrier.T)
+            in_platform[axis] = dot(vectors.T, axes.T)
+        return self._to_sensor(in_platform.T)
 
     @cached_property
     def azimuth(self) -> Floats:

@@ -25,7 +25,7 @@ from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
-from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
+from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, random_depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
@@ -67,7 +67,7 @@ class LightPaths:
     def optical_end(self, step_m: Floats) -> Floats:
         """Return the optical path lengths from the sensor to points `step_m` from the origins."""
         return self.optical_start + (
-            step_m if self.in_media is None else self.in_media.optical(step_m)
+            step_m if self.in_media is None else self.in_media.optical_length(step_m)
         )
 
     @property
@@ -209,7 +209,7 @@ class CastStep(PulseStep):
         return setup.return_count_varies
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the largest number of ghosts of a pulse, as an upper bound of the mean number."""
         return MAX_REFLECTIONS * setup.has_mirrors
 
@@ -332,7 +332,7 @@ class CastStep(PulseStep):
         if batch.subrays_per_beam > 1 and deflected:
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
-            leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
+            leaf_depths = random_depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
             media_rays = MediaRays(origins, directions, times, poses.actor_trajectories)
             light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
         return light
@@ -658,7 +658,7 @@ class CastStep(PulseStep):
         range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
         clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
         pattern, origins = _pattern_behind(light, crossings.step_m, clear_m, outgoing)
-        optical_m = clear_m if in_media is None else in_media.optical(clear_m)
+        optical_m = clear_m if in_media is None else in_media.optical_length(clear_m)
         if in_media is not None:
             in_media.advance(clear_m)
         behind = LightPaths(

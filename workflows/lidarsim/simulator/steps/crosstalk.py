@@ -30,7 +30,7 @@ from ..returns import (
     number_within_ray,
     returns_without_surface,
 )
-from .detection import passes
+from .detection import exceeds_threshold
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class CrosstalkStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch together with received foreign pulses."""
         rays = np.arange(batch.start, batch.stop)
-        row, distance, energy = self.received(
+        row, distance, energy = self.receive(
             batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
         )
         order = np.lexsort((distance, row))
@@ -135,7 +135,7 @@ class CrosstalkStep(PulseStep):
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.scan_and_number(ray)
-        detected = passes(
+        detected = exceeds_threshold(
             self.setup.noise, FOREIGN_PULSE, energy, scan, number, number_within_ray(ray)
         )
         foreign_returns = returns_without_surface(

@@ -54,11 +54,11 @@ def detected(
     """
     detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
     if noise.detection_range_m is not None:
-        detected_mask &= passes(noise, DETECTION, energy, scan, ray, number)
+        detected_mask &= exceeds_threshold(noise, DETECTION, energy, scan, ray, number)
     return detected_mask
 
 
-def passes(
+def exceeds_threshold(
     noise: Noise,
     purpose: Purpose,
     energy: Floats,

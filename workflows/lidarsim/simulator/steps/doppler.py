@@ -23,18 +23,18 @@ BLOCK_HITS = 1 << 13  # number of hits that are computed at a time, to fit a cac
 def range_rates_of_origins(
     poses: CastPoses, ray: Integers, origins: Floats, directions: Floats
 ) -> Floats:
-    """Return the range rates of static points due to the motion of the carrier, in m/s.
+    """Return the range rates of static points due to the motion of the platform, in m/s.
 
     `ray` (n,) are numbers of rays in the order of `poses`. Origins and unit directions of the rays
     have shape (n, 3) and are in the scene frame.
     """
     rates = np.zeros(len(ray))
-    if poses.carrier is None:
+    if poses.platform is None:
         return rates
     origins = np.broadcast_to(origins, directions.shape)
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
-        drift = poses.carrier_velocities(ray[block], origins[block])
+        drift = poses.platform_velocities(ray[block], origins[block])
         rates[block] = -dot(drift.T, directions[block].T)
     return rates
 

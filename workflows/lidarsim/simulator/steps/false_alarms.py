@@ -44,7 +44,7 @@ class FalseAlarmStep(PulseStep):
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of false alarms while the receiver waits for a pulse."""
         return setup.noise.false_alarm_hz * setup.sensor.gate_s
 

@@ -60,7 +60,7 @@ class MediaStack:
     triangles: Ints32  # triangles through which the light entered
 
     @classmethod
-    def none(cls, count: int) -> MediaStack:
+    def empty(cls, count: int) -> MediaStack:
         """Return the stacks of light in air."""
         return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
@@ -224,7 +224,7 @@ class Media:
 
     def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
         """Return the media around the origins of light."""
-        stack = MediaStack.none(len(rays.origins))
+        stack = MediaStack.empty(len(rays.origins))
         in_bounds = np.zeros(len(rays.origins), np.bool_)
         if not len(in_bounds):
             return stack
@@ -260,8 +260,8 @@ class Media:
 
         If a ray leaves a medium that it has not entered, its origin is inside this medium.
         """
-        surrounding = MediaStack.none(len(origins))
-        entered = MediaStack.none(len(origins))
+        surrounding = MediaStack.empty(len(origins))
+        entered = MediaStack.empty(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
         probe_indices = np.arange(len(origins))
         skip_m = caster.clear_m / up[2]
@@ -324,7 +324,7 @@ class Media:
         refracts = self._index[stack.kinds] > 0
         return _first_masked(self._attenuation[stack.kinds], refracts, self.air_extinction)
 
-    def behind(
+    def stack_behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
         """Return the media behind surfaces (n,), given the cosines between normals and light."""
@@ -412,7 +412,7 @@ class LightInMedia:
         """Refractive index at the position of the light."""
         return 1.0 if self.differentials is None else self.differentials.index
 
-    def optical(self, step: Floats) -> Floats:
+    def optical_length(self, step: Floats) -> Floats:
         """Return the optical path lengths of steps (n,) in meters."""
         return step if self.differentials is None else step * self.differentials.index
 
@@ -495,7 +495,7 @@ class LightInMedia:
         is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
         triangles = np.take_along_axis(stack.triangles[row_indices], grid_layers, axis=1)
         media_density = np.where(gridded, 0, density[row_indices])
-        meters, remaining_depth, grid_density = grids.through(
+        meters, remaining_depth, grid_density = grids.follow(
             np.where(is_grid, self.media.instances(triangles), -1),
             starts[row_indices],
             directions=directions[row_indices],
@@ -538,7 +538,7 @@ class LightInMedia:
         light has its own rows, so totally reflected light in the other rows gets the share 0.
         """
         stack_before = self.stack
-        self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
+        self.stack = self.media.stack_behind(self.stack, kinds, triangles, cosines)
         if self.differentials is None:
             return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
         ratio = self.media.index(self.stack) / self.differentials.index
@@ -589,7 +589,7 @@ def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
     return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
 
 
-def depths(bits: NDArray[np.uint64]) -> Floats:
+def random_depths(bits: NDArray[np.uint64]) -> Floats:
     """Convert random bits (n,) to exponentially distributed numbers with mean 1.
 
     For speed, the logarithm is computed from the binary exponent and a table of 32,768 logarithms.

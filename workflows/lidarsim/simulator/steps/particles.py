@@ -132,7 +132,7 @@ class WeatherStep(PulseStep):
         return setup.survey.returns_light and setup.noise.detection_range_m is not None
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of particle and fog returns per pulse."""
         backscatter = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
         return setup.survey.mean_particles(setup.number) + bool(backscatter)
@@ -140,7 +140,9 @@ class WeatherStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of sub-rays and of hits in the air, in bytes."""
-        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
+        return Memory(
+            casting=110 * sizes.subrays + 170 * WeatherStep.added_returns(setup) * sizes.beams
+        )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add hits in the air to the hits of a batch."""
@@ -296,16 +298,16 @@ def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
     """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,) in meters."""
-    from . import particle_loops as air_loops  # imported here: numba takes half a second
+    from . import particle_loops  # imported here: numba takes half a second
 
     beams = len(reach) // subrays
-    tables = air_loops.ParticleTables(
-        detectable.counts, detectable.by_range, detectable.step_mm, exponential()
+    tables = particle_loops.ParticleTables(
+        detectable.counts, detectable.by_range, detectable.step_mm, exponential_quantiles()
     )
     beam = 0
     while beam < beams:
         hits = room_for_hits(2 * beams + len(detectable.counts))
-        beam, count = air_loops.sample_particles(
+        beam, count = particle_loops.sample_particles(
             beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
         )
         yield hits.first(count)
@@ -316,11 +318,11 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
 
     `reach` (rays,) is the range in meters at which fog ends on each sub-ray.
     """
-    from . import particle_loops as air_loops
+    from . import particle_loops
 
     hits = room_for_hits(len(reach) // subrays)
-    tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
-    count = air_loops.sample_fog(subrays, tables, random, reach, hits)
+    tables = particle_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
+    count = particle_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)
 
 
@@ -370,13 +372,13 @@ def seen_by_range(
     integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(integrals)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    distance = single(interp(shares, sums / sums[-1], distance))
+    distance = round_to_single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
     energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
     quantities = [smallest, larger, energy_of_1_mm, full_beam_energy]
-    return float(sums[-1]), np.stack([distance, *(single(row) for row in quantities)])
+    return float(sums[-1]), np.stack([distance, *(round_to_single(row) for row in quantities)])
 
 
 def _poisson(mean: float) -> Floats:
@@ -390,7 +392,7 @@ def _poisson(mean: float) -> Floats:
         count += 1
         term *= mean / count
         total += term
-    return single(np.array([*sums, 1.0]))
+    return round_to_single(np.array([*sums, 1.0]))
 
 
 @lru_cache(CACHED_TABLES)
@@ -413,8 +415,8 @@ def _fog_cells(
     if not len(energy):
         return None
     peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    peak_rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return FogCells(min_range_m, cell_m, single(energy), peak_rows.reshape(-1))
+    peak_rows = np.arange(len(energy) + 1)[:, None] + round_to_single(peaks)
+    return FogCells(min_range_m, cell_m, round_to_single(energy), peak_rows.reshape(-1))
 
 
 def highest_probabilities(signals: Floats) -> Floats:
@@ -439,7 +441,7 @@ def highest_probabilities(signals: Floats) -> Floats:
     return probabilities
 
 
-def single(table: Floats) -> Floats:
+def round_to_single(table: Floats) -> Floats:
     """Round a table to single precision.
 
     At this precision, the error functions of different C libraries give identical results.
@@ -448,7 +450,7 @@ def single(table: Floats) -> Floats:
 
 
 @cache
-def exponential() -> Floats:
+def exponential_quantiles() -> Floats:
     """Return the quantiles of the exponential distribution at the centers of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return single(-log1p(-shares))
+    return round_to_single(-log1p(-shares))

@@ -33,7 +33,7 @@ from ..returns import (
 )
 from .particles import (
     add_air_hits,
-    exponential,
+    exponential_quantiles,
     light_reach,
     random_keys,
     room_for_hits,
@@ -108,7 +108,7 @@ class SprayStep(PulseStep):
         return setup.survey.spray_g_m3 > 0 and any(actor.spray for actor in actors)
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of clumps per pulse that passes through spray."""
         return 1.0  # an estimate
 
@@ -145,7 +145,7 @@ class SprayStep(PulseStep):
 
         assert self._clump_distribution is not None
         mean, by_range = self._clump_distribution
-        tables = spray_loops.ClumpTables(mean, by_range, self._step_mm, exponential())
+        tables = spray_loops.ClumpTables(mean, by_range, self._step_mm, exponential_quantiles())
         keys = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
         clump_hits: list[PulseReturns] = []
         row = 0

@@ -115,7 +115,7 @@ class Setup:
     @property
     def return_count_varies(self) -> bool:
         """Whether a ray that hits a surface may have several returns or none."""
-        if self.has(Role.CHANGES | Role.RECEIVES):
+        if self.has_role(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
         return self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses
@@ -123,9 +123,9 @@ class Setup:
     @property
     def has_received_returns(self) -> bool:
         """Whether the receiver adds or merges returns of a pulse before the selection."""
-        return self.has(Role.RECEIVES)
+        return self.has_role(Role.RECEIVES)
 
-    def has(self, roles: Role) -> bool:
+    def has_role(self, roles: Role) -> bool:
         """Return True if any step that applies has one of the roles.
 
         Raises
@@ -167,11 +167,11 @@ class Emitter:
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
         carried = setup.survey.carried[setup.number]
-        # Rotation axis of the head in the carrier frame. The sub-rays of an oval beam are spread
+        # Rotation axis of the head in the platform frame. The sub-rays of an oval beam are spread
         # perpendicular to the axis and along it.
         axis = rotate(np.array([[0.0, 0, 1]]), setup.sensor.axes)
         self._axis = rotate(axis, carried.mount.rotation)[0]
-        self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
+        self._about_axis = self.beam.oval or setup.has_role(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:
         """Return the number of sub-rays of a beam."""
@@ -197,7 +197,7 @@ class Emitter:
         beam_indices
             (n,): rows of `pattern` that are divided, by default all.
         by_head
-            Whether the beams are in the head frame instead of the carrier frame.
+            Whether the beams are in the head frame instead of the platform frame.
         """
         if len(self) == 1 and offsets is None:
             return pattern
@@ -217,7 +217,7 @@ class PulseBatch:
     keys: Keys  # scan and ray numbers of all beams of the scans, for random numbers
     start: int  # number of the batch's first beam
     stop: int  # one past the batch's last beam
-    pattern: Pattern  # rays of beams, in the head or carrier frame
+    pattern: Pattern  # rays of beams, in the head or platform frame
     first: int  # row of beam 0 in the pattern, which repeats
     poses: CastPoses  # poses of all beams of the scans
     firings: Firings  # firings of all beams of the scans
@@ -281,7 +281,7 @@ class PulseBatch:
     @cached_property
     def subray_poses(self) -> CastPoses:
         """Poses of the batch's sub-rays, numbered from 0."""
-        return self.poses.part(self.start, self.stop, self.subrays_per_beam)
+        return self.poses.for_subrays(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
@@ -338,7 +338,7 @@ class PulseStep(ABC):
         """Return True if the step acts on the sensor."""
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of returns that the step adds to a pulse, or an upper bound."""
         return 0.0
 

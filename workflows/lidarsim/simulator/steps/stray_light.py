@@ -19,7 +19,7 @@ from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
-from .detection import passes
+from .detection import exceeds_threshold
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class StrayLightStep(PulseStep):
         light = self._strongest(batch, times)
         row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
         scan, number = batch.keys.scan_and_number(rays[row])
-        row = row[passes(noise, STRAY, light.energy[row], scan, number)]
+        row = row[exceeds_threshold(noise, STRAY, light.energy[row], scan, number)]
         distance = np.sqrt(dot(light.points[row].T, light.points[row].T))
         in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
         row = row[in_range]
