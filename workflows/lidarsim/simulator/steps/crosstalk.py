@@ -143,7 +143,7 @@ class CrosstalkStep(PulseStep):
         )
         return merge_returns(returns, foreign_returns)
 
-    def received(
+    def receive(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
     ) -> ReceivedPulses:
         """Return the foreign pulses that consecutive rays (n,) receive.
