@@ -23,7 +23,7 @@ from lidarpool import (
 )
 from lidarpool.run.job_source import identity_of
 from lidarsim import Actor, Returns, box
-from lidarsim.base.vectors import into_axes
+from lidarsim.base.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweep_motion import poses_at
 from raybeam import moving_loops
@@ -149,12 +149,14 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     for batch in batches:
         on = batch.object == 2
         positions, rotations = CAR.trajectory.poses(0, batch.time[on].astype(np.float64))
-        own = into_axes(batch.positions[on] - positions, rotations) - [0, 0, SIZE[2] / 2]
+        own = rotate_into_frames(batch.positions[on] - positions, rotations) - [0, 0, SIZE[2] / 2]
         off = np.abs(np.abs(own) - SIZE / 2)
         if "several" not in name:  # whose range is the mean of several rays
             assert off.min(axis=1).max(initial=0) < 1e-6
             face = off.argmin(axis=1)
-            cosines = np.abs(into_axes(batch.directions[on], rotations))[np.arange(on.sum()), face]
+            cosines = np.abs(rotate_into_frames(batch.directions[on], rotations))[
+                np.arange(on.sum()), face
+            ]
             assert np.allclose(batch.cosine[on], cosines, atol=1e-6)
             assert (np.abs(own) <= SIZE / 2 + 1e-6).all()
         assert (batch.triangle[on] >= 4).all()

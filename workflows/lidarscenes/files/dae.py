@@ -23,7 +23,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.companions import image_file
@@ -474,8 +474,8 @@ def _rotate(numbers: Floats) -> Floats:
 def _look_at(numbers: Floats) -> Floats:
     """Return the matrix for a camera position, a target, and an up vector, given as (9,)."""
     eye, target, up = numbers.reshape(3, 3)
-    z = (eye - target) / length(eye - target)
-    x = np.cross(up, z) / length(np.cross(up, z))
+    z = (eye - target) / norm(eye - target)
+    x = np.cross(up, z) / norm(np.cross(up, z))
     return affine(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.base.words import did_you_mean, printable
 from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
@@ -96,10 +96,10 @@ def read_matrix(pose: Element) -> Floats:
     if not (np.abs(values) <= _MAX_POSE).all():
         return affine(np.full((3, 3), np.nan), np.full(3, np.nan))
     if is_quaternion:
-        norm = length(values[3:])
-        if not norm > _MIN_NORM:
+        size = norm(values[3:])
+        if not size > _MIN_NORM:
             raise LidarError(f"<pose> is {shown(text)}, whose quaternion has zero length.")
-        x, y, z, w = values[3:] / norm
+        x, y, z, w = values[3:] / size
         return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
     angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])
     return affine(rotations_of(angles[::-1]) if angles.any() else np.eye(3), values[:3])

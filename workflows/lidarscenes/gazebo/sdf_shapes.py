@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.masks import read_heights
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
@@ -81,7 +81,7 @@ def _capsule(shape: Element) -> SceneMesh | None:
 def _plane(shape: Element) -> SceneMesh | None:
     """Return a rectangle perpendicular to a normal."""
     normal = child_numbers(shape, "normal", 3, "0 0 1")
-    size = length(normal)
+    size = norm(normal)
     if not size > 0:
         raise LidarError("<normal> of a <plane> has zero length.")
     x, y = (_sizes(shape, "size", 2, "1 1") / 2).tolist()
@@ -241,7 +241,7 @@ def road_mesh(road: Element) -> SceneMesh | None:
     if len(points) < 2 or not width:
         return None
     steps = np.gradient(points[:, :2], axis=0)
-    lengths = length(steps)[:, None]
+    lengths = norm(steps)[:, None]
     directions = np.where(lengths > 0, steps / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
     across = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))])
     across *= width / 2

@@ -19,7 +19,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import arctan2, cos, sin
 from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
-from lidarsim.base.vectors import length, turned
+from lidarsim.base.vectors import norm, rotate
 from lidarsim.base.words import printable
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
@@ -155,7 +155,7 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     """Convert a group of rangefinders to a sensor."""
     matrix, origins, directions = _beams(model, group, sites)
     x, y, z = directions.T
-    elevations_deg = np.array(_degrees(arctan2(z, length(directions[:, :2]))))
+    elevations_deg = np.array(_degrees(arctan2(z, norm(directions[:, :2]))))
     order = np.argsort(elevations_deg, kind="stable")  # channels are ordered by elevation
     origins = origins[order]
     beams: dict[str, Any] = {
@@ -205,8 +205,8 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
     directions = model.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
     return (
         affine(axes, center),
-        turned(positions - center, axes.T),
-        turned(directions, axes.T),
+        rotate(positions - center, axes.T),
+        rotate(directions, axes.T),
     )
 
 
@@ -226,7 +226,7 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
         right = (column + 0.5 - width / 2) / focal
         down = (row + 0.5 - height / 2) / focal
     directions = np.stack([np.ones(len(row)), -right, -down], axis=1)
-    return np.asarray(directions / length(directions)[:, None])
+    return np.asarray(directions / norm(directions)[:, None])
 
 
 def _degrees(angles: Floats) -> list[float]:

@@ -17,7 +17,7 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.scene.files.scene_graph import MeshFileError
 
 from .cross_sections import GAP_M, Intervals, RoadStations
@@ -314,7 +314,7 @@ class RoadNetwork:
         zero = np.zeros_like(heights)
         origins = np.stack([points.x, points.y, heights], axis=1)
         along = np.stack([points.cosines, points.sines, slopes], axis=1)
-        along /= length(along)[:, None]
+        along /= norm(along)[:, None]
         level_side = np.stack([-points.sines, points.cosines, zero], axis=1)
         upright = np.cross(along, level_side)
         if not roll.any():

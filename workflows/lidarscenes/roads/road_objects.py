@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import arctan2
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.scene.files.scene_graph import Piece
 
 from .cross_sections import (
@@ -183,7 +183,7 @@ class ObjectBuilder:
         starts = []
         stops = []
         for begin, end in pairwise(line):
-            size = float(length(end - begin))
+            size = float(norm(end - begin))
             first = read_non_negative(marking, "startOffset", 0.0)
             last = size - read_non_negative(marking, "stopOffset", 0.0)
             if last <= first or size <= 0:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import applied, length, matmul
+from lidarsim.base.vectors import matmul, matvec, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.files.scene_graph import Piece
 
@@ -41,7 +41,7 @@ def rotation_matrix(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Fl
 
 def transform_points(points: Floats, origin: Floats, turn: Floats) -> Floats:
     """Rotate points (n, 3) by a matrix, and translate them to an origin."""
-    return np.asarray(applied(turn, points) + origin)
+    return np.asarray(matvec(turn, points) + origin)
 
 
 def box(size: ArrayLike, origin: Floats, turn: Floats, material: str) -> Piece:
@@ -146,7 +146,7 @@ def merge_pieces(pieces: Sequence[Piece]) -> Piece:
 def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -> Piece:
     """Return level strips with a given width, centered on lines between points (n, 3)."""
     along = stops - starts
-    size = np.maximum(length(along), 1e-9)[:, None]
+    size = np.maximum(norm(along), 1e-9)[:, None]
     left = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=1) / size * (width / 2)
     points = np.concatenate([starts - left, stops - left, stops + left, starts + left])
     strip_indices = np.arange(len(starts))
@@ -159,8 +159,8 @@ def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
     """Return alternate stripes across the longest side of a convex, level outline (n, 3)."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring
-    longest = int(length(sides).argmax())
-    direction = sides[longest] / max(float(length(sides)[longest]), 1e-9)
+    longest = int(norm(sides).argmax())
+    direction = sides[longest] / max(float(norm(sides)[longest]), 1e-9)
     along = ((ring - ring[longest]) * direction).sum(axis=1)
     points: list[Floats] = []
     faces: list[Ints] = []

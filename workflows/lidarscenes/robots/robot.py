@@ -20,7 +20,7 @@ from lidarsim.base.tables import METERS, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.time_units import TimeUnit
 from lidarsim.base.validation import as_array, checked
-from lidarsim.base.vectors import applied, matmul
+from lidarsim.base.vectors import matmul, matvec
 from lidarsim.base.words import name_hint, plural
 from lidarsim.motion.pose_columns import TIME
 from lidarsim.motion.trajectory import (
@@ -260,7 +260,7 @@ class Robot:
                     hinges.append(Hinge(matrix, joint.axis, slides, value))
                     matrix = np.eye(4)
                 elif slides:
-                    matrix[:3, 3] += applied(matrix[:3, :3], joint.axis * value[0])
+                    matrix[:3, 3] += matvec(matrix[:3, :3], joint.axis * value[0])
                 elif value[0]:
                     rotation = rotation_about(joint.axis, np.degrees(value[0]))
                     matrix[:3, :3] = matmul(matrix[:3, :3], rotation)

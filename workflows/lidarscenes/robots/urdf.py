@@ -23,7 +23,7 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import is_inside
 from lidarsim.base.validation import checked
 from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.motion.rotations import rotations_of
@@ -235,7 +235,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     mimic = None
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
-        if not (size := length(axis)) > 1e-9:
+        if not (size := norm(axis)) > 1e-9:
             raise LidarError("its axis has zero length.")
         axis = axis / size
         limit = element.find("limit")

@@ -10,7 +10,7 @@ import yaml
 
 from lidarsim.base.errors import LidarError, converted
 from lidarsim.sensor_files import ray_npz
-from lidarsim.sensor_files.fired_rays import FiredRays
+from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.sensor_files.format_table import read_rays
 
 from ..writers.lidar_scenario import SCENARIO_FILE, rounded
@@ -54,7 +54,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         lines.append(
             f"files without firing times ({len(rays):,} rays are fired in {1 / rays.rate_hz:g} s)"
         )
-    ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
+    ray_npz.write(folder / _RAYS_FILE, rays.with_times(), lines)
     head = [
         f"Created from {path.name} by lidarpool import.",
         *(f"Not supported: {line}." for line in lines),
@@ -65,7 +65,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     return lines
 
 
-def _section(rays: FiredRays) -> dict[str, float | str]:
+def _section(rays: RayList) -> dict[str, float | str]:
     """Return the `sensor` section of a scenario, in which users can change the ranges."""
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}

@@ -25,7 +25,7 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import listed, printable
 from lidarsim.sensor.optics import Optics
-from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
+from lidarsim.sensor_files.fired_rays import RayList, directions_of
 
 from ..files.child_process import ReaderProcess
 from ..files.usd import USD_CORE_BYTES
@@ -71,7 +71,7 @@ class ImportedSensor(NamedTuple):
         Differences from the other program, one clause each.
     """
 
-    rays: FiredRays
+    rays: RayList
     unsupported: list[str]
 
 
@@ -143,7 +143,7 @@ def _sensor(prim: _Prim) -> ImportedSensor:
         raise ValueError(f"scanType is {kind!r}, but only SOLID_STATE and ROTARY are supported")
     pattern = fires[kind](prim, states, rate_hz)
     order = np.argsort(pattern.times_ns, kind="stable")
-    rays = FiredRays(
+    rays = RayList(
         directions_of(pattern.azimuths_deg[order], pattern.elevations_deg[order]),
         pattern.times_ns[order],
         cycle_ns=max(pattern.cycle_ns, float(pattern.times_ns.max()) + 1),

@@ -16,7 +16,7 @@ from PIL import Image
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import applied, matmul, turned
+from lidarsim.base.vectors import matmul, matvec, rotate
 from lidarsim.scene.colors import LINEAR
 from lidarsim.scene.files.scene_graph import GENERATOR
 from lidarsim.scene.scene import Scene
@@ -94,7 +94,7 @@ class _Writer:
                 matmul(matmul(to_y_up, object_parts[0].matrix), to_y_up.T).T.ravel().tolist()
             )
         elif translated:
-            node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
+            node["translation"] = matvec(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
@@ -131,7 +131,7 @@ class _Writer:
                     tints = shown.corners
             if uv is None and tints is None:
                 if points is None:
-                    vertices = turned(mesh.vertices, UP_AXES["y"].T).astype("<f4")
+                    vertices = rotate(mesh.vertices, UP_AXES["y"].T).astype("<f4")
                     points = self._array(vertices, "VEC3")
                 faces = self._array(mesh.faces[rows].astype("<u4").reshape(-1, 1), "SCALAR")
                 primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
@@ -162,7 +162,7 @@ class _Writer:
         self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
-        corners = turned(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
+        corners = rotate(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
             attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")

@@ -17,11 +17,11 @@ from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.value_texts import one_line, shown
 from ..base.vectors import (
-    applied,
     hypot,
-    length,
     matmul,
     matmul_of_components,
+    matvec,
+    norm,
 )
 from ..base.words import joined, rounded
 from .headings import CurveHeadings, Heading, headed_poses
@@ -96,7 +96,7 @@ class Pose:
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix
-        position = self.position + applied(rotation, mount.position)
+        position = self.position + matvec(rotation, mount.position)
         return Pose.from_rotation(position, matmul(rotation, mount.rotation_matrix))
 
     @classmethod
@@ -463,7 +463,7 @@ class Track:
                     f"quaternions must contain x, y, z and w for each of the {len(times)} poses, "
                     f"but has the shape {quaternions.shape}."
                 )
-            lengths = length(quaternions)
+            lengths = norm(quaternions)
             # Written so that NaN is an error.
             bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
             _check_poses(bad, "The quaternion of pose {} is not of unit length")

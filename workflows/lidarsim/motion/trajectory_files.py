@@ -16,7 +16,7 @@ from ..base.tables import column_name, find_header, read_table
 from ..base.textfile import read_text
 from ..base.time_units import TimeUnit, seconds_of
 from ..base.validation import checked
-from ..base.vectors import turned
+from ..base.vectors import rotate
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
 from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
@@ -398,7 +398,7 @@ def _table(
 
 def _from_camera(track: Track) -> Track:
     """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
-    positions = turned(track.positions, _CAMERA)
+    positions = rotate(track.positions, _CAMERA)
     if track.quaternions is None:
         return replace(track, positions=positions)
     x, y, z, w = track.quaternions.T

@@ -1,4 +1,4 @@
-"""Packets of single sweeps, for programs that move the sensor themselves."""
+"""Encode single sweeps as packets, for programs that move the sensor themselves."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Packets:
         self._prepare(survey)
 
     @classmethod
-    def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
+    def for_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
         """Create an encoder for the sensor of a scanner.
 
         `start` has the same meaning as in `Packets`.
@@ -91,7 +91,7 @@ class Packets:
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 
     def _prepare(self, survey: Survey) -> None:
-        """Make the encoder of the sensor of a survey."""
+        """Create the encoder for the sensor of a survey."""
         carried = survey.carried[0]
         self._sensor = carried.sensor
         self._returns = 2 if survey.returns_each[0].mode in TWO_RETURNS else 1

@@ -13,7 +13,7 @@ from ..base.arrays import Floats, Indices
 from ..base.elementary import interp
 from ..base.errors import LidarError, prefixed
 from ..base.validation import checked, checked_fields
-from ..base.vectors import length, products, turned
+from ..base.vectors import dot, norm, rotate
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
     CENTER,
@@ -133,7 +133,7 @@ class Actor:
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
             vertices = animation.vertices_at(self.played(np.array([time_ns]))[0])[0][0]
-        vertices = turned(vertices, None if rotations is None else rotations[0])
+        vertices = rotate(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Pictures, which call this, do not show masks.
@@ -188,10 +188,10 @@ class Actor:
             )
         positions, rotations = trajectory.poses(0, times_ns.clip(*presence_ns(trajectory)))
         steps = np.diff(positions, axis=0)
-        steps_m = length(steps)
+        steps_m = norm(steps)
         faces_travel = isinstance(trajectory, Track) and trajectory.quaternions is None
         if rotations is not None and not faces_travel:
-            backward = products(steps.T, rotations[:-1, :, 0].T) < 0
+            backward = dot(steps.T, rotations[:-1, :, 0].T) < 0
             steps_m = np.where(backward, -steps_m, steps_m)
         return times_ns, np.append(0.0, np.cumsum(steps_m))
 

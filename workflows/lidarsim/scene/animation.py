@@ -10,7 +10,7 @@ import numpy as np
 from ..base.arrays import Floats, Indices
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
-from ..base.vectors import turned
+from ..base.vectors import rotate
 
 RATE_HZ = 60.0  # least rate of baked poses
 # Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.
@@ -105,5 +105,5 @@ class Animation:
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:
         """Return the animation with all vertices at p -> linear @ p + offset."""
-        points = turned(self.vertices.reshape(-1, 3), linear) + offset
+        points = rotate(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

@@ -15,7 +15,7 @@ from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints
 from ..base.elementary import decade
 from ..base.errors import LidarError
 from ..base.validation import checked_fields
-from ..base.vectors import applied, determinant, inverse, matmul, rank
+from ..base.vectors import determinant, inverse, matmul, matvec, rank
 from ..motion.trajectory import Pose
 from .colors import Colors
 from .face_materials import FaceMaterials
@@ -105,7 +105,7 @@ class SceneInstance:
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
         """Return an instance with another name, transformed by p -> linear @ p + offset."""
-        position = applied(linear, self.matrix[:3, 3]) + offset
+        position = matvec(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
     def flat(self) -> SceneMesh:

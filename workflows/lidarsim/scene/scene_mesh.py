@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
 from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
-from ..base.vectors import determinant, length, matmul, rank, turned
+from ..base.vectors import determinant, matmul, norm, rank, rotate
 from .animation import Animation
 from .colors import Colors
 from .face_materials import FaceMaterials
@@ -166,7 +166,7 @@ class SceneMesh:
             colors = colors and colors.mirrored()
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
-        vertices = turned(self.vertices, linear) + offset
+        vertices = rotate(self.vertices, linear) + offset
         return SceneMesh(
             name=name,
             vertices=vertices,
@@ -265,5 +265,5 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 def triangle_areas(corners: AnyFloats) -> Floats:
     """Return the areas (n,) of triangles from their corners (n, 3, 3)."""
     sides = corners[:, 1:] - corners[:, :1]
-    doubled = length(np.cross(sides[:, 0], sides[:, 1]))
+    doubled = norm(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(doubled / 2, np.float64)

@@ -12,7 +12,7 @@ from ..base.arrays import Ints
 from ..base.errors import LidarError, MissingFileError
 from ..base.validation import checked
 from ..base.words import rounded
-from ..sensor_files.fired_rays import FRAME_HZ, FiredRays, Light
+from ..sensor_files.fired_rays import FRAME_HZ, Light, RayList
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
 from .optics import Optics
 from .ray_sensors import PrismSensor
@@ -42,7 +42,7 @@ class SensorFile(NamedTuple):
 
     path: Path
     format: str
-    rays: FiredRays
+    rays: RayList
     left_out: tuple[str, ...]
 
 
@@ -100,7 +100,7 @@ def export_sensor(
         raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     write = row.function("write")
     if row.describes:
-        rays = FiredRays(np.zeros((0, 3)))
+        rays = RayList(np.zeros((0, 3)))
         duration_s = _duration_ns(sensor, seconds, revolutions) / 1e9
         left_out = write(path, sensor, duration_s, _left_out(sensor, row))
     else:
@@ -117,7 +117,7 @@ def export_sensor(
 
 def fired_rays(
     sensor: Sensor, *, seconds: float | None = None, revolutions: int | None = None
-) -> FiredRays:
+) -> RayList:
     """Return the rays of a sensor's first firings, in the order of their times.
 
     Firings are whole: the last firing starts before the end of the duration. The duration is
@@ -136,7 +136,7 @@ def fired_rays(
     times_ns = times_ns[order] - min(0, times_ns.min())
     origins = sensor.origins(firings)
     channels = np.tile(np.arange(sensor.channels), count)
-    return FiredRays(
+    return RayList(
         directions=sensor.directions(firings).reshape(-1, 3)[order],
         times_ns=times_ns,
         channels=channels[order],

@@ -18,7 +18,7 @@ from ..base.elementary import arcsin, arctan2, sin_cos
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.validation import checked, checked_fields
-from ..base.vectors import turned
+from ..base.vectors import rotate
 from ..base.words import rounded
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
@@ -387,7 +387,7 @@ class Sensor:
         rotated[..., 2] = z
         if self.axes is None:
             return rotated
-        return turned(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
+        return rotate(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the start times of several firings in nanoseconds since the start of the station.

@@ -14,7 +14,7 @@ from distributed import Client
 
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
-from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
+from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from lidarsim.simulator.memory import MB, cast_bytes
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import take_snapshot
@@ -54,7 +54,7 @@ def find_workers(
     client: Client,
     required_slots: Mapping[str, int],
     requested: str,
-    advice: str = AUTO_TAKES,
+    advice: str = AUTO_ADVICE,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
     *,
@@ -287,7 +287,7 @@ def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend:
 
 
 def common_backend(
-    client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_TAKES
+    client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_ADVICE
 ) -> str:
     """Return the name of a ray-casting backend that all these workers have.
 

@@ -19,7 +19,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import rounded
 from lidarsim.sensor import Sensor
-from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
+from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 
 from ...base.field_words import differences
 from ...base.fingerprint import fingerprint
@@ -348,7 +348,7 @@ class RunStore:
     def advice(self) -> str:
         """Advice if the backend is not available, for the end of a message."""
         if not self.committed_in_words:
-            return AUTO_TAKES
+            return AUTO_ADVICE
         return (
             f"The scans in {self.location} were cast with this backend. Continue the run where "
             f"this backend is available, or remove the scans with {_DROP}."

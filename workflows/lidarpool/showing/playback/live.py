@@ -92,7 +92,7 @@ def play(
     242
     """
     keep_freed_memory()
-    packets = Packets.of_scanner(scanner, start)
+    packets = Packets.for_scanner(scanner, start)
     names = {column.name for column in scanner.survey.stored_columns}
     if missing := [name for name in packets.columns if name not in names]:
         columns = "column" if len(missing) == 1 else "columns"
