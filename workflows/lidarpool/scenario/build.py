@@ -14,9 +14,10 @@ import numpy as np
 
 from lidarscenes.robots.robot import Robot
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import check_fields, check_type
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError, Mistakes, prefixed
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.base.words import name_hint, plural
 from lidarsim.media.materials import (
     Material,
@@ -76,7 +77,6 @@ MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Job:
     """A survey of a scene, optionally with path planning.
 
@@ -116,7 +116,13 @@ class Job:
     outputs: Sequence[ExportSpec] = ()
     made_of: Sequence[tuple[str, str]] = ()
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_type(
+            "scene", self.scene, Scene, advice=" To read a file, use Scene.load('hall.glb')."
+        )
+        check_fields(self)
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)

@@ -7,6 +7,7 @@ those that `Field` or `about` state in the annotations, which scenario files use
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
 from functools import cache
@@ -214,13 +215,9 @@ def _number_words(kind: Any, limits: Mapping[str, Any]) -> str:
 
 def _list_words(kinds: Sequence[Any], limits: Mapping[str, Any]) -> str:
     """Return the lists that are allowed: «a list of 3 numbers from 0 to 1»."""
-    least = len(kinds) if len(kinds) > 1 and ... not in kinds else limits.get("min_length")
-    is_exact = least == limits.get("max_length", least)
-    count = "" if least is None else f"{'' if is_exact else 'at least '}{least} "
     item, *others = dict.fromkeys(_words(kind) for kind in kinds if kind is not ...)
     if others:
         return f"[{', '.join([item, *others])}]"
-    items = item if item == "text" else f"items, each {item}"
-    if "number" in item:
-        items = item.removeprefix("a ").replace("number", "numbers", 1)
-    return f"a list of {count}{items}"
+    item = re.sub("^an? ", "", item).replace("number", "numbers", 1)
+    count = len(kinds) if len(kinds) > 1 and ... not in kinds else limits.get("max_length")
+    return f"a list of {item}" if count is None else f"a list of {count} {item}"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
-from ..base.checks import as_array, check_fields
+from ..base.checks import as_array, check_fields, check_list
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.value_texts import shown
@@ -267,6 +267,7 @@ class Scene:
             If there are no meshes, or if the number of vertices or triangles exceeds the range of
             32-bit integers.
         """
+        check_list("meshes", meshes)
         objects = list(meshes)
         _check_objects(objects)
         split = _split_by_kind(objects)
