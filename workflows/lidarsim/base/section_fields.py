@@ -75,12 +75,12 @@ def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
     }
 
 
-def limits_of(hint: Any, names: Iterable[str] = LIMITS) -> dict[str, Any]:
+def limits_of(hint: Any) -> dict[str, Any]:
     """Return the limits of the numbers in an annotation: {name: limit}."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    limits = {name: limit for arg in inner for name, limit in limits_of(arg, names).items()}
+    limits = {name: limit for arg in inner for name, limit in limits_of(arg).items()}
     own = own_limits(getattr(hint, "__metadata__", ()))
-    return limits | {name: limit for name, limit in own.items() if name in names}
+    return limits | {name: limit for name, limit in own.items() if name in LIMITS}
 
 
 def range_words(limits: Mapping[str, Any]) -> str:
