@@ -9,11 +9,11 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields as dataclass_fields
+from dataclasses import fields
 from functools import cache
 from math import isfinite
 from types import MappingProxyType, NoneType, UnionType
-from typing import Any, Literal, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, Protocol, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -27,10 +27,7 @@ from .words import alternatives, did_you_mean
 _NO_LIMITS: Mapping[str, Any] = MappingProxyType({})
 _WITHIN = {"ge": operator.ge, "gt": operator.gt, "le": operator.le, "lt": operator.lt}
 _WHOLE = (int, np.integer)
-_REAL = (float, np.floating)
 _LISTS = (tuple, list, Sequence, Collection, Iterable)
-_NUMBERS = {float: "number", int: "whole number"}
-_SCALARS = {bool: "true or false", str: "text", NoneType: "None"}
 
 
 def check_type(name: str, value: object, *kinds: type, advice: str = "") -> None:
@@ -68,14 +65,16 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 def check_number(name: str, value: object, *, whole: bool = False, **limits: float) -> None:
     """Check that an argument is a finite number within limits: ge, gt, le and lt."""
-    if not _number_test(whole, limits)(value):
-        raise _wrong(name, value, _number_words(int if whole else float, limits))
+    rule = _number_rule(whole, limits)
+    if not rule.fits(value):
+        raise _wrong(name, value, rule.allowed)
 
 
 def check_fits(name: str, value: object, hint: Any) -> None:
     """Check that an argument has the type, the choices and the limits of an annotation."""
-    if not _cached_test_of(hint)(value):
-        raise _wrong(name, value, _words(hint))
+    rule = _cached_rule(hint)
+    if not rule.fits(value):
+        raise _wrong(name, value, rule.allowed)
 
 
 def check_fields(instance: Any) -> None:
@@ -84,10 +83,10 @@ def check_fields(instance: Any) -> None:
     Defaults are always valid. Arrays, mappings and protocols are not checked.
     """
     values = vars(instance)
-    for name, default, hint, fits in _checked_fields(type(instance)):  # type: ignore[arg-type]
+    for name, default, rule in _field_rules(type(instance)):  # type: ignore[arg-type]
         value = values[name]
-        if value is not default and not fits(value):
-            raise _wrong(name, value, _words(hint))
+        if value is not default and not rule.fits(value):
+            raise _wrong(name, value, rule.allowed)
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
@@ -106,67 +105,79 @@ def _wrong(name: str, value: object, allowed: str, advice: str = "") -> Argument
     return ArgumentError(f"{name} must be {allowed}, but is {shown(value)}.{advice}")
 
 
+class _Rule(NamedTuple):
+    """The values that an annotation allows."""
+
+    fits: Callable[[Any], bool]
+    allowed: str  # «a number from 1 to 10 or None»
+
+
 @cache
-def _checked_fields(kind: type) -> Sequence[tuple[str, Any, Any, Callable[[Any], bool]]]:
-    """Return the fields of a dataclass: name, default, annotation, and a test of the value."""
+def _field_rules(kind: type) -> Sequence[tuple[str, Any, _Rule]]:
+    """Return the fields of a dataclass: name, default, and allowed values."""
     hints = get_type_hints(kind, include_extras=True)
-    return [
-        (field.name, field.default, hints[field.name], _test_of(hints[field.name]))
-        for field in dataclass_fields(kind)
-    ]
+    return [(field.name, field.default, _rule(hints[field.name])) for field in fields(kind)]
 
 
-def _test_of(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> Callable[[Any], bool]:
-    """Return a function that tests whether a value has the type and limits of an annotation."""
+def _rule(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> _Rule:
+    """Return the values that an annotation allows, within limits of the annotation around it."""
     origin = get_origin(hint)
     args = get_args(hint)
     if notes := getattr(hint, "__metadata__", ()):
-        return _test_of(args[0], own_limits(notes))
+        return _rule(args[0], own_limits(notes))
     if origin in (Union, UnionType):
-        tests = [_test_of(arg, limits) for arg in args]
-        return lambda value: any(test(value) for test in tests)
+        rules = [_rule(arg, limits) for arg in args]
+        words = alternatives([*dict.fromkeys(rule.allowed for rule in rules)])
+        return _Rule(lambda value: any(rule.fits(value) for rule in rules), words)
     if origin is Literal:
-        return lambda value: isinstance(value, (str, *_WHOLE)) and value in args
+        words = alternatives([*map(repr, args)])
+        return _Rule(lambda value: isinstance(value, (str, *_WHOLE)) and value in args, words)
     if origin in _LISTS:
-        return _list_test(origin, args, limits)
-    if hint in _NUMBERS:
-        return _number_test(hint is int, limits)
+        return _list_rule([_rule(arg) for arg in args if arg is not ...], limits)
+    if hint in (int, float):
+        return _number_rule(hint is int, limits)
     if hint is str:
-        return lambda value: isinstance(value, str) and _has_length(value, limits)
+        return _Rule(lambda value: isinstance(value, str) and _has_length(value, limits), "text")
     if hint is bool:
-        return lambda value: isinstance(value, (bool, np.bool_))
+        return _Rule(lambda value: isinstance(value, (bool, np.bool_)), "true or false")
     if hint is Any or origin or not isinstance(hint, type) or Protocol in hint.__bases__:
-        return lambda value: True  # such as functions, mappings and arrays
-    return lambda value: isinstance(value, hint)
+        name = getattr(origin or hint, "__name__", str(hint))
+        return _Rule(lambda value: True, with_article(name))  # functions, mappings and arrays
+    words = "None" if hint is NoneType else with_article(hint.__name__)
+    return _Rule(lambda value: isinstance(value, hint), words)
 
 
-_cached_test_of = cache(_test_of)
+_cached_rule = cache(_rule)
 
 
-def _list_test(
-    origin: Any, args: tuple[Any, ...], limits: Mapping[str, Any]
-) -> Callable[[Any], bool]:
-    """Return `_test_of` an annotation of a list, whose iterators are not read."""
-    tests = [_test_of(arg) for arg in args if arg is not ...]
-    is_fixed = origin is tuple and ... not in args
+def _list_rule(items: Sequence[_Rule], limits: Mapping[str, Any]) -> _Rule:
+    """Return the rule of a list of items, or of a tuple with a rule for each item.
 
-    def fits(value: Any) -> bool:
-        if isinstance(value, (str, bytes)) or not isinstance(value, Collection):
-            return isinstance(value, Iterator)
-        if isinstance(value, np.ndarray) and not value.ndim:
+    Iterators are not read.
+    """
+    count = limits.get("max_length") if len(items) == 1 else len(items)
+
+    def fits(values: Any) -> bool:
+        if isinstance(values, (str, bytes)) or not isinstance(values, Collection):
+            return isinstance(values, Iterator)
+        if isinstance(values, np.ndarray) and not values.ndim:
             return False
-        if is_fixed:
-            return len(value) == len(tests) and all(
-                test(item) for test, item in zip(tests, value, strict=True)
-            )
-        return _has_length(value, limits) and all(map(tests[0], value))
+        if len(items) == 1:
+            return _has_length(values, limits) and all(map(items[0].fits, values))
+        return len(values) == len(items) and all(
+            item.fits(value) for item, value in zip(items, values, strict=True)
+        )
 
-    return fits
+    words = list(dict.fromkeys(item.allowed for item in items))
+    if len(words) > 1:
+        return _Rule(fits, f"[{', '.join(words)}]")
+    item = re.sub("^an? ", "", words[0]).replace("number", "numbers", 1)
+    return _Rule(fits, f"a list of {item}" if count is None else f"a list of {count} {item}")
 
 
-def _number_test(whole: bool, limits: Mapping[str, Any]) -> Callable[[Any], bool]:
-    """Return a function that tests for a number within limits, which is finite by default."""
-    kinds = _WHOLE if whole else _WHOLE + _REAL
+def _number_rule(whole: bool, limits: Mapping[str, Any]) -> _Rule:
+    """Return the rule of a number, which is finite by default."""
+    kinds = _WHOLE if whole else (float, np.floating, *_WHOLE)
     bounds = [(_WITHIN[name], limits[name]) for name in LIMITS if name in limits]
     may_be_infinite = limits.get("allow_inf_nan", False)
 
@@ -180,44 +191,10 @@ def _number_test(whole: bool, limits: Mapping[str, Any]) -> Callable[[Any], bool
             and all(within(value, limit) for within, limit in bounds)
         )
 
-    return fits
+    noun = "whole number" if whole else "number" if bounds or may_be_infinite else "finite number"
+    return _Rule(fits, f"a {noun} {range_words(limits)}".rstrip())
 
 
 def _has_length(value: Any, limits: Mapping[str, Any]) -> bool:
     """Return whether a list or text is neither too short nor too long."""
     return limits.get("min_length", 0) <= len(value) <= limits.get("max_length", len(value))
-
-
-def _words(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> str:
-    """Return the values that an annotation allows: «a number from 1 to 10 or None»."""
-    args = get_args(hint)
-    if hint in _NUMBERS:
-        return _number_words(hint, limits)
-    if hint in _SCALARS:
-        return "a text that is not empty" if limits.get("min_length") == 1 else _SCALARS[hint]
-    if notes := getattr(hint, "__metadata__", ()):
-        return _words(args[0], own_limits(notes))
-    origin = get_origin(hint)
-    if origin in (Union, UnionType):
-        return alternatives([*dict.fromkeys(_words(arg, limits) for arg in args)])
-    if origin is Literal:
-        return alternatives([*map(repr, args)])
-    if origin in _LISTS:
-        return _list_words(args, limits)
-    return with_article(getattr(origin or hint, "__name__", str(hint)))
-
-
-def _number_words(kind: Any, limits: Mapping[str, Any]) -> str:
-    bounds = range_words(limits)
-    is_finite = kind is float and not bounds and not limits.get("allow_inf_nan")
-    return f"a {'finite ' * is_finite}{_NUMBERS[kind]} {bounds}".rstrip()
-
-
-def _list_words(kinds: Sequence[Any], limits: Mapping[str, Any]) -> str:
-    """Return the lists that are allowed: «a list of 3 numbers from 0 to 1»."""
-    item, *others = dict.fromkeys(_words(kind) for kind in kinds if kind is not ...)
-    if others:
-        return f"[{', '.join([item, *others])}]"
-    item = re.sub("^an? ", "", item).replace("number", "numbers", 1)
-    count = len(kinds) if len(kinds) > 1 and ... not in kinds else limits.get("max_length")
-    return f"a list of {item}" if count is None else f"a list of {count} {item}"
