@@ -376,7 +376,7 @@ def test_one_subray_without_noise_is_the_plain_ray():
         (lambda: Material("*", float("nan")), "reflectance must .* but is nan"),
         (lambda: Material([]), "objects must .* but is"),
         (lambda: Returns(subrays=8), "must be 1, 7, 19, 37"),
-        (lambda: Noise(dropout=2), "dropout must be from 0 to 1, but is 2"),
+        (lambda: Noise(dropout=2), "dropout must be a number from 0 to 1, but is 2"),
         (
             lambda: Survey(poses=[(0, 0, 1)], returns=Returns(subrays=7)),
             "beam divergence of the sensor is unknown",

@@ -770,7 +770,7 @@ def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
         ({"path": "rays.npz", "seconds": -1}, "seconds"),
         (
             {"path": "rays.npz", "sensor": "vlp16"},
-            "sensor must be a Sensor, but is a str. Load one with load_sensor",
+            "sensor must be a Sensor, but is 'vlp16'. Load one with load_sensor",
         ),
     ],
 )

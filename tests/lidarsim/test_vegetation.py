@@ -194,9 +194,9 @@ def test_a_surface_with_gaps_is_refused():
         ({"leaf_area_density": 1.0, "transparent": "pass"}, "cannot be combined with transparent"),
         (
             {"leaf_area_density": 1.0, "leaf_angle": "flat"},
-            "leaf_angle must be one of .* but is 'flat'",
+            "leaf_angle must be 'spherical', .* but is 'flat'",
         ),
-        ({"leaf_area_density": 0.0}, "leaf_area_density must be above 0 .* but is 0.0"),
+        ({"leaf_area_density": 0.0}, "leaf_area_density must be a number above 0 .* but is 0.0"),
     ],
 )
 def test_materials_that_mean_nothing_are_refused(fields, says):

@@ -15,8 +15,6 @@ from matplotlib.colors import LogNorm, Normalize
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import explained
 from lidarsim.base.even_samples import even_indices
-from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
@@ -53,8 +51,6 @@ MIN_DISTANCE_M = 0.001  # end of the scale of distances
 class Comparison:
     """Result of `compare`, which is printed as a table."""
 
-    __signature__ = ReadableSignature()
-
     figures: dict[str, Any]  # content of compare.json; lengths in meters, None for unknown
     images: RangeImages | None  # images of the first pair of sweeps that has any
     residuals: Floats  # (k,): of all cells with a return in both, or of a choice, meters
@@ -67,7 +63,6 @@ class Comparison:
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")
 
-    @checked
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and the pictures, and return their paths.
 

@@ -11,9 +11,9 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from lidarsim.base.checks import check_list, check_type
 from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import listed
 
 from ..base.field_words import differences
@@ -97,7 +97,6 @@ class _ShardFolder:
         return properties | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
-@checked
 def merge(
     shards: Sequence[str | Path | Storage],
     out: str | Path | Storage,
@@ -136,6 +135,8 @@ def merge(
         If shards are missing, damaged, passed twice or unfinished, or come from different runs or
         software versions. The message names the shards.
     """
+    check_list("shards", shards)
+    check_type("out", out, str, Path, Storage)
     target = output_place(str(out))
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}

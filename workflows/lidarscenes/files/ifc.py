@@ -25,7 +25,6 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.elementary import arctan2
 from lidarsim.base.extras import install_command
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -87,7 +86,6 @@ _EMPTY = "contains no elements with geometry, such as walls or slabs, in the sel
 
 
 @dataclass(frozen=True)
-@checked_fields
 class IfcOptions:
     """Options for reading buildings."""
 

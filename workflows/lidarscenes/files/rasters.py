@@ -22,12 +22,12 @@ import numpy as np
 
 from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
+from lidarsim.base.checks import check_fields
 from lidarsim.base.declared import Rectangle, about
 from lidarsim.base.elementary import decade
-from lidarsim.base.errors import CutShortError
+from lidarsim.base.errors import ArgumentError, CutShortError
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.scene.files.coordinate_systems import (
@@ -86,7 +86,6 @@ _NO_DATA = -9999.0  # many programs use this value without declaring it
 
 
 @dataclass(frozen=True)
-@checked_fields
 class RasterOptions:
     """Options for reading elevation rasters."""
 
@@ -100,6 +99,16 @@ class RasterOptions:
     ] = None
     # Coordinate system of the mesh, `world.epsg` in scenarios; None chooses one for the file.
     epsg: EpsgCode | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.window is not None:
+            x0, y0, x1, y1 = self.window
+            if not (x0 < x1 and y0 < y1):
+                raise ArgumentError(
+                    "window must be [x0, y0, x1, y1] with the lower corner first, but is "
+                    f"{list(self.window)}."
+                )
 
 
 def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:

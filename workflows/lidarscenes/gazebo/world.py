@@ -20,7 +20,6 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import about
 from lidarsim.base.errors import prefixed
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import listed, printable
 from lidarsim.scene.files.scene_graph import (
@@ -54,7 +53,6 @@ _REACH_M = np.array([1e7, 1e7, 1e6])
 
 
 @dataclass(frozen=True)
-@checked_fields
 class GazeboOptions:
     """Options for reading Gazebo worlds."""
 

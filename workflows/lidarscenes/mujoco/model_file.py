@@ -23,7 +23,6 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import listed, name_hint, printable
 from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
@@ -60,7 +59,6 @@ _MAX_SAG_M = 1.0
 
 
 @dataclass(frozen=True)
-@checked_fields
 class MujocoOptions:
     """Options for reading MuJoCo models."""
 

@@ -8,14 +8,13 @@ longer than a thousand.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.checks import check_fits, check_number
 from lidarsim.base.declared import Seed
-from lidarsim.base.validation import checked
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 
@@ -46,12 +45,11 @@ _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
 
-@checked
 def city(
-    triangles: Annotated[int, Field(ge=1_000, le=100_000_000)] = 100_000,
-    seed: Seed = 0,
-    trees: Annotated[int, Field(ge=0, le=MAX_TREES)] = 0,
-    cars: Annotated[int, Field(ge=0, le=MAX_CARS)] = 0,
+    triangles: int = 100_000,
+    seed: int = 0,
+    trees: int = 0,
+    cars: int = 0,
 ) -> Scene:
     """Return a city with a given number of triangles.
 
@@ -85,6 +83,10 @@ def city(
     >>> scene.names[:2], 19_800 <= len(scene.faces) <= 20_000
     (('ground', 'pavement'), True)
     """
+    check_number("triangles", triangles, whole=True, ge=1_000, le=100_000_000)
+    check_fits("seed", seed, Seed)
+    check_number("trees", trees, whole=True, ge=0, le=MAX_TREES)
+    check_number("cars", cars, whole=True, ge=0, le=MAX_CARS)
     kinds = city_kinds.all_kinds(seed)
     solids = [solid for group in kinds.values() for solid in group]
     sizes = np.array([len(solid.faces) for solid in solids])

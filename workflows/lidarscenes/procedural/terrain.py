@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.checks import check_fits, check_number
 from lidarsim.base.declared import Seed
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -36,13 +33,11 @@ _WOOD_CELLS = 20  # minimum size of woods in cells
 _DENSER = 5.0  # logarithm of the density ratio between woods and open land
 
 
-@checked
 def terrain(
-    triangles: Annotated[int, Field(ge=2, le=100_000_000)] = 2_000_000,
-    seed: Seed = 0,
-    # Files reject coordinates beyond 1e8 m.
-    side_m: Annotated[float, Field(gt=0, le=1e7)] = 1000.0,
-    trees: Annotated[int, Field(ge=0, le=MAX_TREES)] = 0,
+    triangles: int = 2_000_000,
+    seed: int = 0,
+    side_m: float = 1000.0,
+    trees: int = 0,
 ) -> Scene:
     """Return a square of fractal terrain with ridges and valleys at every scale.
 
@@ -73,6 +68,10 @@ def terrain(
     >>> len(terrain(2_000).faces)
     1984
     """
+    check_number("triangles", triangles, whole=True, ge=2, le=100_000_000)
+    check_fits("seed", seed, Seed)
+    check_number("side_m", side_m, gt=0, le=1e7)  # files reject coordinates beyond 1e8 m
+    check_number("trees", trees, whole=True, ge=0, le=MAX_TREES)
     rows = int(np.sqrt(triangles / 2))
     columns = triangles // (2 * rows)
     x = np.linspace(0, 1, columns + 1)

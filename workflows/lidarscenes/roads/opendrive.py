@@ -18,7 +18,6 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import about
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -54,7 +53,6 @@ Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
 
 
 @dataclass(frozen=True)
-@checked_fields
 class RoadOptions:
     """Options for reading roads."""
 

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import as_array, check_fits, check_list
 from lidarsim.base.elementary import interp, sin_cos
 from lidarsim.base.errors import LidarError, message_of
-from lidarsim.base.signatures import ReadableSignature, shown_readably
 from lidarsim.base.tables import METERS, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.time_units import TimeUnit
-from lidarsim.base.validation import as_array, checked
 from lidarsim.base.vectors import matmul, matvec
 from lidarsim.base.words import name_hint, plural
 from lidarsim.motion.pose_columns import TIME
@@ -105,8 +104,6 @@ class Robot:
         {link: mesh in the frame of the link}, for all links with a visual mesh.
     """
 
-    __signature__ = ReadableSignature()
-
     name: str
     links: tuple[str, ...]
     joints: Mapping[str, Joint]
@@ -136,7 +133,6 @@ class Robot:
         """Names of the movable joints."""
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
-    @shown_readably
     def path(
         self,
         link: str,
@@ -159,8 +155,6 @@ class Robot:
             raise LidarError(f"{self.name} has no link {link!r}.{name_hint(link, self.links)}")
         return self._path(link, trajectory, *self._values(joints, ignore, time_unit))
 
-    @checked
-    @shown_readably
     def actors(
         self,
         trajectory: Trajectory = AT_ZERO,
@@ -199,6 +193,7 @@ class Robot:
         LidarError
             If the joint values cannot be used.
         """
+        check_list("without", without)
         times_s, values = self._values(joints, ignore, time_unit, tell)
         robot_name = self.name if name is None else name
         return tuple(
@@ -279,6 +274,8 @@ class Robot:
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
         """Return the times (k,) in seconds, and the values (k,) of all movable joints by name."""
+        check_fits("time_unit", time_unit, TimeUnit | None)
+        check_list("ignore", ignore)
         table: dict[str, Any] = {}
         if isinstance(joints, (str, Path)):
             table = self._read_values(Path(joints), ignore, time_unit)

@@ -18,10 +18,10 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Bytes, Floats
+from lidarsim.base.checks import check_fits
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import is_inside
-from lidarsim.base.validation import checked
 from lidarsim.base.value_texts import shown
 from lidarsim.base.vectors import norm
 from lidarsim.base.words import printable
@@ -46,7 +46,6 @@ _MAX_NUMBER = 1e8  # largest number in a file
 _NO_FOLDERS = ("", ".", "..")  # parts of a path that are not names of folders
 
 
-@checked
 def load_robot(
     path: str | Path,
     *,
@@ -88,6 +87,7 @@ def load_robot(
         If the file or a mesh cannot be read, or if the joints do not form a tree.
     """
     path = Path(path)
+    check_fits("opacity", opacity, OpacityMode)
     root, size = _read_root(path)
     with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused later
         name = printable(root.get("name", "")) or path.stem

@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from .checks import check_type
 from .checksum import crc32
 from .errors import LidarError
 from .extras import install_command
@@ -78,6 +79,7 @@ class Storage:
         """
         if isinstance(location, Storage):
             return location
+        check_type("location", location, str, Path)
         text = str(location)
         if not is_url(text):
             path = str(Path(text).absolute())

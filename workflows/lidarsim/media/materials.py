@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from pydantic import Field, WrapValidator
 
 from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
+from ..base.checks import check_fields
+from ..base.declared import FileSection, TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
-from ..base.value_texts import shown
+from ..base.value_texts import one_line, shown
 from ..base.words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
@@ -88,8 +88,7 @@ def reflectances() -> dict[str, Measured]:
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Material:
+class Material(FileSection):
     """Optical properties and semantic class of surfaces.
 
     A material selects objects by name, faces by the name of their material in the scene file, or
@@ -208,7 +207,10 @@ class Material:
         ),
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.objects is None and self.material is None:
             raise LidarError(
                 'A material must apply to something. Set objects, such as `objects: "*"`, or '

@@ -24,13 +24,14 @@ import numpy as np
 from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import MinMax, Seed, Several, UnitShare, about
+from ..base.checks import check_fields, check_order
+from ..base.declared import FileSection, MinMax, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
 from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarError
 from ..base.extras import install_command
 from ..base.random_numbers import Purpose, named_seed, normal
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import hypot, matmul, matvec, norm, rotate, rotate_into_frames
 from .rotations import rotation_sines
 from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
@@ -57,8 +58,7 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Imu:
+class Imu(FileSection):
     """An inertial measurement unit (IMU) on the platform.
 
     By default, the measurements have no errors.
@@ -109,10 +109,14 @@ class Imu:
         Skew, about("standard deviation in degrees of the misalignment between axes")
     ] = 0.0
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
-@checked_fields
-class Gnss:
+class Gnss(FileSection):
     """A GNSS receiver on the platform.
 
     By default, the measurements have no errors.
@@ -160,10 +164,16 @@ class Gnss:
         ),
     ] = None
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for index, outage in enumerate(self.outages):
+            check_order(f"outages[{index}]", outage)
+
 
 @dataclass(frozen=True)
-@checked_fields
-class Navigation:
+class Navigation(FileSection):
     """Instruments that measure the motion of the platform.
 
     Their samples are written to files next to the point cloud.
@@ -207,6 +217,11 @@ class Navigation:
         ),
     ] = 9.80665
     seed: Annotated[Seed, about("seed of the errors; the same seed produces the same errors")] = 0
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 class ImuSamples(NamedTuple):

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats, Indices
+from ..base.checks import check_fields, check_fits
 from ..base.elementary import interp
 from ..base.errors import LidarError, prefixed
-from ..base.validation import checked, checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import dot, norm, rotate
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
@@ -21,6 +22,7 @@ from ..motion.trajectory import (
     Stations,
     Track,
     Trajectory,
+    check_trajectory_type,
     full_poses,
     presence_ns,
 )
@@ -46,7 +48,6 @@ class ActorSamples(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Actor:
     """An object that moves during a survey.
 
@@ -77,7 +78,11 @@ class Actor:
     offset_s: float = 0.0
     spray: bool = True
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
+        check_trajectory_type("trajectory", self.trajectory)
         if self.mesh.voxels is not None:
             raise LidarError(
                 f"{self.name!r} contains voxels, which cannot move. List it in scene.files or "
@@ -308,7 +313,6 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     return SceneMesh(name, *parts, colors=colors, animation=animation, materials=materials)
 
 
-@checked
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
     """Create a box mesh whose origin is the center of its bottom face.
 
@@ -324,6 +328,7 @@ def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
     >>> box("Car", (4.5, 1.8, 1.5)).bounds.tolist()
     [[-2.25, -0.9, 0.0], [2.25, 0.9, 1.5]]
     """
+    check_fits("size_m", size_m, tuple[float, float, float])
     corners = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     sides = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     faces = [[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides]

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32
+from ..base.checks import check_fields
 from ..base.elementary import decade
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import determinant, inverse, matmul, matvec, rank
 from ..motion.trajectory import Pose
 from .colors import Colors
@@ -29,7 +30,6 @@ BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class SceneInstance:
     """A mesh that is placed in the world.
 
@@ -57,7 +57,10 @@ class SceneInstance:
     transform: ArrayLike | Transform | Pose
     name: str = ""
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         transform = self.transform
         if isinstance(transform, Pose):
             transform = Transform(transform.rotation_matrix, np.array(transform.position))

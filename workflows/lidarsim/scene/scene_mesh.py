@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
+from ..base.checks import as_array, check_fields
 from ..base.errors import LidarError
-from ..base.validation import as_array, checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import determinant, matmul, norm, rank, rotate
 from .animation import Animation
 from .colors import Colors
@@ -63,7 +64,6 @@ class Voxels:
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class SceneMesh:
     """Triangle mesh of an object in world coordinates.
 
@@ -103,7 +103,10 @@ class SceneMesh:
     animation: Animation | None = None
     materials: FaceMaterials | None = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
+from ..base.checks import as_array
 from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarError
-from ..base.validation import as_array
 from ..base.vectors import matmul, matvec, norm, rank
 from ..motion.trajectory import Pose
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Ints
+from ..base.checks import check_fits, check_type
 from ..base.errors import LidarError, MissingFileError
-from ..base.validation import checked
 from ..base.words import rounded
 from ..sensor_files.fired_rays import FRAME_HZ, Light, RayList
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
@@ -46,14 +46,13 @@ class SensorFile(NamedTuple):
     left_out: tuple[str, ...]
 
 
-@checked
 def export_sensor(
     sensor: Any,
     path: str | Path,
     *,
     format: str | None = None,  # noqa: A002 - the name of the option
-    seconds: Seconds | None = None,
-    revolutions: Revolutions | None = None,
+    seconds: float | None = None,
+    revolutions: int | None = None,
 ) -> SensorFile:
     """Export the rays or the optics of a sensor to a file for another program.
 
@@ -91,11 +90,9 @@ def export_sensor(
     """
     path = Path(path)
     row = format_of(path, format)
-    if not isinstance(sensor, Sensor):
-        raise LidarError(
-            f"sensor must be a Sensor, but is a {type(sensor).__name__}. Load one with "
-            "load_sensor(MODEL)."
-        )
+    check_type("sensor", sensor, Sensor, advice=" Load one with load_sensor(MODEL).")
+    check_fits("seconds", seconds, Seconds | None)
+    check_fits("revolutions", revolutions, Revolutions | None)
     if not path.parent.is_dir():
         raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     write = row.function("write")

@@ -16,9 +16,9 @@ from pydantic import Field
 from raybeam.poses import check_poses
 
 from ..base.arrays import Floats, Floats32, Indices
+from ..base.checks import check_fits, check_type
 from ..base.declared import Names
 from ..base.errors import LidarError
-from ..base.validation import checked
 from ..base.value_texts import shown
 from ..base.words import name_hint
 from ..columns.cloud import Cloud
@@ -96,7 +96,6 @@ class Scanner:
     (2, 1809, 16)
     """
 
-    @checked
     def __init__(
         self,
         scene: Scene,
@@ -121,6 +120,7 @@ class Scanner:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
+        check_type("scene", scene, Scene, advice=" To read a file, use Scene.load('hall.glb').")
         if name and isinstance(sensor, Mounted):
             raise LidarError(
                 f"The name of a Mounted sensor is set in Mounted, but name is {name!r}. Use "
@@ -210,10 +210,7 @@ class Scanner:
         """The scene, with actors and instances at their current poses."""
         return self._rig.scene
 
-    @checked
-    def span_s(
-        self, number: SweepNumber = 0, *, start_s: StartSeconds = None
-    ) -> tuple[float, float]:
+    def span_s(self, number: int = 0, *, start_s: float | None = None) -> tuple[float, float]:
         """Return the firing times of the first and the last beam of a sweep, in seconds.
 
         `number` and `start_s` are the same as in `sweep`, but `number` is 0 by default.
@@ -224,13 +221,12 @@ class Scanner:
         last_delay_ns = float(rig.survey.sensor.beams.time_ns.max())
         return begin_ns / 1e9, (end_ns + last_delay_ns) / 1e9
 
-    @checked
     def sweep(
         self,
         pose: Pose | Trajectory | Sequence[float],
         *,
-        number: SweepNumber | None = None,
-        start_s: StartSeconds = None,
+        number: int | None = None,
+        start_s: float | None = None,
     ) -> Cloud:
         """Simulate a sweep, which is one revolution of the head or one frame.
 
@@ -285,13 +281,12 @@ class Scanner:
         part = replace(part, columns={**part.columns, **owned_columns})
         return part.cloud(table, survey.precision_m, origin)
 
-    @checked
     def ranges(
         self,
         poses: Pose | ArrayLike,
         *,
-        number: SweepNumber | None = None,
-        start_s: StartSeconds = None,
+        number: int | None = None,
+        start_s: float | None = None,
     ) -> Floats32:
         """Simulate the range images that the sensor measures from several poses.
 
@@ -334,7 +329,6 @@ class Scanner:
                 raise LidarError(str(error)) from error
             return rig.ranges(specs, checked_poses.positions, checked_poses.rotations)
 
-    @checked
     def move(
         self,
         name: str | Sequence[str],
@@ -517,6 +511,8 @@ class Scanner:
         The random numbers are those of the revolution that follows `revolutions_ahead` later
         (`ScanSpec.ahead`).
         """
+        check_fits("number", number, SweepNumber)
+        check_fits("start_s", start_s, StartSeconds)
         sensor = rig.survey.sensor
         specs = self._revolution(sensor, number)
         if specs[-1].scan >= MAX_SCANS:

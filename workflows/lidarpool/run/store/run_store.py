@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import rounded
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
@@ -551,7 +550,6 @@ def parts_of(location: Storage, parts_location: str) -> Storage:
     return Storage.at(folder or "/").below(name) if parts_location else location.below(PARTS)
 
 
-@checked
 def remove_run(folder: str | Path | Storage) -> None:
     """Remove a stored run and its parts, but no other files.
 

@@ -20,9 +20,9 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, AnyFloats, Floats
+from lidarsim.base.checks import check_items
 from lidarsim.base.errors import LidarError
 from lidarsim.base.notebook import cell_display
-from lidarsim.base.validation import checked
 from lidarsim.base.words import rounded
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
@@ -53,7 +53,6 @@ MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a senso
 _RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
 
 
-@checked
 def show(
     scanner: Scanner | Sequence[Scanner], *, to: str | None = None, browser: bool = False
 ) -> ScannerPage:
@@ -92,7 +91,9 @@ def show(
     ...         pose = Pose((0.1 * number, 0, 1))
     ...         view.show(scanner.sweep(pose), pose)
     """
-    return ScannerPage([scanner] if isinstance(scanner, Scanner) else [*scanner], to, browser)
+    scanners = [scanner] if isinstance(scanner, Scanner) else scanner
+    check_items("scanner", scanners, Scanner)
+    return ScannerPage([*scanners], to, browser)
 
 
 class ScannerPage(ScannerView):

@@ -26,7 +26,6 @@ from ...base.errors import (
 )
 from ...base.extras import install_command
 from ...base.input_files import not_found, open_input, read_input
-from ...base.validation import checked
 from ...base.vectors import determinant, matmul, rotate
 from ...base.vocabulary import UNITS_M
 from ...base.words import as_python, listed, plural, printable, rounded
@@ -97,7 +96,6 @@ class Objects(NamedTuple):
         return (*self.static, *map(_mesh_at_start, self.actors))
 
 
-@checked
 def load_objects(
     path: str | Path,
     *,
