@@ -214,7 +214,7 @@ def test_keywords_are_the_options_of_runs():
     """But for the place of a result, ways to a cluster, and what only commands do at the end."""
     keywords = get_type_hints(RunKeywords)
     options = get_type_hints(RunOptions)
-    assert options.keys() - keywords.keys() == {"out", "stay", "scheduler", "files", "cluster"}
+    assert options.keys() - keywords.keys() == {"stay", "scheduler", "files", "cluster"}
     assert keywords.keys() <= options.keys()
     for name, hint in keywords.items():
         assert hint in (options[name], options[name] | None), name

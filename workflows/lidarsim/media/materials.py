@@ -49,22 +49,29 @@ SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
 
 
-def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
-    """Raise ValueError for names of classes that files cannot hold, or that two classes share."""
-    if not isinstance(names, Mapping):
-        return handler(names)
+def class_names_problem(names: Mapping[Any, Any]) -> str:
+    """Return why names of classes, {number: name}, cannot be stored in files, or an empty string.
+
+    Two classes must not have the same name.
+    """
     for number, name in names.items():
         valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
         unique = [*names.values()].count(name) == 1
         if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
-            raise ValueError(
+            return (
                 "expected whole numbers from 0 to 65535 with unique names, such as {10: car}, "
                 f"but found {shown({number: name})}."
             )
+    return ""
+
+
+def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
+    if isinstance(names, Mapping) and (problem := class_names_problem(names)):
+        raise ValueError(problem)
     return handler(names)
 
 
-ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_validate_names)]
 
 
 class Measured(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
@@ -17,7 +17,7 @@ from pydantic import AwareDatetime, Field, Strict
 from ..base.arrays import Floats, Ints
 from ..base.checks import check_fields, check_type
 from ..base.declared import FILLED_IN, FileSection, Names, Several, about, written_as
-from ..base.errors import LidarError
+from ..base.errors import ArgumentError, LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.value_texts import one_line, shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
@@ -31,7 +31,7 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
-from ..media.materials import ClassNames, Material
+from ..media.materials import ClassNames, Material, class_names_problem
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
 from ..motion.navigation import Navigation, check_navigation
 from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, check_trajectory_type, pose_of
@@ -298,6 +298,9 @@ class Survey(CloudOptions, Weather):
     def __post_init__(self) -> None:
         check_type("sensor", self.sensor, Sensor, advice=_ON_SENSORS)
         check_fields(self)
+        check_type("classes", self.classes, Mapping)
+        if problem := class_names_problem(self.classes):
+            raise ArgumentError(f"classes: {problem}")
         if self.trajectory is not None:
             check_trajectory_type("trajectory", self.trajectory)
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
