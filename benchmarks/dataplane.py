@@ -149,17 +149,15 @@ def first_scans(part: PartColumns, first: int, scans: int) -> PartColumns:
 # -- the run --------------------------------------------------------------------------------------
 
 
-class CountedOutput(SurveyOutput):
-    """The result of a survey, which notes the sizes of the parts."""
+class CountingPage(RunPage):
+    """Page of a run that notes the sizes of the parts."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def __init__(self) -> None:
         self.part_sizes: list[int] = []  # bytes of each committed part
 
-    def add_parts(self, parts: Sequence[Receipt]) -> None:
-        """Note the sizes of committed parts, and append the parts to the cloud."""
-        self.part_sizes += [part.size for part in parts]
-        super().add_parts(parts)
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
+        """Note the sizes of committed parts."""
+        self.part_sizes += [part.size for part in receipts]
 
 
 @dataclass(frozen=True)
@@ -219,10 +217,10 @@ class Cluster:
         """Return the bytes that casting workers have sent so far."""
         return sum(self._client.run(sent_bytes, workers=self._casting).values())
 
-    def run(self, folder: Path, scans: int) -> tuple[int, float, CountedOutput]:
+    def run(self, folder: Path, scans: int) -> tuple[int, float, CountingPage]:
         """Run a survey into a folder; return its points, the seconds until stage 4 has ended."""
         survey = still_survey(self._sizes, scans)
-        output = CountedOutput(folder, survey, (), "cloud")
+        output = SurveyOutput(folder, survey, (), "cloud")
         options = RunOptions(
             client=self._client,
             folder=folder / RUN_FOLDER,
@@ -230,8 +228,9 @@ class Cluster:
         )
         jobs = OneJob(Job(HALL, survey, None))
         screen = Screen(lambda _: None)
-        result, _ = run_survey(jobs, options, output, screen, RunPage())
-        return len(result.points), result.survey_seconds, output
+        page = CountingPage()
+        result, _ = run_survey(jobs, options, output, screen, page)
+        return len(result.points), result.survey_seconds, page
 
 
 @contextmanager
@@ -252,7 +251,7 @@ def measure_run(cluster: Cluster, sizes: Sizes, folder: Path) -> tuple[dict[str,
     before = cluster.usage()
     sent = cluster.sent()
     start = time.perf_counter()
-    points, survey_s, output = cluster.run(folder, sizes.scans)
+    points, survey_s, page = cluster.run(folder, sizes.scans)
     wall_s = time.perf_counter() - start
     after = cluster.usage()
     processes = {
@@ -273,7 +272,7 @@ def measure_run(cluster: Cluster, sizes: Sizes, folder: Path) -> tuple[dict[str,
         "ns": sum(process["ns"] for process in processes.values()),
         "processes": processes,
     }
-    return figures, [*output.part_sizes, (folder / CLOUD).stat().st_size]
+    return figures, [*page.part_sizes, (folder / CLOUD).stat().st_size]
 
 
 # -- beside it ------------------------------------------------------------------------------------

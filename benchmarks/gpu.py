@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from raybeam import available_backends
-from raybeam.registry import choose
+from raybeam.registry import choose_backend
 
 from .gpu_clock import QUICK, Session, Sizes, clocks
 
@@ -224,7 +224,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
     end = time.monotonic() + 0.7 * seconds  # then a row has time to end
     try:
         section = getattr(importlib.import_module(f".{module}", __package__), name)
-        cupy = choose("cuda").load_cupy()  # type: ignore[attr-defined]
+        cupy = choose_backend("cuda").load_cupy()  # type: ignore[attr-defined]
         for title, row in section(Session(cupy, sizes, folder)):
             rows[title] = row
             print(f"{name}: {title}: {shown(row)}", flush=True)

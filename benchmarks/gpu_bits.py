@@ -120,7 +120,7 @@ def _count_different_hits(device_scan: Any, host_scan: Any) -> int:
 def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, Float]) -> int:
     """Count coordinates of the device's rays of hits that differ from expected rays."""
     parts: list[tuple[Float, Float]] = []
-    caster.visit(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
+    caster.scan_on_device(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
     return int(
         sum(
             (rays != np.concatenate(arrays, axis=1).T).sum()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from raybeam import Pattern, RayCaster
-from raybeam.cuda_backend import flags, source
+from raybeam.cuda_backend import compiler_options, kernel_source
 from raybeam.scan import check_scan
 
 from .gpu_clock import Session
@@ -55,7 +55,7 @@ PROFILED = ("cast_table", "pack")
 
 def compiling(session: Session) -> Rows:
     """Yield seconds, registers and local bytes of each kernel, by kind of scene."""
-    names = re.findall(r"^KERNEL (\w+)\(", source(), re.M)
+    names = re.findall(r"^KERNEL (\w+)\(", kernel_source(), re.M)
     for words, nested, masked in (
         ("meshes", False, False),
         ("masked", False, True),
@@ -63,7 +63,9 @@ def compiling(session: Session) -> Rows:
         ("instances, masked", True, True),
     ):
         start = time.perf_counter()
-        module = session.cupy.RawModule(code=source(), options=flags(_STACK, nested, masked))
+        module = session.cupy.RawModule(
+            code=kernel_source(), options=compiler_options(_STACK, nested, masked)
+        )
         module.compile()
         row: dict[str, Any] = {"seconds": time.perf_counter() - start}
         for name in names:

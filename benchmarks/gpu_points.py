@@ -29,7 +29,7 @@ from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from raybeam.device import Outbox
+from raybeam.device import CopyQueue
 
 from .gpu_clock import Session, Sizes, Split, to_pinned
 
@@ -94,7 +94,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
     engine = rig.scene_casters[0].caster.engine
     run = engine._run  # type: ignore[attr-defined]
     kernel = lidarsim.simulator.points.device_columns._kernel
-    send = Outbox.send
+    send = CopyQueue.send
 
     def running(name: str, *arguments: Any) -> None:
         with split.timed(name):
@@ -107,7 +107,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
         return launch
 
-    def sending(outbox: Outbox, pairs: Any) -> None:
+    def sending(outbox: CopyQueue, pairs: Any) -> None:
         outbox._stream.wait_event(cupy.cuda.get_current_stream().record())
         with split.timed("copy", outbox._stream):
             send(outbox, pairs)
@@ -115,7 +115,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
     with (
         patch.object(engine, "_run", running),
         patch.object(lidarsim.simulator.points.device_columns, "_kernel", columns),
-        patch.object(Outbox, "send", sending),
+        patch.object(CopyQueue, "send", sending),
     ):
         yield split
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from raybeam import Instance, Mesh, Opacity, Pattern, PoseMotion, RayCaster
-from raybeam.scan import Groups, Scan, check_scan
+from raybeam.scan import HitGroups, Scan, check_scan
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
 from .gpu_scenes import Float, beam_directions, city, revolution, track
@@ -74,16 +74,16 @@ def rates(
     hits = sum(int((triangle >= 0).sum()) for _, triangle, _ in hit_parts)
 
     def pack() -> None:
-        groups = Groups(scan.groups, 1)
+        groups = HitGroups(scan.groups, 1)
         for (start, _), hit in zip(parts, hit_parts, strict=True):
-            chunk = engine._counted(start, None, hit, groups, engine._no_other_hits)
+            chunk = engine._count_chunk_hits(start, None, hit, groups, engine._no_external_hits)
             engine._pack(chunk, groups, 1.0, engine._no_counters)
 
     calls: dict[str, tuple[Any, Callable[[], object]]] = {
         "rays": (milliseconds, rays),
         "cast": (milliseconds, cast),
         "pack": (milliseconds, pack),
-        "to_device": (wall_milliseconds, lambda: caster.visit(scan, len)),
+        "to_device": (wall_milliseconds, lambda: caster.scan_on_device(scan, len)),
         "to_host": (wall_milliseconds, lambda: engine.scan(scan)),
     }
     times = {name: clock(session, call) for name, (clock, call) in calls.items() if name in stages}
@@ -190,7 +190,7 @@ def moving(session: Session) -> Rows:
         with split.timed("rays"):
             hits.rays()
 
-    caster.visit(scan, use)
+    caster.scan_on_device(scan, use)
     took = split.milliseconds()["rays"]
     yield "rays of the hits", {"ms": took, "grays_s": len(scan) / took / 1e6}
 
@@ -241,7 +241,7 @@ def large(session: Session) -> Rows:
     hits_per_revolution = int(caster.scan(Pattern(directions), MIDDLE).hit_counts.sum())
     last = []
     start = time.perf_counter()
-    hits, _ = caster.visit(scan, lambda hits: last.append(hits.ray[-1:]))
+    hits, _ = caster.scan_on_device(scan, lambda hits: last.append(hits.ray[-1:]))
     took = time.perf_counter() - start
     yield (
         "many rays",

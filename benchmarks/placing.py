@@ -27,8 +27,8 @@ from distributed import Scheduler, Status
 from distributed.scheduler import WorkerState
 
 from poolpart.choosing import NAME as CHOICE
-from poolpart.features import begin_features
-from poolpart.fence import enclose
+from poolpart.features import enable_features
+from poolpart.fence import raise_fence
 
 PARTITION = "A"
 _numbers = itertools.count()
@@ -190,8 +190,8 @@ async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, 
     figures: dict[str, Any] = {"workers": number}
     for label in ("dask", "poolpart"):
         async with Scheduler(port=0, host="127.0.0.1", dashboard=False) as scheduler:
-            begin_features(scheduler, [PARTITION])
-            enclose(scheduler, PARTITION)
+            enable_features(scheduler, [PARTITION])
+            raise_fence(scheduler, PARTITION)
             if label == "dask":
                 scheduler.plugins[CHOICE].uninstall()
             add_workers(scheduler, number)

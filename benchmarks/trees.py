@@ -26,8 +26,8 @@ from unittest.mock import patch
 import numpy as np
 
 from raybeam import cuda_backend, ploc
-from raybeam.instances import plain
-from raybeam.layout import Layout, lay_out, lay_out_instances
+from raybeam.cuda_tables import MeshTables, build_instance_tables, build_mesh_tables
+from raybeam.instances import single_mesh_scene
 from raybeam.mesh import LocalMesh, local_mesh
 
 from .raycast_scenes import Job, jobs
@@ -66,13 +66,13 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
     return loaded
 
 
-def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
+def count(library: ctypes.CDLL, layout: MeshTables, mesh: LocalMesh, job: Job) -> dict[str, float]:
     """Cast the rays of a job, and return the counters per ray and the share of hits."""
     directions = np.ascontiguousarray((job.directions @ job.rotation.T).T)
     n = directions.shape[1]
     distance = np.empty(n)
     triangle = np.empty(n, np.int32)
-    instance_layout = lay_out_instances(plain(mesh), layout.roots)
+    instance_layout = build_instance_tables(single_mesh_scene(mesh), layout.roots)
     instance_tables = (instance_layout.frame, instance_layout.top, instance_layout.instances)
     counters_before = _read_counters(library)
     hits = 0
@@ -123,7 +123,9 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     for name, cluster_limits in TREES.items():
         start = time.process_time()
         layout = (
-            lay_out((mesh,)) if cluster_limits is None else _lay_out_limited(mesh, cluster_limits)
+            build_mesh_tables((mesh,))
+            if cluster_limits is None
+            else _lay_out_limited(mesh, cluster_limits)
         )
         row[name] = {
             "build_s": time.process_time() - start,
@@ -133,13 +135,13 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     return row
 
 
-def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout:
+def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> MeshTables:
     """Lay out a mesh with limits on the clusters left to the sweep."""
     with (
         patch.object(ploc, "_MAX_CLUSTERS", cluster_limits[0]),
         patch.object(ploc, "_MIN_CLUSTERS", cluster_limits[1]),
     ):
-        return lay_out((mesh,))
+        return build_mesh_tables((mesh,))
 
 
 def show(row: dict[str, Any]) -> None:

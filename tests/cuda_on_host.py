@@ -206,7 +206,7 @@ class SourceBackend(CudaBackend):
     chunk = 1 << 16
 
     @classmethod
-    def missing(cls):
+    def unavailable_reason(cls):
         return ""
 
     @staticmethod

@@ -35,7 +35,7 @@ def points_of(survey, scene):
 
 def encoded(cloud, sweeps):
     """Return the groups of datagrams of all sweeps of a survey with one sensor."""
-    encoder = encoder_of(PacketSource.of_sensor(sweeps, 0))
+    encoder = encoder_of(PacketSource.for_sensor(sweeps, 0))
     groups = []
     for sweep, points in enumerate(sweeps.points(cloud)):
         groups += encoder.encode(Shots.from_points(sweeps, sweep, points, encoder.columns))

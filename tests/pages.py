@@ -18,7 +18,7 @@ def ask(url: str, what: str, headers: dict[str, str] | None = None, **asked: Any
 
 
 def unpacked(message: bytes) -> Any:
-    """Return what `lidarview.viewer.server.bundle` has packed."""
+    """Return what `lidarview.viewer.server.pack_answer` has packed."""
     length = int.from_bytes(message[:4], "little")
     header = json.loads(message[4 : 4 + length])
     start = 4 + length

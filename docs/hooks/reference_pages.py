@@ -74,7 +74,8 @@ _FIRST = {
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
-        *("Results", "PartitionStats", "StageStats", "Pipe", "Listener", "after_all", "cancelled"),
+        *("Results", "PartitionStats", "StageStats", "Pipe", "PipeListener"),
+        *("after_all", "cancelled"),
     ),
     "poolpart.deploy": ("local_cluster", "start_partitions"),
     "raybeam": ("RayCaster", "Pattern", "Hits", "ScanReturns"),

@@ -22,8 +22,8 @@ from PIL import Image
 from lidarscenes.procedural.city import city
 from lidarview.render.camera import Camera
 from lidarview.render.coloring import TURBO
-from lidarview.render.pictures import splat
-from lidarview.render.surface import unit
+from lidarview.render.pictures import draw_discs
+from lidarview.render.surface import normalize
 
 SIZE = (720, 405)
 BACK = np.array([14, 17, 22, 255]) / 255
@@ -50,7 +50,7 @@ def frame(camera: Camera, points: Any) -> Image.Image:
     paint = np.pad(TURBO[(24 + 231 * np.sqrt(share)).astype(int)], ((0, 0), (0, 1)), mode="edge")
     paint[:, 3] = 1
     empty = np.tile(BACK.astype(np.float32), (*camera.size[::-1], 1))
-    image = splat(empty, pixels[rows], paint, 1.6)
+    image = draw_discs(empty, pixels[rows], paint, 1.6)
     return Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
 
 
@@ -61,8 +61,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--sweeps", type=int, default=100)
     parser.add_argument("--triangles", type=int, default=100_000)
     options = parser.parse_args(arguments)
-    ahead = unit((TARGET - EYE)[None])
-    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+    ahead = normalize((TARGET - EYE)[None])
+    right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
     axes = np.concatenate([right, np.cross(right, ahead), ahead])
     camera = Camera(EYE, axes, 600.0, np.array(SIZE) / 2, SIZE)
     context = get_context("spawn")

@@ -27,7 +27,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.render.camera import Camera
-from lidarview.render.surface import unit
+from lidarview.render.surface import normalize
 
 SIZE = (560, 420)  # of each half
 EYE = np.array([-46.0, -34.0, 34.0])
@@ -67,8 +67,8 @@ def drive(sweeps: int) -> Cloud:
 
 def camera() -> Camera:
     """Return the camera of both halves."""
-    ahead = unit((TARGET - EYE)[None])
-    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+    ahead = normalize((TARGET - EYE)[None])
+    right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
     axes = np.concatenate([right, np.cross(right, ahead), ahead])
     return Camera(EYE, axes, 470.0, np.array(SIZE) / 2, SIZE)
 

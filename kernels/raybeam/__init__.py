@@ -1,12 +1,12 @@
-"""Closest hits of rays with triangle meshes, on GPUs and on CPUs."""
+"""Closest intersections of rays with triangle meshes, on GPUs and CPUs."""
 
 from ._version import __version__
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .deforming import Deforming
+from .deforming import DeformingMesh
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
-from .moving import Moving
+from .moving import MovingBodies
 from .opacity import Opacity
 from .pattern import Pattern
 from .pattern_rays import pattern_rays
@@ -16,11 +16,11 @@ from .sub_rays import SubRays
 
 __all__ = [
     "BackendUnavailable",
-    "Deforming",
+    "DeformingMesh",
     "Hits",
     "Instance",
     "Mesh",
-    "Moving",
+    "MovingBodies",
     "Opacity",
     "Pattern",
     "PoseMotion",

@@ -1,4 +1,4 @@
-"""Types of arrays by element."""
+"""Type aliases for NumPy arrays, named after their elements."""
 
 from __future__ import annotations
 

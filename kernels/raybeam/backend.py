@@ -1,4 +1,4 @@
-"""The interface of a ray casting engine."""
+"""The interface that a ray-casting backend implements."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
-from .crossing import Crossing, Nearest, TimedBodies, cast_crossing
-from .device import DeviceHits, DeviceNearest, OtherHits
-from .hits import Counted, Hits, Part, ScanReturns, join_hits
-from .instances import Scene
+from .body_rays import NearestHits, RayBodyPairs, TimedBodies, cast_pairs
+from .device import DeviceHits, DeviceNearestHits, ExternalHits
+from .hits import HitColumns, Hits, ScanReturns, TallyCounts, join_hits
+from .instances import LocalScene
 from .rays import Rays
-from .scan import Collector, Scan
+from .scan import HitCollector, Scan
 
 
-class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """Raised when the requested backend cannot be used; the message states the reason."""
+class BackendUnavailable(RuntimeError):  # noqa: N818 - describes a state, not an error
+    """Raised if the requested backend cannot be used. The message states the reason."""
 
 
 @dataclass(frozen=True)
 class ClosestHits:
-    """Closest hits of a chunk of rays, without misses, in ray order.
+    """Closest hits of a chunk of rays, in ray order and without rays that miss.
 
     Attributes
     ----------
     ray
-        (k,): number of the ray within the chunk.
+        (k,): index of the ray within the chunk.
     t
         float64 (k,): distance in local units.
     triangle
-        int32 (k,): row of the `faces` of the mesh.
+        int32 (k,): index of the triangle in the `faces` of its mesh.
     u, v
-        float64 (k,): weights of the second and third corner.
+        float64 (k,): barycentric weights of the second and third vertex.
     instance
-        int32 (k,): number of the instance.
+        int32 (k,): index of the instance.
     """
 
     ray: Integers
@@ -49,87 +49,89 @@ class ClosestHits:
 
 
 class Backend(ABC):
-    """A ray casting engine, bound to the meshes of a scene.
+    """A ray-casting engine for one scene.
 
-    A backend is created with the scene, the maximum number of CPU threads (None for the default of
-    the backend) and the number of the CUDA device (None for the current device); a backend without
-    threads or device ignores the number. The constructor builds the trees of the meshes, and calls
-    `update_scene` for all that depends on transforms. A backend must implement `closest`; it may
-    override `scan` to be faster.
+    The constructor takes the scene, the maximum number of CPU threads (None for the default of the
+    backend) and the index of the CUDA device (None for the current device). A backend that uses no
+    threads or no device ignores these arguments. The constructor builds the acceleration structures
+    of the meshes and calls `update_scene`, which does everything that depends on transforms.
+
+    A backend must implement `closest_hits` and `unavailable_reason`. It may override `scan` and
+    other methods with faster versions.
     """
 
     name: ClassVar[str]
-    # Maximum rays of a call of `closest`: limits the memory. The result of a ray does not depend
-    # on its chunk.
+    # Maximum number of rays per call of `closest_hits`, which limits the memory. How rays are
+    # divided into chunks does not affect the results.
     chunk: ClassVar[int]
 
-    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device (`visit`)
+    on_device: ClassVar[bool] = False  # whether `scan_on_device` is supported
 
     @classmethod
     @abstractmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why this backend cannot be used and the remedy, or "" if it can be used."""
 
     @classmethod
-    def build(cls) -> str:
-        """Return the versions besides NumPy's that the bits of results depend on, "" for none."""
+    def versions(cls) -> str:
+        """Return the versions, besides NumPy's, that affect the bits of the results, or ""."""
         return ""
 
-    @classmethod  # noqa: B027 - other backends have nothing to limit
+    @classmethod  # noqa: B027 - most backends have nothing to limit
     def limit_memory(cls, device: int | None, share: float) -> None:
-        """Have this process take at most a share of a device's memory.
+        """Limit the device memory of this process to a fraction of the total.
 
-        Without a device, nothing is limited.
-
-        A share of 1 or more sets no limit.
+        If `share` is 1 or more, there is no limit. Backends without a device ignore this call.
         """
 
-    def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:
+    def __init__(self, scene: LocalScene, threads: int | None, device: int | None) -> None:
         self._scene = scene
 
-    def update_scene(self, scene: Scene) -> None:
-        """Replace the scene by a scene of the same instances with new transforms."""
+    def update_scene(self, scene: LocalScene) -> None:
+        """Replace the scene with a scene that has the same instances but new transforms."""
         self._scene = scene
 
     @property
     def device_lost(self) -> bool:
-        """Whether the device answers no call of this process any more, after an error of it."""
+        """Whether the device no longer responds to calls from this process after an error."""
         return False
 
     @abstractmethod
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
 
-    def nearest(self, rays: Rays) -> Part:
-        """Return the closest hits of rays, without weights and misses, in ray order."""
-        parts: list[Part] = []
+    def hit_columns(self, rays: Rays) -> HitColumns:
+        """Return the closest hits of any number of rays, in ray order.
+
+        Rays that miss and barycentric weights are not included.
+        """
+        parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
-            hits = self.closest(rays.part(start, start + self.chunk))
+            hits = self.closest_hits(rays.normalized(start, start + self.chunk))
             ray = hits.ray.astype(np.uint32) + np.uint32(start)
             distance = hits.t / self._scene.frame.scale
             parts.append((ray, distance, hits.triangle, hits.instance))
         return join_hits(parts)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
-        cast_crossing(self.nearest, crossing, nearest)
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
+        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
+        cast_pairs(self.hit_columns, pairs, nearest)
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
-        """Put rays `start` to `stop` of a scan on the device, as `RayCaster.device_nearest`."""
-        raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_crossing."
-        )
+    ) -> DeviceNearestHits:
+        """Copy rays `start` to `stop` of a scan to the device. See `RayCaster.upload_rays`."""
+        raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
-        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
-        raise BackendUnavailable(
-            f"Backend {self.name!r} does not support devices. Use cast_crossing."
-        )
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
+        """Cast rays at bodies on the device, and record closer hits in `nearest`.
+
+        The bodies have the shape of this scene.
+        """
+        raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 
     def cast(self, rays: Rays) -> Hits:
-        """Return the closest hit of every ray, misses included."""
+        """Return the closest hit of each ray, including rays that miss."""
         n = len(rays)
         hits = Hits(
             np.full(n, np.inf),
@@ -139,7 +141,7 @@ class Backend(ABC):
             np.full(n, -1, np.int32),
         )
         for start in range(0, n, self.chunk):
-            chunk_hits = self.closest(rays.part(start, start + self.chunk))
+            chunk_hits = self.closest_hits(rays.normalized(start, start + self.chunk))
             row = start + chunk_hits.ray.astype(np.int64)
             hits.distance[row] = chunk_hits.t / self._scene.frame.scale
             hits.triangle[row] = chunk_hits.triangle
@@ -149,35 +151,38 @@ class Backend(ABC):
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the kept hits of the rays of a scan, and counts of all hits."""
-        collector = Collector(scan, self._scene.face_count if scan.tally else 0)
-        for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
+        """Return the stored hits of a scan and the counts of all hits."""
+        collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
+        for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
-                collector.tally(self._scene.tally_rows(instance, triangle))
-            selected = collector.keep(ray, start, stop)
-            collector.add(
+                collector.count_triangles(self._scene.tally_rows(instance, triangle))
+            selected = collector.select_kept(ray, start, stop)
+            collector.add_hits(
                 start, ray[selected], distance[selected], triangle[selected], instance[selected]
             )
         return collector.result()
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
-        """Yield start and stop of each part of a scan, and its hits, numbered from start."""
+    def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
+        """Yield consecutive parts of a scan, each as first ray, end, and hits.
+
+        The ray indices of the hits start at 0 in each part.
+        """
         for start, stop in scan.chunks(self.chunk):
-            hits = self.closest(scan.rays(start, stop))
+            hits = self.closest_hits(scan.rays(start, stop))
             distance = hits.t / self._scene.frame.scale
             ray = hits.ray.astype(np.uint32, copy=False)
             yield start, stop, (ray, distance, hits.triangle, hits.instance)
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
-        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does.
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
+        """Cast a scan and pass its hits to `use` on the device. See `RayCaster.scan_on_device`.
 
-        BackendUnavailable if this backend has no device.
+        Raises BackendUnavailable if this backend does not use a device.
         """
         raise BackendUnavailable(
             f"The hits of backend {self.name!r} are not on a device. Use scan, or backend='cuda'."

@@ -1,4 +1,4 @@
-"""The public ray caster."""
+"""The ray caster, which is the main class of this package."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints, Ints32
 from .backend import Backend
-from .crossing import Crossing, Nearest, TimedBodies
-from .device import DeviceHits, DeviceNearest, OtherHits
-from .hits import Counted, Hits, ScanReturns
-from .instances import Instance, Mesh, check_instances, check_transforms
+from .body_rays import NearestHits, RayBodyPairs, TimedBodies
+from .device import DeviceHits, DeviceNearestHits, ExternalHits
+from .hits import Hits, ScanReturns, TallyCounts
+from .instances import Instance, Mesh, build_scene, check_transforms
 from .pattern import Pattern
 from .poses import PoseMotion, Poses
 from .rays import check_rays
-from .registry import choose
+from .registry import choose_backend
 from .scan import Scan, check_scan
 
 
@@ -123,8 +123,8 @@ class RayCaster:
     ) -> None:
         if threads is not None and index(threads) < 1:
             raise ValueError(f"threads must be at least 1 or None, but is {threads}.")
-        engine = choose(backend)
-        self._scene, self._transforms = check_instances(instances)
+        engine = choose_backend(backend)
+        self._scene, self._transforms = build_scene(instances)
         self._engine = engine(self._scene, threads, device)
         self._moved = False
         self._lock = threading.Lock()
@@ -140,7 +140,7 @@ class RayCaster:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can remain on a CUDA device, as `visit` requires."""
+        """Whether hits can remain on a CUDA device, as `scan_on_device` requires."""
         return self._engine.on_device
 
     @property
@@ -158,29 +158,29 @@ class RayCaster:
         """Number of instances."""
         return len(self._scene.mesh)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
-        self.engine.cast_crossing(crossing, nearest)
+        self.engine.cast_pairs(pairs, nearest)
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
+    ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
 
         `time_index` (n,) contains the index of the time of each ray. Only hits at a distance of
         less than `end` meters are recorded. Raises BackendUnavailable if this backend does not use
         a device.
         """
-        return self.engine.device_nearest(scan, start, stop, time_index, end)
+        return self.engine.upload_rays(scan, start, stop, time_index, end)
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays at bodies with this shape on the device, and record closer hits in `nearest`.
 
         Raises BackendUnavailable if this backend does not use a device.
         """
         self.engine.cast_bodies(bodies, nearest)
 
-    def move(self, number: int | ArrayLike, transform: ArrayLike) -> None:
+    def set_transforms(self, instance: int | ArrayLike, transform: ArrayLike) -> None:
         """Set new transforms of instances for all subsequent casts.
 
         Only the acceleration structure over the instances is rebuilt, which happens once before the
@@ -189,7 +189,7 @@ class RayCaster:
 
         Parameters
         ----------
-        number
+        instance
             Index of the instance, or indices (k,) without duplicates.
         transform
             (3, 4) or (4, 4), as for `Instance`; for k instances (k, 3, 4) or (k, 4, 4).
@@ -207,10 +207,10 @@ class RayCaster:
         >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
         >>> instances = [Instance(mesh), Instance(mesh)]
         >>> caster = RayCaster.from_instances(instances, backend="numpy")
-        >>> caster.move([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
+        >>> caster.set_transforms([0, 1], np.stack([np.eye(4), np.diag([1, 1, -1, 1])]))
         """
-        single = np.ndim(number) == 0
-        numbers = np.asarray([index(number)] if single else number)  # type: ignore[arg-type]
+        single = np.ndim(instance) == 0
+        numbers = np.asarray([index(instance)] if single else instance)  # type: ignore[arg-type]
         outside = numbers[(numbers < 0) | (numbers >= self.instance_count)]
         if len(outside):
             raise IndexError(
@@ -232,7 +232,7 @@ class RayCaster:
         """Ray-casting engine, updated with the current transforms if instances have moved."""
         with self._lock:
             if self._moved:
-                self._scene = self._scene.moved(self._transforms)
+                self._scene = self._scene.with_transforms(self._transforms)
                 self._engine.update_scene(self._scene)
                 self._moved = False
         return self._engine
@@ -278,7 +278,7 @@ class RayCaster:
         groups: ArrayLike | None = None,
         tally: bool = False,
         motion: PoseMotion | None = None,
-        room: Floats | None = None,
+        out: Floats | None = None,
     ) -> ScanReturns:
         """Cast a ray pattern from a pose or a series of poses.
 
@@ -317,7 +317,7 @@ class RayCaster:
         motion
             Motion of the lidar while the rays that share a pose are fired, if these rays have
             different delays.
-        room
+        out
             Output array for the origins and directions of all rays, as returned by `pattern_rays`:
             float64 (6, rays), contiguous, or (3, rays) for the directions only. None if they are
             not needed.
@@ -352,17 +352,17 @@ class RayCaster:
                 groups=groups,
                 tally=tally,
                 motion=motion,
-                room=room,
+                out=out,
             )
         )
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
         """Cast a scan and pass its hits to a function on the CUDA device.
 
         Parameters
@@ -376,22 +376,22 @@ class RayCaster:
             Table and length of the scan's tally. The table is int64 (instances, 2): hits on
             triangle t of instance i are counted in row ``table[i, 0] + table[i, 1] * t`` of the
             tally. None for the rows of `ScanReturns.tally`.
-        other_hits
+        external_hits
             Hits that replace more distant hits of the caster. They are assigned to an additional
             instance after the last one. With a tally, the table in `counters` must have a row for
             this instance.
 
         Returns
         -------
-        hits
+        hit_counts
             int64 (g,): number of hits in each group, including hits that are not stored.
         counted
-            Indices of the counters that are not 0, and their numbers of hits, int64 (k,) each; None
-            without a tally.
+            Indices of the nonzero counters and their numbers of hits, int64 (k,) each. None without
+            a tally.
 
         Raises
         ------
         BackendUnavailable
             If the backend of this caster is not cuda.
         """
-        return self.engine.visit(scan, use, counters, other_hits)
+        return self.engine.scan_on_device(scan, use, counters, external_hits)

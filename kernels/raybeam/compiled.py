@@ -1,4 +1,7 @@
-"""Loops that numba compiles, or plain Python a hundred times slower without numba."""
+"""Decorators that compile functions with numba and cache the result on disk.
+
+Without numba, the functions run as plain Python, about a hundred times slower.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from typing import Any
 
 try:
     import fcntl
-except ImportError:  # Windows: each process compiles for itself
+except ImportError:  # On Windows, each process compiles for itself.
     fcntl = None  # type: ignore[assignment]
 
 try:
@@ -26,45 +29,45 @@ try:
     from numba.core.types.misc import unliteral
     from numba.types import ExternalFunction
 
-    from .loop_files import LoopFiles, remove_unfinished, tell_not_kept
+    from .loop_files import LoopFiles, remove_unfinished, warn_not_cached
 except ImportError:
     njit = None
 
 
 def _has_cache() -> bool:
-    """Return whether numba has a folder for compiled code.
+    """Return whether numba has a writable folder for compiled code.
 
-    Without a folder each process compiles for 20 s.
+    Without one, each process spends about 20 s compiling.
     """
     try:
         njit(cache=True)(_has_cache)
-    except (RuntimeError, TypeError):  # neither beside this file nor in the user's home; no numba
+    except (RuntimeError, TypeError):  # no writable folder; a TypeError means that numba is missing
         return False
     return True
 
 
 _log = logging.getLogger(__name__)
-# Of all loops together: a first `lidarpool check` took 24 s of processor time, a later check 4 s,
-# and 30 and 5 s while the machine was busy.
+# Times for all loops together. The first `lidarpool check` on a machine took 24 s of CPU time and
+# the next one 4 s, or 30 s and 5 s if the machine was busy.
 COMPILING = "compiling the ray-casting loops, which takes about 20 s the first time"
 COMPILING_EACH_TIME = (
     "compiling the ray-casting loops, which takes about 20 s in each process. To cache the "
     "compiled loops, set NUMBA_CACHE_DIR to a writable folder"
 )
-_TOLD_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
-_compiling_s = [0.0]  # what this process has waited for loops that were not compiled
-_waits = [False]  # whether the loop at hand is compiled, here or in another process
-HAS_CACHE = _has_cache()  # whether compiled loops are kept for later processes
+_LOG_AFTER_S = 1.0  # compiling a single loop takes less time
+_seconds_spent = [0.0]  # time that this process has waited for compilation
+_is_compiling = [False]  # whether the current loop is being compiled, here or in another process
+HAS_CACHE = _has_cache()  # whether compiled loops are cached on disk
 
 
 _IMPORTS = re.compile(r"^\s*from (\.+)([\w.]*) import (?:\(([^)]*)\)|(.*))$", re.MULTILINE)
 
 
 @cache
-def _imported(path: Path) -> tuple[Path, ...]:
-    """Return the files that a module names in its relative imports."""
+def _imported_files(path: Path) -> tuple[Path, ...]:
+    """Return the source files that a module imports with relative imports."""
     files: list[Path] = []
-    # Not by `ast`, which takes ten times as long in each process that starts.
+    # Parsing with `ast` would take ten times as long, in each process that starts.
     for dots, module, several, single in _IMPORTS.findall(path.read_text("utf-8")):
         folder = path.parents[len(dots) - 1].joinpath(*module.split("."))
         candidates = [folder.with_suffix(".py")] if module else []
@@ -74,12 +77,13 @@ def _imported(path: Path) -> tuple[Path, ...]:
 
 
 @cache
-def _stamp(path: Path) -> tuple[int, ...]:
-    """Return a value that changes with each source file that a loop may depend on.
+def _source_stamp(path: Path) -> tuple[int, ...]:
+    """Return a value that changes with each source file that affects the compiled code of a loop.
 
-    Numba itself watches only the file of the loop. Its constants and callees come from the modules
-    that this file imports, directly or not, and from raybeam. The rest of a package does not count:
-    loops of the simulator need not be compiled again when a command changes.
+    numba only checks the file that contains the loop. The constants and callees of a loop may also
+    come from modules that this file imports, directly or indirectly, and from raybeam. Other
+    modules of the package are ignored, so that the loops of the simulator are not recompiled
+    whenever a command changes.
     """
     sources: set[Path] = set()
     unread = [path]
@@ -87,80 +91,84 @@ def _stamp(path: Path) -> tuple[int, ...]:
         source = unread.pop()
         if source not in sources:
             sources.add(source)
-            unread += _imported(source)
+            unread += _imported_files(source)
     sources.update(Path(__file__).parent.glob("*.py"))
     stats = [source.stat() for source in sorted(sources)]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-_WAIT_S = 60.0  # total for processes that compile: a process may have been stopped
-_STEP_S = 0.02
-_held = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
-_locked = [""]  # folder whose lock this process has
-_patience = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vain
+# Longest total wait for other processes that compile, because such a process may be suspended.
+_WAIT_S = 60.0
+_STEP_S = 0.02  # pause between attempts to acquire the lock
+_lock_depth = [0]  # nesting depth of `_compile_lock` in the thread that holds numba's lock
+_locked_folder = [""]  # folder that this process has locked
+_wait_left_s = [_WAIT_S]  # remaining time to wait for other processes
 
 
 @contextmanager
 def _compile_lock(folder: str) -> Iterator[None]:
-    """Let a single process compile at a time, so that further processes load the compiled code.
+    """Let only one process at a time compile loops in a folder.
 
-    A hundred workers, on any machines, that start with an empty folder compile each loop once.
+    The other processes wait and then load the compiled code. If a hundred workers start with an
+    empty cache folder, each loop is compiled once, even if the workers run on different machines.
     """
-    with global_compiler_lock:  # keeps threads apart; compiling a loop may compile further loops
+    # numba's own lock excludes other threads. It is reentrant, because compiling a loop may compile
+    # the loops that it calls.
+    with global_compiler_lock:
         file = None
         collects = gc.isenabled()
-        gc.disable()  # an eighth of the time: numba keeps most of the objects of a compilation
+        gc.disable()  # saves an eighth of the time, because most objects outlive the compilation
         try:
-            if fcntl is not None and not _held[0]:
+            if fcntl is not None and not _lock_depth[0]:
                 Path(folder).mkdir(parents=True, exist_ok=True)
                 file = (Path(folder) / "raybeam.lock").open("a")
-                while _patience[0] > 0:
+                while _wait_left_s[0] > 0:
                     try:
                         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                        _locked[0] = folder
+                        _locked_folder[0] = folder
                         break
                     except BlockingIOError:
-                        _waits[0] = True
+                        _is_compiling[0] = True
                         time.sleep(_STEP_S)
-                        _patience[0] -= _STEP_S
-        except OSError:  # a file system without locks
+                        _wait_left_s[0] -= _STEP_S
+        except OSError:  # The file system does not support locks.
             pass
-        _held[0] += 1
+        _lock_depth[0] += 1
         try:
             yield
         finally:
-            _held[0] -= 1
+            _lock_depth[0] -= 1
             (gc.enable if collects else gc.disable)()
             if file is not None:
-                _locked[0] = ""
+                _locked_folder[0] = ""
                 with suppress(OSError):
-                    fcntl.flock(file, fcntl.LOCK_UN)  # for a forked child, too
+                    fcntl.flock(file, fcntl.LOCK_UN)  # A forked child may still have the file open.
                 file.close()
 
 
-def _tell_if_long(seconds: float) -> None:
-    """Count the time that a loop has taken, and log once that loops are being compiled.
+def _log_if_slow(seconds: float) -> None:
+    """Add the time that a loop took, and log once that loops are being compiled.
 
-    Loops are compiled when modules are imported, one after the other: after the first second it is
-    certain that many of them are.
+    Loops are compiled one after the other when modules are imported. If they take more than a
+    second in total, many of them are being compiled, so a message is helpful.
     """
-    if not _waits[0]:
+    if not _is_compiling[0]:
         return
-    _waits[0] = False
-    before_s = _compiling_s[0]
-    _compiling_s[0] += seconds
-    if before_s < _TOLD_AFTER_S <= _compiling_s[0]:
+    _is_compiling[0] = False
+    before_s = _seconds_spent[0]
+    _seconds_spent[0] += seconds
+    if before_s < _LOG_AFTER_S <= _seconds_spent[0]:
         _log.info(COMPILING if HAS_CACHE else COMPILING_EACH_TIME)
 
 
 def _cached(dispatcher: Any, function: Any) -> Any:
-    """Cache compiled code on disk, for processes with the same sources of the package."""
+    """Make a dispatcher cache its compiled code on disk until its sources change."""
     if not HAS_CACHE:
         dispatcher.compile = _timed(dispatcher.compile)
         return dispatcher
     dispatcher.enable_caching()
     cache = dispatcher._cache
-    stamp = _stamp(Path(function.__code__.co_filename))
+    stamp = _source_stamp(Path(function.__code__.co_filename))
     cache._cache_file = LoopFiles(cache._cache_path, cache._impl.filename_base, stamp)
     cache.load_overload = partial(_load_compiled, cache)
     cache.save_overload = partial(_save_compiled, cache)
@@ -176,45 +184,45 @@ def _cached(dispatcher: Any, function: Any) -> Any:
 
 
 def _timed(compile_now: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that compiles or loads a loop, and counts the time."""
+    """Wrap a compile function so that the time it takes is recorded."""
 
     def compile_and_count(*signature: Any) -> Any:
-        if _held[0]:  # a loop that the loop at hand calls
+        if _lock_depth[0]:  # The loop is called by a loop whose time is already measured.
             return compile_now(*signature)
         started_s = time.perf_counter()
-        _waits[0] = not HAS_CACHE
+        _is_compiling[0] = not HAS_CACHE
         code = compile_now(*signature)
-        _tell_if_long(time.perf_counter() - started_s)
+        _log_if_slow(time.perf_counter() - started_s)
         return code
 
     return compile_and_count
 
 
 def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
-    """Return compiled code from the cache on disk, or None without whole files of the code.
+    """Return compiled code from the cache on disk, or None if there is none.
 
-    `FunctionCache.load_overload` first imports all that numba needs to compile, among it
-    `scipy.linalg`: more than the half of what loading all loops takes. numba imports the same when
-    it compiles.
+    `FunctionCache.load_overload` would first import everything that numba needs for compiling,
+    including `scipy.linalg`, which takes more than half of the time to load all loops. numba
+    imports it anyway if it compiles.
     """
     rtsys.initialize(target_context)  # compiled code may allocate memory
     code = cache._load_overload(signature, target_context)
     if code is None:
-        _waits[0] = True
+        _is_compiling[0] = True
     return code
 
 
 def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
-    """Keep compiled code on disk, if the disk has room and the folder can be written."""
-    remove_unfinished(cache._cache_path, is_locked=_locked[0] == cache._cache_path)
+    """Store compiled code on disk, or log a warning if that fails."""
+    remove_unfinished(cache._cache_path, is_locked=_locked_folder[0] == cache._cache_path)
     try:
         cache._save_overload(signature, code)
     except OSError as error:
-        tell_not_kept(cache._cache_path, error)
+        warn_not_cached(cache._cache_path, error)
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
-    """Compile a function for signatures of numba or, without a signature, on the first call."""
+    """Compile a function for numba signatures, or on the first call if there are none."""
     if njit is None:
         return lambda function: function
 
@@ -229,18 +237,19 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-def part(signature: Any) -> Callable[[Any], Any]:
-    """Compile a function that compiled code calls by its address.
+def called_by_address(signature: Any) -> Callable[[Any], Any]:
+    """Compile a function that compiled callers call by its address.
 
-    As a stage it would be compiled again with each of its callers, and with the callers of these.
-    Callers pass all arguments by position, since an address does not come with names.
+    With `noinline`, the function would be compiled again with each of its callers, and with their
+    callers. Callers must pass all arguments by position, because a call by address does not support
+    keywords.
     """
 
     def make(function: Any) -> Any:
         kinds = (signature.args, signature.return_type)
         c_function = _cached(CFunc(function, kinds, {}, {"error_model": "numpy"}), function)
         c_function.compile()
-        _parts.append(c_function)
+        _called_by_address.append(c_function)
         name = f"raybeam_{function.__module__}_{function.__name__}"
         add_symbol(name, c_function.address)
         return ExternalFunction(name, c_function._sig)
@@ -248,29 +257,32 @@ def part(signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-WHOLE = (types.int64,) if njit is not None else ()  # argument of a part: a number or an address
-_parts: list[Any] = []  # whose addresses compiled code holds
+# Argument type of functions with `called_by_address`: a number or an address. A tuple, so that
+# ``4 * INT64`` stands for four arguments.
+INT64 = (types.int64,) if njit is not None else ()
+_called_by_address: list[Any] = []  # keeps code alive whose address is compiled into other code
 
 
 def inlined(function: Any) -> Any:
-    """Compile a function as a part of its compiled callers."""
-    return _inner(function, forceinline=True)
+    """Compile a function that is inlined into its compiled callers."""
+    return _compile_inner(function, forceinline=True)
 
 
-def stage(function: Any) -> Any:
-    """Compile a function apart from its callers, so that its loops become vector instructions.
+def noinline(function: Any) -> Any:
+    """Compile a function that compiled callers call, but do not inline.
 
-    As parts of a longer function the loops do not.
+    LLVM vectorizes the loops of such a function, which often fails in the middle of a longer
+    function.
     """
-    return _inner(function)
+    return _compile_inner(function)
 
 
-def _inner(function: Any, **options: Any) -> Any:
-    """Compile a function for calls by compiled functions only.
+def _compile_inner(function: Any, **options: Any) -> Any:
+    """Compile a function that only compiled functions call.
 
-    Python may call its `py_func`.
-
-    Wrappers for Python would take long to compile, and so would a version for each literal number.
+    No wrapper for calls from Python is generated, which saves compile time. Python can call the
+    original function as `py_func`. Literal integers are treated as plain integers, so that there is
+    a single version for all of them.
     """
     if njit is None:
         return function

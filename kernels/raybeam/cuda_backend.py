@@ -1,4 +1,4 @@
-"""Ray casting on a CUDA device, through CuPy."""
+"""Ray casting on a CUDA device through CuPy."""
 
 from __future__ import annotations
 
@@ -14,65 +14,66 @@ import numpy as np
 
 from .arrays import AnyArray, Ints, Ints32
 from .backend import Backend, ClosestHits
-from .crossing import TimedBodies
-from .device import DeviceHits, DeviceNearest, HitTransfer, OtherHits, PendingCopy, to_device
-from .hits import Counted, ScanReturns
+from .body_rays import TimedBodies
+from .cuda_tables import build_instance_tables, build_mesh_tables
+from .device import DeviceHits, DeviceNearestHits, ExternalHits, HitTransfer, PendingCopy, to_device
+from .hits import ScanReturns, TallyCounts
 from .installation import install_command
-from .instances import Scene
-from .layout import lay_out, lay_out_instances
-from .opacity import Masks
+from .instances import LocalScene
+from .opacity import MaskTables
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
-from .scan import Groups, Scan, host_rays
+from .scan import HitGroups, Scan, host_rays
 
 T = TypeVar("T")
 
-# {pattern: {number of a device: directions on the device, and origins if the pattern has any}}
+# Patterns on devices: {pattern: {device index: (directions, origins)}}.
 _patterns: WeakKeyDictionary[Pattern, dict[int, tuple[Any, ...]]] = WeakKeyDictionary()
-_BLOCK = 128  # threads, as in intersect.cu
+_BLOCK = 128  # threads per block; intersect.cu has the same value
 _STACK_STEP = 32
-# Tables that are not read where all triangles are opaque.
+# Placeholders for mask tables, which are not read if all triangles are opaque.
 NO_MASKS = np.zeros((1, 6), np.float32), np.zeros(1, np.uint8), np.zeros((1, 4), np.int64)
-_MAX_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than the rays of a chunk
+_MAX_INT = (1 << 31) - 1  # more than the number of rays in a chunk
 
 
 class _CastChunk(NamedTuple):
-    """Hits of consecutive rays on the device, and counts of the hits on their way to the host."""
+    """Hits of consecutive rays on the device, and hit counts that are being copied to the host."""
 
-    start: int  # number of the first ray
+    start: int  # index of the first ray
     rays: tuple[Any, Any]  # origins and directions, float64 (3, n) each
-    hits: tuple[Any, Any, Any]  # local distance, row and instance, (n,) each
-    other_hits: tuple[Any, ...]  # arguments of the kernel `pack`
-    sums: Any  # int32 (n,): number of hits up to each ray
-    span: slice  # groups of the rays
-    later_starts: Ints  # first ray of each of these groups but the first, counted from `start`
-    cuts: PendingCopy  # hits up to the end of each group
+    hits: tuple[Any, Any, Any]  # local distance, table row and instance, (n,) each
+    external_hits: tuple[Any, ...]  # arguments of the kernel `pack`
+    sums: Any  # int32 (n,): cumulative number of hits
+    span: slice  # indices of the groups that the rays belong to
+    later_starts: Ints  # first ray of the second and later groups, relative to `start`
+    cuts: PendingCopy  # cumulative number of hits at the end of each group
 
 
 class CudaBackend(Backend):
-    """The traversal of intersect.cu, a thread for each ray.
+    """Traversal in intersect.cu, with one thread per ray.
 
-    Only the hits that are kept leave the device.
+    Only the stored hits are copied to the host.
 
-    Kernels and copies use the thread's current stream, and every call ends with a copy to the
-    host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
-    Tables and patterns outlive a call; a call waits for their creation, so that threads with other
-    streams may use both. All calls switch to the caster's device and back.
+    Kernels and copies use the current stream of the calling thread. Each call ends with a copy to
+    the host that CuPy waits for, so the device no longer uses the memory of a call when the call
+    returns. Tables and patterns are kept between calls. The call that creates them waits until they
+    are complete, so that threads with other streams can use them. Each call switches to the
+    caster's device and back.
 
-    NumPy builds the tree (layout.py). Building it on the device took as much code as the
-    traversal, and saved a worker two seconds for each million triangles, once.
+    NumPy builds the trees (cuda_tables.py). A builder on the device needed as much code as the
+    traversal and saved each worker two seconds per million triangles, once.
     """
 
     name: ClassVar[str] = "cuda"
     on_device: ClassVar[bool] = True
-    # Rays: two chunks take some 600 MB on the device, columns included. Grid, sums of
-    # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
+    # Two chunks of rays with all columns take about 600 MB on the device. The grid size, the sums
+    # of hits and the indices into the arrays of a chunk are far below 2**31. Only ray indices need
     # 64 bits.
     chunk: ClassVar[int] = 1 << 21
 
     @classmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
         if importlib.util.find_spec("cupy") is None:
             command = install_command("cupy-cuda12x")
@@ -93,18 +94,18 @@ class CudaBackend(Backend):
             reason = str(error).partition("\n")[0]
             command = install_command("cupy-cuda13x[ctk]")
             return f"CuPy cannot find a compiler ({reason}); run {command} (or cupy-cuda12x[ctk])"
-        if not _headers():
+        if not _has_cuda_headers():
             command = install_command("cupy-cuda13x[ctk]")
             return f"CuPy cannot find the CUDA headers; run {command} (or cupy-cuda12x[ctk])"
         return ""
 
     @classmethod
     def limit_memory(cls, device: int | None, share: float) -> None:
-        """Have this process take at most a share of a device's memory.
+        """Limit the device memory of this process to a fraction of the total.
 
-        CuPy keeps the memory that it has freed: without a limit, the first process on a device
-        leaves none to the others. A share of 1 or more sets no limit, and a limit of the user
-        (CUPY_GPU_MEMORY_LIMIT) stays.
+        CuPy keeps memory that it has freed, so without a limit, the first process on a device may
+        leave no memory for other processes. If `share` is 1 or more, there is no limit. A limit set
+        by the user with CUPY_GPU_MEMORY_LIMIT takes precedence.
         """
         if share >= 1 or "CUPY_GPU_MEMORY_LIMIT" in os.environ:
             return
@@ -112,16 +113,18 @@ class CudaBackend(Backend):
         with _device(cupy, device):
             cupy.get_default_memory_pool().set_limit(fraction=share)
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
         super().__init__(scene, threads, device)
         self._cupy = cupy = self.load_cupy()
         self._device = _device(cupy, device)
-        layout = lay_out(scene.meshes)
+        layout = build_mesh_tables(scene.meshes)
         self._roots = layout.roots
         self._stack = layout.stack
         self._masked = layout.masks is not None
         with self._device:
-            masks = layout.masks or Masks(*NO_MASKS)
+            masks = layout.masks or MaskTables(*NO_MASKS)
             tables: tuple[AnyArray, ...] = (
                 layout.nodes,
                 layout.triangles,
@@ -134,28 +137,28 @@ class CudaBackend(Backend):
             self._meshes = tuple(to_device(cupy, table) for table in tables)
             no_table = to_device(cupy, np.zeros(2, np.int64))
             self._no_counters = no_table, np.int32(0), cupy.zeros(1, np.int64)
-            self._no_other_hits = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
+            self._no_external_hits = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         self.update_scene(scene)
 
-    def update_scene(self, scene: Scene) -> None:
-        """Replace the scene by a scene of the same instances with new transforms."""
+    def update_scene(self, scene: LocalScene) -> None:
+        """Replace the scene with a scene that has the same instances but new transforms."""
         super().update_scene(scene)
-        layout = lay_out_instances(scene, self._roots)
+        layout = build_instance_tables(scene, self._roots)
         with self._device:
-            # In steps, so that scenes share compiled kernels.
+            # The stack size is rounded up so that different scenes can share compiled kernels.
             stack = -(-max(self._stack + layout.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _compiled(
-                self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
+                self._cupy, self._device.id, compiler_options(stack, scene.nested, self._masked)
             )
             tables = (layout.frame, layout.top, layout.instances)
             self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
 
     @property
     def device_lost(self) -> bool:
-        """Whether the device answers no call of this process any more.
+        """Whether the device no longer responds to calls from this process.
 
-        After an illegal address or an uncorrectable error of memory, all calls of CUDA fail until
-        the process ends; after a lack of memory, they do not.
+        After an illegal memory access or an uncorrectable memory error, all CUDA calls fail until
+        the process ends. After an out-of-memory error, they do not.
         """
         try:
             self._device.synchronize()
@@ -165,22 +168,22 @@ class CudaBackend(Backend):
 
     @staticmethod
     def load_cupy() -> Any:
-        """Load CuPy on first use.
+        """Import CuPy on first use.
 
-        Tests replace the module.
+        The tests replace this method.
         """
         import cupy
 
         return cupy
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         n = len(rays)
         with self._device:
             table = self._ray_table(rays)
             hits = self._cast(table, n, (rays.t_min, rays.t_max))
-            groups = Groups(np.zeros(1, np.int64), 1)
-            chunk = self._counted(0, table, hits, groups, self._no_other_hits)
+            groups = HitGroups(np.zeros(1, np.int64), 1)
+            chunk = self._count_chunk_hits(0, table, hits, groups, self._no_external_hits)
             packed = self._pack(chunk, groups, 1.0, self._no_counters)
             u, v = self._weights(hits, table, packed[0])
             ray, distance, triangle, instance = packed
@@ -188,7 +191,10 @@ class CudaBackend(Backend):
             return ClosestHits(*(array.get() for array in columns))
 
     def _ray_table(self, rays: Rays) -> tuple[Any, Any]:
-        """Copy rays to the device. Return origins, (3, n) or (3, 1) if shared, and directions."""
+        """Copy rays to the device.
+
+        Return their origins, (3, n) or (3, 1) if all rays share one, and their directions (3, n).
+        """
         tables = (np.ascontiguousarray(table.T) for table in (rays.origins, rays.directions))
         origins, directions = map(self._cupy.asarray, tables)
         return origins, directions
@@ -196,7 +202,10 @@ class CudaBackend(Backend):
     def _weights(
         self, hits: tuple[Any, Any, Any], table: tuple[Any, Any], ray: Any
     ) -> tuple[Any, Any]:
-        """Return the weights of the second and third corner of the hits of rays (k,)."""
+        """Return the barycentric weights of the second and third vertex at the hits of rays.
+
+        `ray` (k,) contains the indices of rays that hit.
+        """
         count = len(ray)
         u = self._cupy.empty(count)
         v = self._cupy.empty(count)
@@ -208,17 +217,17 @@ class CudaBackend(Backend):
         return u, v
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the kept hits of the rays of a scan, and counts of all hits."""
-        if scan.pattern.sub_rays is not None:  # the kernel has no sub-rays
+        """Return the stored hits of a scan and the counts of all hits."""
+        if scan.pattern.sub_rays is not None:  # The kernel does not support sub-rays.
             return super().scan(scan)
-        if scan.room is not None:
-            scan.rays(0, len(scan))  # writes the rays
+        if scan.out is not None:
+            scan.rays(0, len(scan))  # writes the rays to `scan.out`
         with self._device:
             max_hits = -(-len(scan) // scan.keep_every) + len(scan.groups)
             transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.nested)
             try:
-                hit_counts, counted = self.visit(scan, transfer.send)
-            finally:  # else the device would write to memory that goes back to the pool
+                hit_counts, counted = self.scan_on_device(scan, transfer.send)
+            finally:  # Wait in any case, because the device still writes to this memory.
                 ray, distance, triangle, instance = transfer.finish()
         tally = None
         if counted is not None:
@@ -226,47 +235,47 @@ class CudaBackend(Backend):
             tally[counted[0]] = counted[1]
         return ScanReturns(ray, distance, triangle, hit_counts, tally, instance)
 
-    def visit(
+    def scan_on_device(
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: tuple[Ints, int] | None = None,
-        other_hits: OtherHits | None = None,
-    ) -> tuple[Ints, Counted | None]:
-        """Cast a scan, and pass its hits to `use` on the device, as `RayCaster.visit` does."""
+        external_hits: ExternalHits | None = None,
+    ) -> tuple[Ints, TallyCounts | None]:
+        """Cast a scan and pass its hits to `use` on the device. See `RayCaster.scan_on_device`."""
         cp = self._cupy
         scene = self._scene
-        groups = Groups(scan.groups, scan.keep_every)
+        groups = HitGroups(scan.groups, scan.keep_every)
         with self._device:
             counting = self._no_counters
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
                 counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
             chunks = (
-                self._cast_chunk(scan, start, stop, groups, other_hits)
+                self._cast_chunk(scan, start, stop, groups, external_hits)
                 for start, stop in scan.chunks(self.chunk)
             )
             try:
                 for chunk in _one_behind(chunks):
                     packed = self._pack(chunk, groups, scene.frame.scale, counting)
-                    use(DeviceHits(*packed, cp, partial(_listed_rays, chunk.start, chunk.rays)))
-            except BaseException:  # the device still writes to the counts of the next chunk
+                    use(DeviceHits(*packed, cp, partial(_select_rays, chunk.start, chunk.rays)))
+            except BaseException:  # The device still writes the counts of the next chunk.
                 cp.cuda.get_current_stream().synchronize()
                 raise
             return groups.hit_counts, self._nonzero_counters(counting[2]) if scan.tally else None
 
-    def device_nearest(
+    def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
-    ) -> DeviceNearest:
-        """Put rays `start` to `stop` (n) of a scan on the device, as `RayCaster.device_nearest`."""
+    ) -> DeviceNearestHits:
+        """Copy rays `start` to `stop` of a scan to the device. See `RayCaster.upload_rays`."""
         cp = self._cupy
         n = stop - start
         with self._device:
             if scan.pattern.sub_rays is None:
                 rays = self._make_rays(scan, start, stop)
-            else:  # the kernel has no sub-rays
+            else:  # The kernel does not support sub-rays.
                 rays = cp.asarray(host_rays(scan, start, stop))
-            return DeviceNearest(
+            return DeviceNearestHits(
                 rays=rays,
                 time_index=cp.asarray(time_index),
                 distance=cp.full(n, end, np.float64),
@@ -276,8 +285,8 @@ class CudaBackend(Backend):
                 cupy=cp,
             )
 
-    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
-        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
+    def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
+        """Cast rays at bodies on the device, and record closer hits in `nearest`."""
         cp = self._cupy
         n = len(nearest.time_index)
         limits = (np.float64(t * self._scene.frame.scale) for t in bodies.limits)
@@ -304,19 +313,26 @@ class CudaBackend(Backend):
                 nearest.triangle,
             )
 
-    def _nonzero_counters(self, tally: Any) -> Counted:
-        """Copy the counters that are not 0 to the host, a small part of a tally."""
+    def _nonzero_counters(self, tally: Any) -> TallyCounts:
+        """Copy the nonzero counters of a tally, which are usually few, to the host."""
         rows = self._cupy.flatnonzero(tally)
         return rows.get(), tally[rows].get()
 
-    def _replace(
-        self, hits: tuple[Any, Any, Any], start: int, n: int, other_hits: OtherHits | None
+    def _apply_external_hits(
+        self, hits: tuple[Any, Any, Any], start: int, n: int, external_hits: ExternalHits | None
     ) -> tuple[Any, ...]:
-        """Replace hits of a cast behind `other_hits`, and return arguments of the kernel `pack`."""
-        if other_hits is None:
-            return self._no_other_hits
-        span = slice(*np.searchsorted(other_hits.ray, [start, start + n]))
-        tables = (other_hits.ray[span], other_hits.distance[span], other_hits.triangle[span])
+        """Replace hits of a chunk of n rays that are more distant than external hits.
+
+        Return the arguments of the kernel `pack` that describe the external hits.
+        """
+        if external_hits is None:
+            return self._no_external_hits
+        span = slice(*np.searchsorted(external_hits.ray, [start, start + n]))
+        tables = (
+            external_hits.ray[span],
+            external_hits.distance[span],
+            external_hits.triangle[span],
+        )
         ray, meters, triangle = map(self._cupy.asarray, tables)
         count = np.int64(len(ray))
         scale = np.float64(self._scene.frame.scale)
@@ -324,15 +340,15 @@ class CudaBackend(Backend):
         return meters, triangle, np.int32(len(self._scene.mesh))
 
     def _make_rays(self, scan: Scan, start: int, stop: int) -> Any:
-        """Return origins, meters, and directions of rays `start` to `stop` of a scan.
+        """Compute the origins in meters and the directions of rays `start` to `stop` of a scan.
 
-        They are float64 (6, n) on the device, with the bits of `pattern_rays`. Rays that are read
-        from memory cost the cast fewer registers and operations in double than rays that are
-        computed again for each triangle.
+        Return a float64 array (6, n) on the device, which is bit-identical to the result of
+        `pattern_rays`. Casting rays that are read from memory takes fewer registers and fewer
+        double-precision operations than computing each ray again for each triangle.
         """
         cp = self._cupy
         n = stop - start
-        directions, pattern_origins = self._resident(scan.pattern)
+        directions, pattern_origins = self._pattern_on_device(scan.pattern)
         rows = len(scan.pattern)
         rays = cp.empty((6, n))
         self._run(
@@ -344,26 +360,27 @@ class CudaBackend(Backend):
             np.int64(rows),
             np.int64((scan.first + start) % rows),
             *self._pattern_flags(scan, start),
-            *self._motion(scan.poses, start, stop),
+            *self._motion_tables(scan.poses, start, stop),
             np.int64(n),
             rays,
         )
         return rays
 
     def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
-        """Return arguments of make_rays: positions and rotations of rays `start` to `stop`."""
+        """Return the positions and rotations of the poses of rays, as arguments of `make_rays`."""
         span = _pose_span(poses, start, stop)
         matrices = np.zeros(1) if poses.rotations is None else poses.rotations[span]
-        # `asarray` keeps the order of memory, and poses are stored by component.
+        # Poses are stored component by component, and `asarray` would keep this memory order.
         return [
             self._cupy.asarray(np.ascontiguousarray(table))
             for table in (poses.positions[span], matrices)
         ]
 
     def _pattern_flags(self, scan: Scan, start: int) -> list[np.int32]:
-        """Return arguments of make_rays: rays of the first pose, of each pose, and flags.
+        """Return further arguments of the kernel `make_rays`.
 
-        The flags say whether there are rotations, and whether there are origins.
+        They are the number of rays of the first pose and of each later pose, whether there are
+        rotations, and whether the pattern has origins.
         """
         poses = scan.poses
         first_count = poses.rays_per_pose - start % poses.rays_per_pose
@@ -372,8 +389,8 @@ class CudaBackend(Backend):
         counts = (min(first_count, _MAX_INT), min(poses.rays_per_pose, _MAX_INT))
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
-    def _motion(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
-        """Return arguments of make_rays: delays, rates of poses, and whether there is motion."""
+    def _motion_tables(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
+        """Return arguments of `make_rays`: delays, velocities, and whether the lidar moves."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:
@@ -382,16 +399,17 @@ class CudaBackend(Backend):
         rates = np.concatenate([motion.velocities[span], motion.rates[span]], axis=1)
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
-    def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Return directions and origins of a pattern on the device: (3, n) each.
+    def _pattern_on_device(self, pattern: Pattern) -> tuple[Any, ...]:
+        """Return the directions and origins of a pattern on the device, (3, n) each.
 
-        Without origins, the directions take their place, which are not read then.
+        The arrays are copied on first use. If the pattern has no origins, the directions are
+        returned in their place, and the kernel does not read them.
         """
         copies = _patterns.setdefault(pattern, {})
         tables = copies.get(self._device.id)
         if tables is None:
             arrays = (pattern.directions, pattern.origins)
-            # If two threads come here, the second copy is kept, and both are right.
+            # If two threads copy the pattern at the same time, both copies are correct.
             columns = [to_device(self._cupy, array.T) for array in arrays if array is not None]
             tables = copies[self._device.id] = (columns[0], columns[-1])
         return tables
@@ -399,9 +417,10 @@ class CudaBackend(Backend):
     def _cast(
         self, table: tuple[Any, Any], n: int, limits: tuple[float, float]
     ) -> tuple[Any, Any, Any]:
-        """Return local distance, table row and instance of closest hits, on the device.
+        """Return the local distance, table row and instance of the closest hits, on the device.
 
-        `table` has origins and directions of n rays; `limits` are limits of the distance, meters.
+        `table` contains the origins and directions of n rays. `limits` are the minimum and maximum
+        distance in meters.
         """
         t = self._cupy.empty(n)
         row = self._cupy.empty(n, np.int32)
@@ -413,36 +432,42 @@ class CudaBackend(Backend):
         return t, row, instance
 
     def _cast_chunk(
-        self, scan: Scan, start: int, stop: int, groups: Groups, other_hits: OtherHits | None
+        self,
+        scan: Scan,
+        start: int,
+        stop: int,
+        groups: HitGroups,
+        external_hits: ExternalHits | None,
     ) -> _CastChunk:
-        """Cast rays `start` to `stop` of a scan, and count the hits, without waiting."""
-        rays = _table(self._make_rays(scan, start, stop))
+        """Cast rays `start` to `stop` of a scan and count the hits, without blocking."""
+        rays = _split_rays(self._make_rays(scan, start, stop))
         hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
-        replacing = self._replace(hits, start, stop - start, other_hits)
-        return self._counted(start, rays, hits, groups, replacing)
+        replacing = self._apply_external_hits(hits, start, stop - start, external_hits)
+        return self._count_chunk_hits(start, rays, hits, groups, replacing)
 
-    def _counted(
+    def _count_chunk_hits(
         self,
         start: int,
         rays: tuple[Any, Any],
         hits: tuple[Any, Any, Any],
-        groups: Groups,
-        other_hits: tuple[Any, ...],
+        groups: HitGroups,
+        external_hits: tuple[Any, ...],
     ) -> _CastChunk:
-        """Count the hits of a cast up to each ray, and start to copy counts of groups to the host.
+        """Compute the cumulative number of hits, and start to copy the counts to the host.
 
-        Hits are closed up by these sums in ray order, not by atomics: the same bytes on every run.
+        The hits are compacted by these sums instead of atomic operations, so that they are in ray
+        order and each run returns the same bytes.
         """
         cp = self._cupy
         n = len(hits[1])
         sums = cp.cumsum(hits[1] != -1, dtype=np.int32)
-        span, later_starts = groups.spans(start, start + n)
+        span, later_starts = groups.find_groups(start, start + n)
         cuts = PendingCopy(cp, sums[cp.asarray(np.append(later_starts, n) - 1)])
         return _CastChunk(
             start=start,
             rays=rays,
             hits=hits,
-            other_hits=other_hits,
+            external_hits=external_hits,
             sums=sums,
             span=span,
             later_starts=later_starts,
@@ -452,24 +477,24 @@ class CudaBackend(Backend):
     def _pack(
         self,
         chunk: _CastChunk,
-        groups: Groups,
+        groups: HitGroups,
         scale: float,
         counting: tuple[Any, np.int32, Any],
     ) -> tuple[Any, Any, Any, Any]:
-        """Count the hits of a chunk in `groups`, and close up the hits to keep, on the device.
+        """Count the hits of a chunk in `groups`, and compact the hits to store, on the device.
 
-        Distances are divided by `scale`. `counting` are arguments of the kernel `pack`. Returns
-        numbers of the rays, distances, the caller's triangles, and instances.
+        Distances are divided by `scale`. `counting` contains the tally arguments of the kernel
+        `pack`. Return the ray indices, distances, triangles and instances.
         """
         cp = self._cupy
         n = len(chunk.hits[1])
         cuts = np.append(0, chunk.cuts.values()).astype(np.int64)
-        first_kept, kept_counts = groups.count(chunk.span, np.diff(cuts))
+        first_kept, kept_counts = groups.count_hits(chunk.span, np.diff(cuts))
         offsets = np.cumsum(kept_counts) - kept_counts
         starts = np.append(0, chunk.later_starts)
         table = np.minimum([starts, cuts[:-1] + first_kept, offsets], _MAX_INT)
-        kinds = (np.uint32, np.float64, np.int32, np.int32)
-        packed = tuple(cp.empty(int(kept_counts.sum()), kind) for kind in kinds)
+        dtypes = (np.uint32, np.float64, np.int32, np.int32)
+        packed = tuple(cp.empty(int(kept_counts.sum()), dtype) for dtype in dtypes)
         self._run(
             "pack",
             n,
@@ -479,7 +504,7 @@ class CudaBackend(Backend):
             np.int64(n),
             np.float64(scale),
             np.int64(chunk.start),
-            *chunk.other_hits,
+            *chunk.external_hits,
             cp.asarray(table.astype(np.int32)),
             np.int32(len(kept_counts)),
             np.int32(min(groups.keep_every, _MAX_INT)),
@@ -489,9 +514,9 @@ class CudaBackend(Backend):
         return packed
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with a thread for each item, unless there are none.
+        """Launch a kernel with one thread per item, unless there are no items.
 
-        A grid has one dimension, of fewer than 2**31 blocks: room for 2**38 items.
+        The grid has one dimension with fewer than 2**31 blocks, which is enough for 2**38 items.
         """
         if threads:
             grid = (-(-threads // _BLOCK),)
@@ -499,9 +524,10 @@ class CudaBackend(Backend):
 
 
 def _one_behind(items: Iterable[T]) -> Iterator[T]:
-    """Yield items, each after the next was computed.
+    """Yield each item after the next item has been computed.
 
-    So the device casts a chunk while the host waits for the hits of the chunk before.
+    This way, the device casts the next chunk while the host waits for the hits of the current
+    chunk.
     """
     waiting: list[T] = []
     for item in items:
@@ -511,71 +537,71 @@ def _one_behind(items: Iterable[T]) -> Iterator[T]:
     yield from waiting
 
 
-def _table(rays: Any) -> tuple[Any, Any]:
-    """Return origins and directions, (3, n) each, of rays (6, n)."""
+def _split_rays(rays: Any) -> tuple[Any, Any]:
+    """Split rays (6, n) into origins and directions, (3, n) each."""
     return rays[:3], rays[3:]
 
 
 def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:
-    """Return arguments of kernels: origins, directions, and the number of each."""
+    """Return kernel arguments: origins and directions, each followed by its number of columns."""
     origins, directions = table
     return origins, np.int64(origins.shape[1]), directions, np.int64(directions.shape[1])
 
 
-def _listed_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
-    """Return origins and directions, (3, k), of rays of a table.
+def _select_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
+    """Return the origins and directions, (3, k) each, of rays in a table.
 
-    Ray `start` is in its first column.
+    The first column of the table belongs to ray `start`.
     """
     origins, directions = (column.take(ray - start, axis=1) for column in table)
     return origins, directions
 
 
 def _pose_span(poses: Poses, start: int, stop: int) -> slice:
-    """Return the range of the poses of rays `start` to `stop`."""
+    """Return the range of poses that rays `start` to `stop` belong to."""
     return slice(start // poses.rays_per_pose, -(-stop // poses.rays_per_pose))
 
 
-def source() -> str:
-    """Return the text of intersect.cu, with its name for the compiler's messages."""
+def kernel_source() -> str:
+    """Return the text of intersect.cu, with its file name for compiler messages."""
     text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
     return f'#line 1 "intersect.cu"\n{text}'
 
 
-def flags(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
-    """Return the compiler options of intersect.cu.
+def compiler_options(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
+    """Return the compiler options for intersect.cu.
 
-    `stack` is the maximum of nodes that wait in a traversal; `nested` is true for instances,
-    `masked` if parts of triangles are transparent.
+    `stack` is the maximum number of pending nodes in a traversal. `nested` states whether the scene
+    has instances, and `masked` whether parts of triangles are transparent.
     """
     scene_flags = (f"-DNESTED={int(nested)}", f"-DMASKED={int(masked)}")
     return ("-std=c++17", "-fmad=false", f"-DSTACK={stack}", *scene_flags)
 
 
 @lru_cache(maxsize=64)
-def _compiled(cupy: Any, device: int, flags: tuple[str, ...]) -> Any:
-    """Compile the kernels for the current device, with the number `device`, once."""
-    module = cupy.RawModule(code=source(), options=flags)
+def _compiled(cupy: Any, device: int, options: tuple[str, ...]) -> Any:
+    """Compile the kernels for the current device, whose index is `device`. The result is cached."""
+    module = cupy.RawModule(code=kernel_source(), options=options)
     module.compile()
     return module
 
 
-def _headers() -> bool:
-    """Return whether CuPy will find the headers of CUDA, which compilation needs.
+def _has_cuda_headers() -> bool:
+    """Return whether CuPy will find the CUDA headers, which it needs to compile kernels.
 
-    Runtime containers have a driver and a compiler, but no headers.
+    Runtime containers contain a driver and a compiler, but no headers.
     """
     try:
         from cuda.pathfinder import find_nvidia_header_directory
-    except ImportError:  # this version of CuPy searches elsewhere
+    except ImportError:  # Versions of CuPy without cuda.pathfinder find the headers differently.
         return True
     return find_nvidia_header_directory("cudart") is not None
 
 
 def _device(cupy: Any, number: int | None) -> Any:
-    """Return the device with a number, or the current device.
+    """Return the device with an index, or the current device for None.
 
-    Raises ValueError for a wrong number.
+    Raises ValueError if the device does not exist.
     """
     count = cupy.cuda.runtime.getDeviceCount()
     if number is not None and not 0 <= number < count:

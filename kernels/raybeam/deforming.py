@@ -1,8 +1,10 @@
-"""Meshes whose vertices move: each ray meets the mesh in its shape at the time of the ray.
+"""Meshes whose vertices move between frames.
 
-A tree over the triangles, built once, serves for all times: between two frames each vertex moves
-straight, so a box around a triangle at both frames holds the triangle in between, too. All backends
-cast these meshes in a loop on the CPU (deforming_loops.py), with the test of triangle.py.
+A ray hits such a mesh in its shape at the firing time of the ray. One tree over the triangles,
+which is built once, serves all times: each vertex moves along a straight line between two frames,
+so a box that encloses a triangle at both frames also encloses it in between. All backends cast rays
+at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses the intersection
+test in triangle.py.
 """
 
 from __future__ import annotations
@@ -14,19 +16,19 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from .arrays import Floats, Ints
-from .crossing import Crossing, Nearest
+from .body_rays import NearestHits, RayBodyPairs
 from .tree import build_tree
 
 if TYPE_CHECKING:
     from .deforming_loops import DeformingTree
 
-_PAD = 1e-6  # share of the mesh's size, around boxes: far more than rounding to float32
+_PAD = 1e-6  # padding of boxes relative to the mesh's size, much more than float32 rounding errors
 _LEAF_SIZE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Deforming:
-    """A mesh whose vertices move linearly between frames, for use as a shape in `Moving`.
+class DeformingMesh:
+    """A mesh whose vertices move linearly between frames, for use as a shape in `MovingBodies`.
 
     Frame numbers start at 0, and frame 1.5 is halfway between the second and the third frame. The
     mesh keeps its shape before the first and after the last frame.
@@ -48,18 +50,18 @@ class Deforming:
         """Lower and upper corner of the bounding box of all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays at bodies with this shape, and record closer hits in `nearest`.
 
         Ties are resolved in favor of the lowest triangle index.
         """
         from . import deforming_loops as loops
 
-        loops.cast_crossing(crossing.contiguous(), self._tree, nearest)
+        loops.cast_pairs(pairs.contiguous(), self._tree, nearest)
 
     @cached_property
     def _tree(self) -> DeformingTree:
-        """The mesh and its tree for the compiled loop."""
+        """The mesh and its tree in the form that the compiled loop reads."""
         from . import deforming_loops as loops
 
         vertices = np.ascontiguousarray(self.vertices)
@@ -69,5 +71,5 @@ class Deforming:
         tree = build_tree(local[faces], loops.WIDTH, _LEAF_SIZE)
         boxes = np.empty((len(vertices) - 1, len(tree.child), 6, loops.WIDTH), np.float32)
         pad = _PAD * float(np.abs(box).max())
-        loops.fit(vertices, faces, tree.order, tree.child, pad, boxes)
+        loops.fit_boxes(vertices, faces, tree.order, tree.child, pad, boxes)
         return loops.DeformingTree(vertices, faces, tree.order, tree.child, boxes)

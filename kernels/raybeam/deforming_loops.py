@@ -1,4 +1,4 @@
-"""Loops of deforming.py, which cast rays on meshes whose vertices move."""
+"""Compiled loops that cast rays at meshes whose vertices move (deforming.py)."""
 
 from __future__ import annotations
 
@@ -8,36 +8,35 @@ import numpy as np
 from numba import types
 
 from .arrays import Floats, Floats32, Ints, Ints32
-from .cast_memory import float32s, float64s
-from .compiled import compiled, inlined, stage
-from .moving_loops import CROSSING, NEAREST, named_tuple_type, pose_rotation, to_body_axes
+from .cast_record import float32s, float64s
+from .compiled import compiled, inlined, noinline
+from .moving_loops import NEAREST_HITS, PAIRS, named_tuple_type, pose_rotation, to_body_axes
 from .tree import LEAF_BITS
-from .triangle_loops import areas, same_sign, shear
+from .triangle_loops import intersect_plane, same_sign, shear_ray
 
-WIDTH = 8  # children of a node
-_STACK = 512  # nodes still to visit: far more than on any descent in a tree of 2**28 triangles
+WIDTH = 8  # children per node
+_STACK = 512  # capacity of the stack, much more than any traversal of 2**28 triangles needs
 _BOX = 4 * 6 * WIDTH  # bytes of the boxes of a node
 _TINY = 1e-300
 
 
 class DeformingTree(NamedTuple):
-    """A mesh that deforms, and a tree over its triangles with boxes for each interval of frames.
-
-    A frame is the vertices at a known time; between two frames each vertex moves straight.
+    """A deforming mesh, and a tree over its triangles with boxes for each interval between frames.
 
     Attributes
     ----------
     vertices
-        float64 (f, v, 3): vertices at each frame, meters.
+        float64 (f, v, 3): vertices at each frame, in meters. They move linearly between frames.
     faces
-        int64 (t, 3): rows of the vertices of each triangle.
+        int64 (t, 3): indices of the vertices of each triangle.
     order, child
-        int32 (t,) and (m, `WIDTH`): triangles in the order of the leaves, and children of each
-        node, as in `tree.WideTree`: a positive number of a node, 0 for none, or
-        ``~(first << LEAF_BITS | count - 1)`` for a leaf of ``order[first : first + count]``.
+        int32 (t,) and (m, `WIDTH`): triangles in leaf order, and children of each node, as in
+        `tree.WideTree`. A child is the index of a node if it is positive, 0 if the slot is empty,
+        or ``~(first << LEAF_BITS | count - 1)`` for a leaf with the triangles ``order[first : first
+        + count]``.
     boxes
-        float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node, from each frame to the
-        next: lower x, y, z, upper x, y, z, meters.
+        float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node between consecutive
+        frames: lower x, y, z, upper x, y, z, in meters.
     """
 
     vertices: Floats
@@ -58,13 +57,14 @@ _TREE = named_tuple_type(
 
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
-def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Compute the boxes of all nodes of a `DeformingTree` between each frame and the next.
+def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
+    """Compute the boxes of all nodes of a `DeformingTree` between consecutive frames.
 
-    The boxes are written to `boxes`. They extend beyond the triangles by `pad`, in meters.
+    The boxes are written to `boxes`. They extend beyond the triangles by `pad` meters.
     """
     for i in range(len(boxes)):
-        for node in range(len(child) - 1, -1, -1):  # children come after their parents
+        # Children have higher indices than their parents.
+        for node in range(len(child) - 1, -1, -1):
             for c in range(WIDTH):
                 code = np.int64(child[node, c])
                 first = ~code >> LEAF_BITS
@@ -88,13 +88,13 @@ def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-d
                     boxes[i, node, 3 + axis, c] = upper
 
 
-@stage
-def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+@noinline
+def _entry_distances(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     """Write the distances at which a ray enters the boxes of a node's children, or inf for a miss.
 
-    `box` is the address of the boxes, float32 (6, `WIDTH`); `entry_distances` is the address of the
-    output, float64 (`WIDTH`,). `inverse` is 1 over the ray's direction; the ray ends at the
-    distance `reach`.
+    `box` is the address of the boxes, float32 (6, `WIDTH`), and `entry_distances` is the address of
+    the output, float64 (`WIDTH`,). `inverse` contains the reciprocals of the direction's
+    components. The ray ends at the distance `reach`.
     """
     x, y, z = origin
     u, v, w = inverse
@@ -114,15 +114,15 @@ def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-unt
 
 @inlined
 def _inverse(d):  # type: ignore[no-untyped-def]
-    """Return 1 over a component of a direction, or a large number for 0."""
+    """Return the reciprocal of a direction component, or of a tiny number if it is 0."""
     return 1 / (d if abs(d) >= _TINY else _TINY)
 
 
 @inlined
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
-    """Return a vertex at a share of the time from a frame to the next, 0 to 1.
+    """Return a vertex between two frames, as three coordinates in meters with `axis` last.
 
-    Returns three coordinates, meters, with `axis` last.
+    `share` is the fraction of the time from `frame` to the next frame, between 0 and 1.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
@@ -134,26 +134,26 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
     )
 
 
-@compiled(types.void(CROSSING, _TREE, NEAREST))
-def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast the pairs of a `Crossing` on a deforming mesh, and write nearer hits to a `Nearest`.
+@compiled(types.void(PAIRS, _TREE, NEAREST_HITS))
+def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+    """Cast pairs of rays and bodies at a deforming mesh, and record closer hits in `nearest`.
 
-    Each ray meets the mesh in its shape at `Crossing.frame`. Nodes are visited nearest first;
-    `waits` are the distances of the nodes on the stack.
+    Each ray hits the mesh in its shape at the frame number `RayBodyPairs.frame`. Nodes are visited
+    from near to far. `stack_distances` contains the entry distances of the nodes on the stack.
     """
-    rays = crossing.rays
-    poses = crossing.poses
-    body = crossing.body
+    rays = pairs.rays
+    poses = pairs.poses
+    body = pairs.body
     vertices, faces, order, child, boxes = tree
     distance, bodies, instance, triangle = nearest
     stack = np.empty(_STACK, np.int64)
-    waits = np.empty(_STACK)
-    enters = np.empty(WIDTH)
-    t_min, t_max = crossing.limits
+    stack_distances = np.empty(_STACK)
+    child_distances = np.empty(WIDTH)
+    t_min, t_max = pairs.limits
     last = np.int64(len(vertices) - 2)
     for n in range(len(body)):
-        k = crossing.row[n]
-        p = crossing.pose[n]
+        k = pairs.row[n]
+        p = pairs.pose[n]
         rotation = pose_rotation(poses, p)
         x = rays[0, k] - poses[0, p]
         y = rays[1, k] - poses[1, p]
@@ -162,37 +162,39 @@ def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # n
         u, v, w = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
         origin = x, y, z
         inverse = _inverse(u), _inverse(v), _inverse(w)
-        axis, a, b, c, d, e, f = shear(x, y, z, u, v, w)
+        axis, a, b, c, d, e, f = shear_ray(x, y, z, u, v, w)
         sheared_ray = a, b, c, d, e, f
-        frame = np.int64(max(crossing.frame[n], 0.0))
+        frame = np.int64(max(pairs.frame[n], 0.0))
         frame = frame if frame < last else last
-        share = min(max(crossing.frame[n] - frame, 0.0), 1.0)
+        share = min(max(pairs.frame[n] - frame, 0.0), 1.0)
         frame_boxes = boxes.ctypes.data + _BOX * len(child) * frame
         best = min(distance[k], t_max)
         hit_triangle = np.int64(-1)
         top = 1
         stack[0] = 0
-        waits[0] = 0.0
+        stack_distances[0] = 0.0
         while top:
             top -= 1
             node = stack[top]
-            if waits[top] > best:
+            if stack_distances[top] > best:
                 continue
-            _enter(frame_boxes + _BOX * node, origin, inverse, best, enters.ctypes.data)
-            below = top
+            _entry_distances(
+                frame_boxes + _BOX * node, origin, inverse, best, child_distances.ctypes.data
+            )
+            bottom = top
             for slot in range(WIDTH):
                 code = np.int64(child[node, slot])
-                enter = enters[slot]
-                if code == 0 or enter > best:
+                distance_to_child = child_distances[slot]
+                if code == 0 or distance_to_child > best:
                     continue
-                if code > 0:  # the nearest comes last
+                if code > 0:  # Insert the node so that the nearest one is on top.
                     position = top
-                    while position > below and waits[position - 1] < enter:
+                    while position > bottom and stack_distances[position - 1] < distance_to_child:
                         stack[position] = stack[position - 1]
-                        waits[position] = waits[position - 1]
+                        stack_distances[position] = stack_distances[position - 1]
                         position -= 1
                     stack[position] = code
-                    waits[position] = enter
+                    stack_distances[position] = distance_to_child
                     top += 1
                     continue
                 first = ~code >> LEAF_BITS
@@ -203,7 +205,7 @@ def cast_crossing(crossing, tree, nearest):  # type: ignore[no-untyped-def]  # n
                         _corner(vertices, frame, share, faces[face, 1], axis),
                         _corner(vertices, frame, share, faces[face, 2], axis),
                     )
-                    a, b, c, det, t = areas(corners, sheared_ray)
+                    a, b, c, det, t = intersect_plane(corners, sheared_ray)
                     if det == 0 or not same_sign(a, b, c) or not t_min <= t <= best:
                         continue
                     if t < best or hit_triangle < 0 or face < hit_triangle:

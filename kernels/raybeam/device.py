@@ -1,4 +1,4 @@
-"""Hits that stay on a CUDA device, and the copy of arrays from the device to the host."""
+"""Hits on a CUDA device, and transfers from the device to the host."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .arrays import AnyArray, Floats, Ints32, UInts32
-from .crossing import BodyHits
-from .hits import Part
+from .body_rays import BodyHits
+from .hits import HitColumns
 
-PINNED_BYTES = 1 << 30  # page-locked, of all outboxes of a process
-_MAX_PENDING = 2  # copies: a copy runs while the arrays of the next are computed
+PINNED_BYTES = 1 << 30  # limit for the page-locked memory of a process
+_MAX_PENDING = 2  # pending copies, so that one runs while the next arrays are computed
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceHits:
-    """Kept hits of a part of a scan, as CuPy arrays on the current device and stream.
+    """Stored hits of a part of a scan, as CuPy arrays on the current device and stream.
 
     Attributes
     ----------
     ray, distance, triangle, instance
         (k,): as in `ScanReturns`.
     cupy
-        The module, for further arrays and kernels.
+        The CuPy module.
     make_rays
-        Function of numbers of rays that returns origins and directions (`rays`).
+        Function that computes the origins and directions of rays from their indices.
     """
 
     ray: Any
@@ -45,29 +45,29 @@ class DeviceHits:
         return len(self.ray)
 
     def rays(self) -> tuple[Any, Any]:
-        """Compute origins, meters, and unit directions of the rays: float64 (3, k) on the device.
+        """Compute the origins in meters and the unit directions of the rays, float64 (3, k) each.
 
-        Both have the bits of `pattern_rays`.
+        The arrays are on the device. They are bit-identical to the result of `pattern_rays`.
         """
         return self.make_rays(self.ray)
 
-    def get(self) -> Part:
+    def get(self) -> HitColumns:
         """Copy the hits to the host."""
         return self.ray.get(), self.distance.get(), self.triangle.get(), self.instance.get()
 
 
 @dataclass(frozen=True, eq=False)
-class OtherHits:
-    """Hits of a scan's rays on surfaces outside the caster, such as moving bodies.
+class ExternalHits:
+    """Hits of a scan's rays on surfaces that are not part of the caster, for example moving bodies.
 
     Attributes
     ----------
     ray
-        uint32 (k,): number of the ray, ascending, each at most once.
+        uint32 (k,): index of the ray, in ascending order and without duplicates.
     distance
-        float64 (k,): meters.
+        float64 (k,): distance in meters.
     triangle
-        int32 (k,): any number of a triangle.
+        int32 (k,): value that is returned as the triangle of the hit.
     """
 
     ray: UInts32
@@ -76,19 +76,19 @@ class OtherHits:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceNearest:
-    """Rays on a CUDA device, and their nearest hits on moving bodies so far, as CuPy arrays.
+class DeviceNearestHits:
+    """Rays on a CUDA device with their closest hits on moving bodies, as CuPy arrays.
 
     Attributes
     ----------
     rays
-        float64 (6, n): origins, meters, and directions.
+        float64 (6, n): origins in meters and directions.
     time_index
-        int32 (n,): number of each ray's time.
+        int32 (n,): index of the firing time of each ray.
     distance, body, instance, triangle
-        (n,): as in `Nearest`.
+        (n,): as in `NearestHits`.
     cupy
-        The module.
+        The CuPy module.
     """
 
     rays: Any
@@ -99,21 +99,22 @@ class DeviceNearest:
     triangle: Any
     cupy: Any
 
-    def hits(self) -> BodyHits:
-        """Copy the hits to the host, without the rays that hit no body."""
+    def compact(self) -> BodyHits:
+        """Copy the recorded hits to the host, without rays that hit no body."""
         ray = self.cupy.flatnonzero(self.body >= 0)
         columns = (self.distance, self.body, self.instance, self.triangle)
         return BodyHits(ray.get(), *(column[ray].get() for column in columns))
 
 
 def to_device(cupy: Any, array: AnyArray) -> Any:
-    """Copy an array to the current device, and wait: any stream may read the copy then.
+    """Copy an array to the current device and wait until the copy is complete.
 
-    A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
-    returns: hence the wait, after which the caller may release the array.
+    After that, any stream may read the copy, and the caller may release the array. The wait is
+    necessary on devices that read ordinary host memory themselves, such as Grace Hopper, because
+    `set` may return before they have finished.
 
-    `asarray` would copy through page-locked memory as large as the array and keep it: fine for
-    the rays of a chunk, too much for a scene.
+    `cupy.asarray` would allocate page-locked memory of the same size as the array and keep it,
+    which is acceptable for the rays of a chunk but not for a scene.
     """
     copy = cupy.empty(array.shape, array.dtype)
     if array.size:
@@ -123,21 +124,22 @@ def to_device(cupy: Any, array: AnyArray) -> Any:
 
 
 class _Pinned:
-    """Count of page-locked bytes in use by this process, for threads to share."""
+    """Thread-safe count of the page-locked bytes that this process uses."""
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()  # a finalizer may run while its thread holds the lock
+        # Reentrant, because a finalizer may run while its thread holds the lock.
+        self._lock = threading.RLock()
         self._bytes = 0
 
-    def take(self, size: int) -> bool:
-        """Count bytes and return True, unless there would be too many."""
+    def reserve(self, size: int) -> bool:
+        """Reserve bytes, and return False if the limit would be exceeded."""
         with self._lock:
             fits = self._bytes + size <= PINNED_BYTES
             self._bytes += size * fits
             return fits
 
-    def give_back(self, size: int) -> None:
-        """Count bytes that are no longer in use."""
+    def release(self, size: int) -> None:
+        """Release reserved bytes."""
         with self._lock:
             self._bytes -= size
 
@@ -145,69 +147,70 @@ class _Pinned:
 _pinned = _Pinned()
 
 
-def host_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
-    """Return an array (count,) in page-locked memory, for the device to write to directly.
+def pinned_array(cupy: Any, count: int, dtype: DTypeLike) -> AnyArray:
+    """Return an array (count,) in page-locked memory, to which the device can write directly.
 
-    The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
-    `PINNED_BYTES`, further arrays are in ordinary memory. Copies to ordinary memory take longer,
-    but page-locked memory is lost to all other processes of the machine.
+    The memory returns to CuPy's pool when the last view of the array is released. If `PINNED_BYTES`
+    are in use, the array is in ordinary memory instead. Copies to ordinary memory are slower, but
+    page-locked memory is not available to other processes on the machine.
     """
-    size = max(count * np.dtype(kind).itemsize, 1)
-    if not _pinned.take(size):
-        return np.empty(count, kind)
+    size = max(count * np.dtype(dtype).itemsize, 1)
+    if not _pinned.reserve(size):
+        return np.empty(count, dtype)
     try:
         memory = cupy.cuda.alloc_pinned_memory(size)
     except BaseException:
-        _pinned.give_back(size)
+        _pinned.release(size)
         raise
-    array = np.frombuffer(memory, kind, count)
-    weakref.finalize(array, _pinned.give_back, size)  # views of the array keep the array
+    array = np.frombuffer(memory, dtype, count)
+    weakref.finalize(array, _pinned.release, size)  # views of the array keep the array
     return array
 
 
 class PendingCopy:
-    """A small copy to the host, in the current stream, for which the host waits later.
+    """A small copy to the host that runs in the current stream without blocking.
 
     Parameters
     ----------
     cupy
-        The module.
+        The CuPy module.
     array
-        CuPy array (n,), which the current stream computes.
+        CuPy array (n,) that the current stream computes.
     """
 
     def __init__(self, cupy: Any, array: Any) -> None:
         stream = cupy.cuda.get_current_stream()
-        self._values = host_array(cupy, len(array), array.dtype)
+        self._values = pinned_array(cupy, len(array), array.dtype)
         array.get(stream=stream, out=self._values, blocking=False)
         self._copied = stream.record()
-        self._source = array  # the device still reads the array
+        self._source = array  # must stay alive while the device reads it
 
     def values(self) -> AnyArray:
-        """Wait for the copy, and return the values (n,)."""
+        """Wait until the copy is complete and return the values (n,)."""
         self._copied.synchronize()
         return self._values
 
 
-class Outbox:
-    """Queue of copies of arrays to the host, in a separate stream, while the device goes on.
+class CopyQueue:
+    """Queue of copies to the host in a separate stream, while the device computes further arrays.
 
     Parameters
     ----------
     cupy
-        The module.
+        The CuPy module.
     """
 
     def __init__(self, cupy: Any) -> None:
         self._cupy = cupy
         self._stream = cupy.cuda.Stream(non_blocking=True)
-        # Events after copies, and arrays that the device still reads.
+        # The event after each copy, and the arrays that the device reads until then.
         self._pending: deque[tuple[Any, Sequence[Any]]] = deque()
 
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
-        """Start to copy arrays that the current stream computes: pairs of source and target.
+        """Start to copy arrays that the current stream computes.
 
-        Targets are arrays from `host_array`.
+        `pairs` contains the source and target of each copy. The targets must come from
+        `pinned_array`.
         """
         self._stream.wait_event(self._cupy.cuda.get_current_stream().record())
         for source, target in pairs:
@@ -216,58 +219,58 @@ class Outbox:
         self._wait(_MAX_PENDING)
 
     def wait(self) -> None:
-        """Wait until all copies have ended."""
+        """Wait until all copies are complete."""
         self._wait(0)
 
     def _wait(self, max_pending: int) -> None:
-        """Wait until at most `max_pending` copies remain."""
+        """Wait until at most `max_pending` copies are pending."""
         while len(self._pending) > max_pending:
             copied, _ = self._pending.popleft()
             copied.synchronize()
 
 
 class HitTransfer:
-    """Sends the hits of a scan to the host, part by part, while the device casts further rays.
+    """Transfer of a scan's hits to the host, part by part, while the device casts further rays.
 
     Parameters
     ----------
     cupy
-        The module.
+        The CuPy module.
     max_hits
-        Number of hits for which there is room.
+        Maximum number of hits.
     nested
-        Whether the scene has instances; without instances, all hits are on instance 0.
+        Whether the scene has instances. Otherwise, all hits belong to instance 0.
     """
 
     def __init__(self, cupy: Any, max_hits: int, *, nested: bool) -> None:
-        self._outbox = Outbox(cupy)
-        kinds = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
-        self._arrays = [host_array(cupy, max_hits, kind) for kind in kinds]
+        self._outbox = CopyQueue(cupy)
+        dtypes = (np.uint32, np.float64, np.int32, *([np.int32] if nested else []))
+        self._arrays = [pinned_array(cupy, max_hits, dtype) for dtype in dtypes]
         self._max_hits = max_hits
         self._count = 0
 
     def send(self, hits: DeviceHits) -> None:
-        """Start to copy the next hits, in ray order."""
+        """Start to copy the next hits in ray order."""
         rows = slice(self._count, self._count + len(hits))
         columns = (hits.ray, hits.distance, hits.triangle, hits.instance)
         pairs = zip(columns, self._arrays, strict=False)
         self._outbox.send([(column, array[rows]) for column, array in pairs])
         self._count += len(hits)
 
-    def finish(self) -> Part:
-        """Wait for all copies, and return the hits."""
+    def finish(self) -> HitColumns:
+        """Wait until all copies are complete and return the hits."""
         self._outbox.wait()
         ray, distance, triangle, *instances = (
-            filled(array, self._count, self._max_hits) for array in self._arrays
+            trim_to_count(array, self._count, self._max_hits) for array in self._arrays
         )
         instance = instances[0] if instances else np.zeros(self._count, np.int32)
         return ray, distance, triangle, instance
 
 
-def filled(array: AnyArray, count: int, room: int) -> AnyArray:
-    """Return the first `count` values of an array from `host_array`, which has `room` values.
+def trim_to_count(array: AnyArray, count: int, capacity: int) -> AnyArray:
+    """Return the first `count` values of an array from `pinned_array`.
 
-    If less than half of the room is in use, the values are a copy: the page-locked memory is given
-    back.
+    If the values occupy less than half of the array's `capacity`, they are copied to ordinary
+    memory, so that the page-locked memory can be released.
     """
-    return array[:count].copy() if 2 * count < room else array[:count]
+    return array[:count].copy() if 2 * count < capacity else array[:count]

@@ -1,4 +1,4 @@
-"""Results of casting rays."""
+"""Results of ray casting."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from .arrays import Bools, Floats, Ints, Ints32, UInts32
 
-# Ray, distance, triangle and instance of hits, as in `ScanReturns`.
-Part = tuple[UInts32, Floats, Ints32, Ints32]
+# The columns `ray`, `distance`, `triangle` and `instance` of `ScanReturns`.
+HitColumns = tuple[UInts32, Floats, Ints32, Ints32]
 
-# Numbers of the counters of a tally that are not 0, ascending, and their hits.
-Counted = tuple[Ints, Ints]
+# Indices of the nonzero counters of a tally, in ascending order, and their numbers of hits.
+TallyCounts = tuple[Ints, Ints]
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class ScanReturns:
         return len(self.ray)
 
 
-def join_hits(parts: list[Part]) -> Part:
-    """Join the hits of parts, in order, without a copy of a single part."""
+def join_hits(parts: list[HitColumns]) -> HitColumns:
+    """Concatenate hits in the given order. A single part is returned without a copy."""
     if len(parts) == 1:
         return parts[0]
     no_ints = np.zeros(0, np.int32)

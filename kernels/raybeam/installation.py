@@ -1,4 +1,4 @@
-"""How packages are installed in the environment of this process, for messages."""
+"""Installation commands for error messages."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements, such as ``pye57>=0.4``, here.
+    """Return the command that installs requirements in the environment of this process.
 
-    Environments of uv have no pip, and environments of conda may lack it.
+    A requirement may have a version, for example ``pye57>=0.4``. Environments created by uv do not
+    contain pip, and conda environments may lack it.
     """
     words = [f'"{word}"' if {*word} & {*"[]<>="} else word for word in requirements]
     pip_install = " ".join(["pip install", *words])
@@ -19,13 +20,13 @@ def install_command(*requirements: str) -> str:
     prefix = Path(sys.prefix)
     if (prefix / "conda-meta").is_dir():
         return f"conda install pip && {pip_install}"
-    if _is_of_uv(prefix):
+    if _created_by_uv(prefix):
         return f"uv {pip_install}"
     return f"python -m ensurepip && python -m {pip_install}"
 
 
-def _is_of_uv(prefix: Path) -> bool:
-    """Return whether uv has made a virtual environment."""
+def _created_by_uv(prefix: Path) -> bool:
+    """Return whether uv created a virtual environment."""
     try:
         settings = (prefix / "pyvenv.cfg").read_text("utf-8")
     except OSError:

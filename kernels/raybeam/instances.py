@@ -1,13 +1,13 @@
-"""Meshes, their instances, and the scene of a caster.
+"""Meshes, instances, and the scene that a backend casts rays at.
 
-Rays are cast in two levels. The scene and each mesh have local coordinates (`Frame`). At an
-instance, a matrix transforms the ray from the scene's to the mesh's coordinates, and the direction
-is made a unit vector again, so the properties of rays and meshes in [-1, 1] hold: every error
-bound, and that no ray slips between two triangles. The distance is divided by the length of the
-direction before that.
+Rays are cast on two levels. The scene and each mesh have their own local coordinates
+(`LocalFrame`). At an instance, a matrix transforms a ray from scene to mesh coordinates, and its
+direction is normalized again. Therefore, the same error bounds hold for all meshes, and no ray
+slips between two adjacent triangles. Distances are divided by the length that the direction had
+before it was normalized.
 
-All backends do these operations in float64, in the order of `Scene.enter`, without a fused
-multiply-add.
+All backends perform these operations in float64, in the order of `LocalScene.to_mesh_coordinates`
+and without fused multiply-adds, so that their results have the same bits.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
-from .mesh import Frame, LocalMesh, center_and_scale, local_mesh
+from .mesh import LocalFrame, LocalMesh, center_and_scale, local_mesh
 from .opacity import Opacity
 from .poses import determinants
 from .tree import PAD
 
-# Limit for all meshes together: positions in a tree have 31 bits, 3 of them for a leaf.
+# Limit for all meshes together. Positions in a tree have 31 bits, of which a leaf takes 3.
 MAX_TRIANGLES = 2**28 - 1
-_FLAT = 1e-9  # share of the volume of its columns below which a transform is singular
+# A transform counts as singular if its determinant, relative to the lengths of its columns, is
+# less.
+_FLAT = 1e-9
 
 
 class Mesh:
@@ -84,28 +86,28 @@ class Instance:
 
 @dataclass(frozen=True, eq=False)
 class MeshFrames:
-    """Frames of the meshes of n instances.
+    """Local coordinates and bounding boxes of the meshes of n instances.
 
     Attributes
     ----------
     scale
-        float64 (n,): `Frame.scale`.
+        float64 (n,): as in `LocalFrame`.
     center
-        float64 (n, 3): `Frame.center`, meters.
-    middle
-        float64 (n, 3): middle of the mesh's box, relative to `center`, meters.
-    half
-        float64 (n, 3): halves of the sides of the mesh's box, meters.
+        float64 (n, 3): as in `LocalFrame`, in meters.
+    box_center
+        float64 (n, 3): center of the bounding box relative to `center`, in meters.
+    box_half_size
+        float64 (n, 3): half side lengths of the bounding box, in meters.
     """
 
     scale: Floats
     center: Floats
-    middle: Floats
-    half: Floats
+    box_center: Floats
+    box_half_size: Floats
 
     @classmethod
-    def of_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
-        """Return the frames of the meshes of instances, for arguments as in `Scene`."""
+    def from_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
+        """Return the frames of the meshes of instances. The arguments are as in `LocalScene`."""
         frames = [local.frame for local in meshes]
         scale = np.array([frame.scale for frame in frames])[mesh]
         lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
@@ -115,7 +117,7 @@ class MeshFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LocalScene:
     """Instances and meshes in the representation used by backends.
 
     Attributes
@@ -125,7 +127,7 @@ class Scene:
     mesh
         intp (n,): index of the mesh of each instance.
     frame
-        Local frame of the scene. In a plain scene, it is the frame of the mesh.
+        Local coordinates of the scene. In a plain scene, they are the coordinates of the mesh.
     matrices
         float64 (n, 12): (3, 4) matrix of each instance, row by row, which transforms from the local
         coordinates of the scene to those of the mesh. None if the scene is plain, that is, a single
@@ -134,12 +136,12 @@ class Scene:
         float64 (n, 2, 3): lower and upper corner of the bounding box of each instance, in local
         coordinates of the scene.
     mesh_frames
-        Frame of the mesh of each instance. None if the scene is plain.
+        Local coordinates of the mesh of each instance. None if the scene is plain.
     """
 
     meshes: tuple[LocalMesh, ...]
     mesh: Indices
-    frame: Frame
+    frame: LocalFrame
     matrices: Floats | None
     boxes: Floats
     mesh_frames: MeshFrames | None = None
@@ -165,7 +167,7 @@ class Scene:
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
-    def moved(self, transforms: Floats) -> Scene:
+    def with_transforms(self, transforms: Floats) -> LocalScene:
         """Return a copy of the scene with new transforms of shape (n, 3, 4).
 
         The scene must be nested, and the transforms must already have been validated.
@@ -174,10 +176,10 @@ class Scene:
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return the tally row of each triangle (k,) in its instance (k,)."""
+        """Return the tally row of each hit, given its instance (k,) and triangle (k,)."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
-    def enter(
+    def to_mesh_coordinates(
         self, instance: Indices, origins: Floats, directions: Floats
     ) -> tuple[Floats, Floats, Floats]:
         """Transform each ray to the mesh coordinates of its instance (m,), in a nested scene.
@@ -206,20 +208,20 @@ class Scene:
         return moved, np.stack([u / length, v / length, w / length], axis=1), length
 
 
-def plain(mesh: LocalMesh) -> Scene:
+def single_mesh_scene(mesh: LocalMesh) -> LocalScene:
     """Return the plain scene of a single mesh without a transform."""
     frame = mesh.frame
     boxes = np.stack([frame.lower, frame.upper])[None]
-    return Scene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
+    return LocalScene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
 
 
-def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
-    """Return the scene of instances, and their transforms (n, 3, 4).
+def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
+    """Validate instances, and return their scene and their transforms (n, 3, 4).
 
     Raises
     ------
     ValueError
-        If no instance is given, a transform is invalid, or the meshes have too many triangles.
+        If there are no instances, a transform is invalid, or the meshes have too many triangles.
     """
     listed = list(instances)
     if not listed:
@@ -237,15 +239,15 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
             f"The instances have {total:,} triangles, but the limit is {MAX_TRIANGLES:,}."
         )
     if len(listed) == 1 and listed[0].transform is None:
-        return plain(meshes[0]), transforms
-    frames = MeshFrames.of_instances(meshes, mesh)
+        return single_mesh_scene(meshes[0]), transforms
+    frames = MeshFrames.from_instances(meshes, mesh)
     return _nested_scene(meshes, mesh, frames, transforms), transforms
 
 
 def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
-    """Return transforms of instances `numbers` (k,) as float64 (k, 3, 4).
+    """Return the transforms of the instances `numbers` (k,) as float64 (k, 3, 4).
 
-    ValueError, which names the instance, if a transform is invalid.
+    Raises ValueError with the index of the instance if a transform is invalid.
     """
     values = np.asarray(transforms)
     if values.ndim != 3 or len(values) != len(numbers):
@@ -259,9 +261,9 @@ def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
 
 
 def _matrix(number: int, transform: ArrayLike | None) -> Floats:
-    """Return a transform as float64 (3, 4).
+    """Return a transform as float64 (3, 4), or the identity for None.
 
-    Raises ValueError for a wrong shape or type.
+    Raises ValueError if the shape or type is invalid.
     """
     if transform is None:
         return np.eye(3, 4)
@@ -269,9 +271,9 @@ def _matrix(number: int, transform: ArrayLike | None) -> Floats:
 
 
 def _matrices(numbers: Integers, values: AnyArray) -> Floats:
-    """Return transforms (k, ...) of instances `numbers` as float64 (k, 3, 4).
+    """Return transforms (k, ...) of the instances `numbers` as float64 (k, 3, 4).
 
-    ValueError for a wrong shape or type.
+    Raises ValueError if the shape, the type or the last row is invalid.
     """
     if values.dtype.kind not in "fiu" or values.shape[1:] not in ((3, 4), (4, 4)):
         raise ValueError(
@@ -290,10 +292,7 @@ def _matrices(numbers: Integers, values: AnyArray) -> Floats:
 
 
 def _check_regular(numbers: Integers, transforms: Floats) -> None:
-    """Check transforms (n, 3, 4) of instances `numbers` (n,).
-
-    Raises ValueError for a singular transform.
-    """
+    """Raise ValueError if a transform is not finite or is singular."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
     if not finite.all():
         row = int(finite.argmin())
@@ -305,7 +304,7 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
     with np.errstate(all="ignore"):
         lengths = np.sqrt((rotation_scale**2).sum(axis=1))
         volume = np.abs(determinants(rotation_scale.transpose(1, 2, 0))) / lengths.prod(axis=1)
-    regular = volume >= _FLAT  # also False when it is not a number
+    regular = volume >= _FLAT  # also False for NaN
     if not regular.all():
         row = int(regular.argmin())
         raise ValueError(
@@ -316,31 +315,32 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
 
 def _nested_scene(
     meshes: tuple[LocalMesh, ...], mesh: Indices, mesh_frames: MeshFrames, transforms: Floats
-) -> Scene:
-    """Return a nested scene: instances with transforms.
+) -> LocalScene:
+    """Return the scene of instances with transforms.
 
     Parameters
     ----------
     meshes, mesh
-        Meshes, and the number of each instance's mesh, intp (n,), as in `Scene`.
+        Distinct meshes, and the index of each instance's mesh, as in `LocalScene`.
     mesh_frames
-        Frames of these meshes.
+        Local coordinates of the mesh of each instance.
     transforms
-        (n, 3, 4), checked.
+        (n, 3, 4), validated, from mesh to scene coordinates in meters.
     """
     rotation_scale = transforms[:, :, :3]
     scale = mesh_frames.scale
-    # Center of each mesh's coordinates in the scene, meters: large numbers are subtracted first.
-    center = _product(rotation_scale, mesh_frames.center) + transforms[:, :, 3]
-    shift = _product(rotation_scale, mesh_frames.middle)
-    half = _product(np.abs(rotation_scale), mesh_frames.half)
+    # Origin of each mesh's local coordinates in the scene, in meters. Large numbers are subtracted
+    # from each other before anything small is added.
+    center = _multiply(rotation_scale, mesh_frames.center) + transforms[:, :, 3]
+    shift = _multiply(rotation_scale, mesh_frames.box_center)
+    half = _multiply(np.abs(rotation_scale), mesh_frames.box_half_size)
     frame, boxes = _scene_frame(center, shift, half)
     offset = frame.center - center
-    inverse = _inverse(rotation_scale)
+    inverse = _invert(rotation_scale)
     matrices = np.empty((len(mesh), 3, 4))
     matrices[:, :, :3] = inverse * (scale / frame.scale)[:, None, None]
-    matrices[:, :, 3] = _product(inverse, offset) * scale[:, None]
-    return Scene(
+    matrices[:, :, 3] = _multiply(inverse, offset) * scale[:, None]
+    return LocalScene(
         meshes=meshes,
         mesh=mesh,
         frame=frame,
@@ -350,10 +350,10 @@ def _nested_scene(
     )
 
 
-def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:
-    """Return the frame of a scene, and its boxes (n, 2, 3) of instances, local.
+def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFrame, Floats]:
+    """Return the local coordinates of a scene, and the local boxes (n, 2, 3) of its instances.
 
-    Boxes have their centers at ``center + shift``, and halves of their sides `half`: (n, 3) each.
+    The boxes have the centers ``center + shift`` and the half side lengths `half`, (n, 3) each.
     """
     lower = (center + shift - half).min(axis=0)
     upper = (center + shift + half).max(axis=0)
@@ -362,18 +362,19 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[Frame, Fl
     boxes = np.stack([local - half * unit, local + half * unit], axis=1)
     lower = boxes[:, 0].min(axis=0) - PAD
     upper = boxes[:, 1].max(axis=0) + PAD
-    return Frame(origin, unit, lower, upper), boxes
+    return LocalFrame(origin, unit, lower, upper), boxes
 
 
-def _product(matrices: Floats, vectors: Floats) -> Floats:
-    """Return matrices (n, 3, 3) times vectors (n, 3), with the same bits on every machine."""
+def _multiply(matrices: Floats, vectors: Floats) -> Floats:
+    """Multiply matrices (n, 3, 3) and vectors (n, 3), with the same bits on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
-def _inverse(matrices: Floats) -> Floats:
-    """Return the inverses of matrices (n, 3, 3), with the same bits everywhere."""
+def _invert(matrices: Floats) -> Floats:
+    """Return the inverses of matrices (n, 3, 3), with the same bits on every machine."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
-    # Rows are the cross products of columns; `numpy.cross` takes four times as long for few.
+    # The rows are cross products of columns. `numpy.cross` takes four times as long for few
+    # matrices.
     across = np.empty((3, 3, len(matrices)))
     across[0] = e * i - f * h, f * g - d * i, d * h - e * g
     across[1] = h * c - i * b, i * a - g * c, g * b - h * a

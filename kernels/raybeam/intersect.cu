@@ -1,50 +1,55 @@
-// Closest hits of rays with triangles: traversal of a four-wide bounding volume hierarchy.
+// Closest hits of rays with triangles, by traversal of a four-wide bounding volume hierarchy.
 //
-// Compiled by NVRTC, which has no standard headers: no header is included; the tests compile the
-// same text for the CPU. A thread for each ray, blocks of 128 threads, a grid of one dimension.
-// Defined on the command line: STACK, the maximum of nodes that wait; NESTED, 1 for a scene with
-// instances, 0 for a plain scene: a mesh without a transform; MASKED, 1 if parts of triangles are
-// transparent, else 0. A scene without instances or masks does not pay for these.
+// NVRTC compiles this file. It provides no standard headers, so no header is included. The tests
+// compile the same text for the CPU. There is one thread per ray, in blocks of 128 threads and a grid
+// of one dimension. The following macros are defined on the command line:
+//   STACK   maximum number of pending nodes in a traversal.
+//   NESTED  1 for a scene with instances, 0 for a plain scene, which is a mesh without a transform.
+//   MASKED  1 if parts of triangles are transparent, otherwise 0.
+// Scenes without instances or masks do not pay for these features.
 //
-// Threads are independent but for counts: no shared memory, no barriers, and votes of a warp and
-// atomics only in `count_row`, so it does not matter which threads run together. Offsets into tables are 64 bits wide; an
-// int is enough for the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit,
-// and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
-// Tables of float4 are separate allocations, which the device aligns to 256 bytes.
+// Threads are independent except for counting. There is no shared memory and there are no barriers.
+// Only `count_row` uses warp votes and atomics, so it does not matter which threads run together.
+// Offsets into tables have 64 bits. An int is sufficient for everything else: there are fewer than 2^28
+// triangles, so rows shifted by LEAF_BITS fit, and the largest code of a leaf differs from DONE. The
+// number of rays in a chunk is far below 2^31 (cuda_backend.py). Tables of float4 are separate
+// allocations, which the device aligns to 256 bytes.
 //
-// CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
-// of layout.py), and nodes never come near it: a box is as wide as its padding.
+// CuPy adds -ftz=true, which flushes subnormal floats to zero. The error bands below allow for that
+// (_FLOOR in cuda_tables.py). Nodes never come close to it, because a box is at least as wide as its
+// padding.
 //
-// All lengths are local: coordinates within [-1, 1], see mesh.py; the scene and each mesh have
-// separate local coordinates, see instances.py. layout.py computes the tables, with all meshes in
-// sequence:
-//   nodes      8 float4 (one 128-byte line) a node: lower x, y, z of four children, then upper x, y,
-//              z, then the children's codes as integer bits, then padding. A code >= 0 is a
-//              node, a negative code ~(first << 3 | count - 1) the triangles of a leaf. An empty
-//              slot has an inverted box.
-//   triangles  3 float4 a triangle, in the order of the leaves: corner and band of b, edge to
-//              the second corner and band of c, edge to the third and band of t.
-//   corners    9 doubles a triangle, in the same order.
-//   faces      the caller's number of each triangle.
-//   uvs, masks, opacity  as in `Masks` of opacity.py.
-//   frame      10 doubles: center (3), scale, lower corner of the scene's box (3), upper corner (3).
-//   top        as nodes, over the instances: a leaf holds the number of an instance.
-//   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), lower corner of the
-//              mesh's box (3), upper corner (3), the mesh's first node, its number.
+// All lengths are local, with coordinates within [-1, 1] (see mesh.py). The scene and each mesh have
+// separate local coordinates (see instances.py). cuda_tables.py computes the following tables, which
+// contain all meshes one after the other:
+//   nodes      8 float4 per node, which is one cache line of 128 bytes: lower x, y, z of the four
+//              children, upper x, y, z, the codes of the children as integer bits, and padding. A code
+//              >= 0 is the index of a node. A negative code ~(first << 3 | count - 1) is a leaf with
+//              these triangles. An empty slot has an inverted box.
+//   triangles  3 float4 per triangle, in leaf order: first vertex and error band of b, edge to the
+//              second vertex and error band of c, edge to the third vertex and error band of t.
+//   corners    9 doubles per triangle, in the same order.
+//   faces      the caller's index of each triangle.
+//   uvs, masks, opacity  as in `MaskTables` (opacity.py).
+//   frame      10 doubles: center (3), scale, lower corner (3) and upper corner (3) of the scene's box.
+//   top        like nodes, for the tree over the instances. A leaf contains the index of an instance.
+//   instances  20 doubles per instance: matrix from the scene to the mesh, row by row (12), lower corner
+//              (3) and upper corner (3) of the mesh's box, first node of the mesh, index of the mesh.
 //
-// Two tests for each triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
-// its rounding errors can be, so it never loses a hit; it rejects nearly all other triangles.
-// `decide` is the watertight test of triangle.py in double, operation by operation: compiled
-// without fused multiply-add (-fmad=false) its results have the same bits as NumPy's. The float
-// part has explicit fma.
+// Each triangle is tested in two steps. `may_hit` is the test of Moeller and Trumbore (1997) in float,
+// with bands as wide as the possible rounding errors, so it never loses a hit and rejects nearly all
+// other triangles. `decide` is the watertight test of triangle.py in double with the same operations.
+// Compiled without fused multiply-add (-fmad=false), its results have the same bits as NumPy's. The
+// float part uses explicit fma.
 //
-// Comparisons are written so that a comparison with NaN is false, and false means "no hit".
+// Comparisons are written so that a comparison with NaN is false, and false means no hit.
 
 typedef long long Count;
 
-// Blocks of 128 threads to a multiprocessor: seven for plain scenes, five with masks or from sm_100 on, four
-// with instances; for bodies one less than five or four, and two less with instances and masks. With more,
-// nvcc 13.0 or 13.5 spills registers. Seven are 2 to 5 % faster than five on an H100.
+// Number of blocks of 128 threads per multiprocessor: seven for plain scenes, five with masks or from
+// sm_100 on, and four with instances. For bodies, it is four, three with instances, and two with
+// instances and masks. With more blocks, nvcc 13.0 and 13.5 spill registers. On an H100, seven blocks are
+// 2 to 5 % faster than five.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 1000
 #define PLAIN_BLOCKS 7
 #else
@@ -53,20 +58,20 @@ typedef long long Count;
 #define BLOCKS (NESTED ? 4 : MASKED ? 5 : PLAIN_BLOCKS)
 #define KERNEL extern "C" __global__ void __launch_bounds__(128, BLOCKS)
 
-// Counters for runs on the CPU; on a device, nothing.
+// Counts operations if the tests run the kernels on the CPU. On a device, it does nothing.
 #ifndef SEEN
 #define SEEN(what)
 #endif
 
 #define LEAF_BITS 3
 #define DONE ((int)0x80000000)
-#define TINY 8.673617379884035e-19  // 2^-60: replaces a direction component of zero
-#define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
-#define ACROSS 4.0                  // more than the diagonal of a box, see mesh.py
-#define RECORD 20                   // doubles of an instance
-#define MISSED 1e30f                // distance of a box that the ray does not meet
-#define SPAN 32                     // times for each box of a moving body
-#define UNIT_SLACK 1e-14            // see rays.py
+#define TINY 8.673617379884035e-19  // 2^-60: replaces zero components of directions
+#define SLACK 9.5367431640625e-07f  // 2^-20: margin of limits in float, exceeds their rounding errors
+#define MAX_DIAGONAL 4.0            // more than the diagonal of a box (see mesh.py)
+#define RECORD 20                   // doubles per instance
+#define MISSED 1e30f                // distance of a box that the ray does not intersect
+#define TIMES_PER_BOX 32            // number of times that the box of a moving body covers
+#define UNIT_SLACK 1e-14            // as in rays.py
 
 struct Scene {
     const float4* nodes;
@@ -86,7 +91,7 @@ struct Ray {
     double ox, oy, oz, dx, dy, dz;
 };
 
-// Result of `decide`: weights of the corners times det, and distance.
+// Result of `decide`: weights of the vertices times det, and the distance.
 struct Exact {
     double a, b, c, det, t;
 };
@@ -101,7 +106,7 @@ __device__ __forceinline__ void place_origin(const Scene& scene, const double* o
     ray.oz = (origin[2] - f[2]) * f[3];
 }
 
-// Rays from memory: origins in meters, (3, origin_count), shared by all rays if origin_count is 1, and
+// Rays from memory: origins in meters, (3, origin_count), which all rays share if origin_count is 1, and
 // directions, (3, count).
 struct TableRays {
     const double* origins;
@@ -123,19 +128,19 @@ struct TableRays {
     }
 };
 
-// Rays of a pattern of `rows` rays, each rotated and moved by its pose. Ray i is
-// row (first + i) modulo rows. The first pose has `left` rays, later poses have `each`.
+// Rays of a pattern with `rows` rows, transformed by their poses. Ray i is row (first + i) modulo rows.
+// The first pose has `left` rays, and each later pose has `each` rays.
 struct PatternRays {
-    const double* positions;   // 3 a pose
-    const double* rotations;   // 9 a pose, by rows; not read where `turned` is 0
+    const double* positions;   // 3 per pose
+    const double* rotations;   // 9 per pose, row by row; not read if `turned` is 0
     const double* directions;  // all x, then all y, then all z
-    const double* origins;     // the same; not read where `shifted` is 0
+    const double* origins;     // the same; not read if `shifted` is 0
     Count rows, first;
     int left, each;
     int turned, shifted;
-    // Motion of the lidar within a pose; neither is read where `moving` is 0.
-    const double* delays;  // of each ray of a pose, seconds
-    const double* rates;   // 6 a pose: meters a second, radians a second
+    // Motion of the lidar while the rays of a pose are fired; not read if `moving` is 0.
+    const double* delays;  // of each ray of a pose, in seconds
+    const double* rates;   // 6 per pose: meters per second, radians per second
     int moving;
 
     __device__ __forceinline__ static void turn(
@@ -146,7 +151,7 @@ struct PatternRays {
         c = (x * r[6] + y * r[7]) + z * r[8];
     }
 
-    // Rotate a vector by its delay: v + delay * cross(w, v).
+    // Rotate a vector by the angular velocity w during a delay: v + delay * cross(w, v).
     __device__ __forceinline__ static void drift(
         const double* w, double delay, double& x, double& y, double& z)
     {
@@ -158,11 +163,11 @@ struct PatternRays {
         z = c;
     }
 
-    // Compute the origin of a ray, meters, and its direction.
+    // Compute the origin of a ray in meters and its direction.
     __device__ __forceinline__ void make(int i, double* at, double* to) const
     {
         Count row = first + i;
-        // A chunk's rays fit an int, see above; so does the rest after a turn, if there are more.
+        // The rays of a chunk fit into an int, and so does the remainder after one repetition.
         if (row >= rows) row -= rows;
         if (row >= rows) row = (unsigned)row % (unsigned)rows;
         const int ray = i;
@@ -197,12 +202,13 @@ struct PatternRays {
     }
 };
 
-// Rays in the axes of a moving body at the ray's time: row `row` of `poses` is the position of the
-// body, and the rotation from the body's axes, by rows. A row takes fewer registers than a pointer.
+// Rays in the frame of a moving body at the firing time of the ray. Row `row` of `poses` contains the
+// position of the body and the rotation matrix from the body frame. A row index takes fewer registers
+// than a pointer.
 struct BodyRays {
-    const double* rays;  // 6 rows of `count`: origins in meters, and directions
+    const double* rays;  // 6 rows of `count`: origins in meters and directions
     Count count;
-    const double* poses;  // 12 a row
+    const double* poses;  // 12 per row
     int row;
 
     __device__ __forceinline__ static void take(
@@ -213,7 +219,7 @@ struct BodyRays {
         c = (x * r[2] + y * r[5]) + z * r[8];
     }
 
-    // Compute a ray; return the length of its direction, as `cast_crossing` of crossing.py.
+    // Compute a ray and return the length of its direction, as `cast_pairs` in body_rays.py does.
     __device__ __forceinline__ double make(const Scene& scene, int i, Ray& ray) const
     {
         const double* pose = poses + 12 * (Count)row;
@@ -249,8 +255,8 @@ struct BodyRays {
     }
 };
 
-// Transform a ray from the scene's to an instance's coordinates. Return the length of its direction
-// there, with the operations of `Scene.enter`.
+// Transform a ray from scene to mesh coordinates with the operations of
+// `LocalScene.to_mesh_coordinates`. Return the length of its direction before normalization.
 __device__ __forceinline__ double enter_mesh(const Scene& scene, int instance, Ray& ray)
 {
     if (!NESTED) return 1.0;
@@ -271,7 +277,7 @@ __device__ __forceinline__ double enter_mesh(const Scene& scene, int instance, R
     return length;
 }
 
-// ---- the test that decides ----
+// ---- the exact test ----
 
 __device__ __forceinline__ double pick(int axis, double x, double y, double z)
 {
@@ -308,7 +314,7 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
-// Return whether the mesh's mask stops a ray that passes inside a triangle, as `Masks.opaque`.
+// Return whether the mesh is opaque where a ray hits a triangle, as `MaskTables.is_opaque` does.
 __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, const Exact& hit)
 {
     const Count* record = scene.opacity + 4 * (Count)mesh;
@@ -326,24 +332,24 @@ __device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, 
 
 // ---- traversal ----
 
-// The ray in float, from its entry into the box of the scene, or of an instance's mesh.
+// The ray in float, starting where it enters the box of the scene or of an instance's mesh.
 struct Walk {
     float ox, oy, oz, dx, dy, dz;  // start and direction
     float ix, iy, iz;              // 1 / direction
     float sx, sy, sz;              // start / direction
-    unsigned nx, ny, nz;           // float4 of a node that holds the nearer planes
+    unsigned nx, ny, nz;           // float4 of a node that contains the closer planes
     double entry;                  // distance of the start from the origin
-    float from, to;                // limits of the distance of a hit from the start
+    float from, to;                // minimum and maximum distance of a hit from the start
 };
 
-// Return a limit in float, from the start of the traversal, never less than the exact limit.
+// Return a distance from the start of the traversal in float, never less than the exact distance.
 __device__ __forceinline__ float limit(double t, double entry)
 {
     const double left = (t - entry) * (1.0 + SLACK) + SLACK;
-    return (float)(left < ACROSS ? left : ACROSS);
+    return (float)(left < MAX_DIAGONAL ? left : MAX_DIAGONAL);
 }
 
-// Narrow [entry, leave] to the part of the ray between two planes.
+// Clip [entry, leave] to the part of the ray between two planes.
 __device__ __forceinline__ void clip(
     double low, double high, double o, double d, double& entry, double& leave)
 {
@@ -353,8 +359,8 @@ __device__ __forceinline__ void clip(
     leave = fmin(leave, fmax(one, two));
 }
 
-// Return a coordinate of the traversal's start, near the scene even if the ray is too far away for
-// double to compute the start.
+// Return a coordinate of the start of the traversal. It is clipped, because double cannot represent it
+// accurately if the ray is too far away.
 __device__ __forceinline__ float start(double o, double d, double entry)
 {
     return (float)fmin(fmax(o + entry * d, -2.0), 2.0);
@@ -365,7 +371,7 @@ __device__ __forceinline__ float reciprocal(float d)
     return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
 }
 
-// Prepare the traversal; return false if the ray misses the box (6 doubles).
+// Prepare the traversal. Return false if the ray misses the box, which has 6 doubles.
 __device__ __forceinline__ bool begin(
     const double* low, const Ray& ray, double t_min, double t_max, Walk& w)
 {
@@ -396,13 +402,13 @@ __device__ __forceinline__ bool begin(
     w.nx = w.ix < 0.0f ? 3u : 0u;
     w.ny = w.iy < 0.0f ? 4u : 1u;
     w.nz = w.iz < 0.0f ? 5u : 2u;
-    w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -ACROSS);
+    w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -MAX_DIAGONAL);
     w.to = limit(t_max, entry);
     return true;
 }
 
-// Return the distance at which the ray enters a child's box. `met` becomes whether the ray meets
-// the box before `to`.
+// Return the distance at which the ray enters the box of a child. `met` is set to whether the ray
+// intersects the box before the distance `to`.
 __device__ __forceinline__ float enter(
     const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz, bool& met)
 {
@@ -414,7 +420,7 @@ __device__ __forceinline__ float enter(
     return near;
 }
 
-// Swap two children if the second is nearer.
+// Swap two children if the second one is closer.
 __device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
 {
     const bool swap = t1 < t0;
@@ -426,14 +432,14 @@ __device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
     c1 = c;
 }
 
-// A waiting node, and the distance at which the ray enters it.
+// A pending node and the distance at which the ray enters it.
 struct alignas(8) Waiting {
     int node;
     float t;
 };
 
-// The stack's top is a separate variable: as a member beside the array it would be in local memory,
-// and every push would wait for it.
+// The top of the stack is a separate variable. As a member next to the array, it would be in local
+// memory, and every push would wait for it.
 __device__ __forceinline__ void push(Waiting* stack, int& top, int node, float t)
 {
     if (t < MISSED) {
@@ -451,13 +457,13 @@ __device__ __forceinline__ int pop(const Waiting* stack, int& top, int bottom, f
     return DONE;
 }
 
-// Test a node's children; the nearest child that is hit is next, further children wait. Nodes below
-// `bottom` on the stack belong to another walk.
+// Test the children of a node. Return the closest child that the ray intersects, and push the others.
+// Entries of the stack below `bottom` belong to another traversal.
 __device__ __forceinline__ int descend(
     const float4* nodes, int node, const Walk& w, Waiting* stack, int& top, int bottom)
 {
     SEEN(NODE);
-    // Of 32 bits, since there are fewer than 2^28 nodes: a sum of 64 bits takes two instructions.
+    // 32 bits are sufficient for fewer than 2^28 nodes, and a 64-bit addition takes two instructions.
     const unsigned line = 8u * (unsigned)node;
     const float4 nx = nodes[line + w.nx], ny = nodes[line + w.ny], nz = nodes[line + w.nz];
     const float4 fx = nodes[line + 3u - w.nx], fy = nodes[line + 5u - w.ny];
@@ -470,7 +476,7 @@ __device__ __forceinline__ int descend(
     float t3 = enter(w, nx.w, ny.w, nz.w, fx.w, fy.w, fz.w, met3);
     int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
     int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
-    // Usually all rays of a warp hit a single child or none: no sort is needed then.
+    // Usually, all rays of a warp intersect at most one child, and sorting is not necessary.
     if ((met0 & met1) | (met2 & met3) | ((met0 | met1) & (met2 | met3))) {
         t0 = met0 ? t0 : MISSED;
         t1 = met1 ? t1 : MISSED;
@@ -490,15 +496,15 @@ __device__ __forceinline__ int descend(
     return pop(stack, top, bottom, w.to);
 }
 
-// Result of the float test for a triangle that the ray may hit: bounds of the distance from the
-// start of the traversal, and whether the ray certainly hits it within the limits.
+// Result of the float test for a triangle that the ray may hit: bounds of the distance from the start of
+// the traversal, and whether the ray definitely hits the triangle within the limits.
 struct Guess {
     float near, far;
     bool sure;
 };
 
-// Moeller and Trumbore in float: false only when the ray certainly misses the triangle, or hits it
-// outside [from, to].
+// The test of Moeller and Trumbore in float. It returns false only if the ray definitely misses the
+// triangle or hits it outside [from, to].
 __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Guess& guess)
 {
     SEEN(TRIANGLE);
@@ -519,7 +525,7 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
     const bool may = b >= -v.w && c >= -e.w && b + c <= size + (v.w + e.w) &&
                      t >= fmaf(w.from, size, -g.w) && t <= fmaf(w.to, size, g.w);
     if (!may) return false;
-    // Inside by more than the bands: then det is far from zero as well, and its sign is right.
+    // If the ray is inside by more than the bands, det is far from zero and its sign is correct.
     guess.sure = b >= v.w && c >= e.w && b + c <= size - (v.w + e.w);
     const float scale = 1.0f / size;
     guess.near = guess.sure ? (t - g.w) * scale * (1.0f - SLACK) - SLACK : w.from;
@@ -528,23 +534,23 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
     return true;
 }
 
-// The closest hit so far: distance local to the scene, row in the tables (-1: no hit), and instance.
+// The closest hit so far: distance in scene coordinates, row in the tables (-1 for no hit), and instance.
 //
-// The test that decides costs as much as several nodes, and the rays of a warp reach their triangles
-// at different times. So triangles that may be the closest wait until all rays of the warp are done,
-// or have no room left; a certain hit shortens the traversal at once.
+// The exact test costs as much as several nodes, and the rays of a warp reach their triangles at
+// different times. Therefore, candidates are kept until all rays of the warp have finished or have no
+// room left for more. A definite hit shortens the traversal immediately.
 struct Closest {
     double t;
     int place, instance;
-    int one, two;              // waiting triangles, -1: none
+    int one, two;              // pending triangles, or -1
     float near_one, near_two;  // lower bounds of their distances
 
     __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), instance(0), one(-1), two(-1) {}
 
-    // Add a triangle; return false if there is no room for a further triangle.
+    // Add a triangle. Return false if there is no room for another one.
     __device__ __forceinline__ bool offer(int at, const Guess& guess, Walk& w)
     {
-        // A mask may let the ray through.
+        // If there are masks, the triangle may be transparent at the hit.
         if (guess.sure && !MASKED) w.to = fminf(w.to, guess.far);
         if (one >= 0 && near_one > w.to) one = -1;
         if (two >= 0 && near_two > w.to) two = -1;
@@ -558,7 +564,7 @@ struct Closest {
         return one < 0 || two < 0;
     }
 
-    // Test the waiting triangles of an instance in double.
+    // Test the pending triangles of an instance in double.
     template <class Rays>
     __device__ __forceinline__ void settle(
         const Scene& scene, const Rays& rays, int i, int inside, double t_min, Walk& w)
@@ -568,8 +574,8 @@ struct Closest {
             const int at = turn == 0 ? one : two;
             if (at < 0 || (turn == 0 ? near_one : near_two) > w.to) continue;
             Exact hit;
-            // Load the ray again: keeping it in double during the traversal costs more in
-            // registers than it saves in time.
+            // The ray is loaded again, because keeping it in double during the traversal takes
+            // too many registers.
             Ray ray = rays.load(scene, i);
             const double length = enter_mesh(scene, inside, ray);
             if (!decide(scene, ray, at, hit)) continue;
@@ -591,9 +597,8 @@ struct Closest {
     }
 };
 
-// Offer all triangles of an instance that the ray may hit and that may be the closest. Nodes and
-// triangles have separate loops (Aila and Laine, 2009), so that the rays of a warp do the same work
-// at a time.
+// Find the closest hit on an instance. Nodes and triangles have separate loops (Aila and Laine, 2009), so
+// that the rays of a warp do the same work at the same time.
 template <class Rays>
 __device__ __forceinline__ void visit(
     const Scene& scene, const Rays& rays, int i, int inside, double t_min, Waiting* stack,
@@ -615,7 +620,7 @@ __device__ __forceinline__ void visit(
                 Guess guess;
                 if (may_hit(scene.triangles + 3 * (Count)place, w, guess))
                     room = best.offer(place, guess, w);
-                // The rest of the leaf: a later first triangle, and a smaller count.
+                // The remaining triangles of the leaf have a larger first index and a smaller count.
                 const bool more = leaf & ((1 << LEAF_BITS) - 1);
                 node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, bottom, w.to);
             }
@@ -624,10 +629,10 @@ __device__ __forceinline__ void visit(
     } while (node != DONE);
 }
 
-// Return the root of the next instance from the waiting nodes of the top, the nearest that the ray
-// may hit; DONE if none is left.
+// Return the next instance that the ray may hit, from close to far, or DONE if there are no more.
 //
-// The ray is prepared again: keeping it while an instance is visited takes twice the registers.
+// The ray is prepared again, because keeping it while an instance is visited takes twice as many
+// registers.
 template <class Rays>
 __device__ __forceinline__ int next_instance(
     const Scene& scene, const Rays& rays, int i, double t_min, double t_max,
@@ -658,8 +663,8 @@ __device__ __forceinline__ void walk(
 
 // ---- kernels: scene, rays in, hits out ----
 
-// Closest hits of rays from memory: local distance, row of the tables, and instance, which is
-// written only for scenes with instances; for a miss only the row, -1, is written.
+// Cast rays from memory and write the closest hits: local distance, row of the tables, and instance. The
+// instance is only written for scenes with instances. For a ray that misses, only the row -1 is written.
 KERNEL cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -686,10 +691,11 @@ KERNEL cast_table(
 #undef BLOCKS
 #define BLOCKS (NESTED ? (MASKED ? 2 : 3) : 4)
 
-// Nearer hits of rays on bodies of the scene's shape, which move, as `cast_crossing` of crossing.py. Ray i
-// meets the bodies at time t = when[i] - first_time, if t is one of `times`: the pose of body k then, 12
-// doubles, is at t * body_count + k, and begins with NaN while the body is absent. `boxes` hold a body
-// during SPAN times: lower and upper corner. `nearest_...` are read and written.
+// Cast rays at moving bodies that have the shape of the scene, and record closer hits, as `cast_pairs` in
+// body_rays.py does. Ray i is fired at the time index t = when[i] - first_time. If 0 <= t < times, the
+// pose of body k at this time is row t * body_count + k of `poses`, with 12 doubles per row. It starts
+// with NaN while the body is absent. Each of the `boxes` encloses a body during TIMES_PER_BOX times and
+// consists of a lower and an upper corner. The arrays `nearest_...` are read and written.
 KERNEL cast_bodies(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -712,13 +718,14 @@ KERNEL cast_bodies(
                          masks, opacity,   frame,   top,   instances};
 #pragma unroll 1
     for (int k = 0; k < body_count; ++k) {
-        const double* low = boxes + 6 * ((Count)(time / SPAN) * body_count + k);
+        const double* low = boxes + 6 * ((Count)(time / TIMES_PER_BOX) * body_count + k);
         double enters = 0.0, leaves = nearest_meters[i] * (1.0 + SLACK);
         for (int axis = 0; axis < 3; ++axis) {
             const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];
             clip(low[axis], low[3 + axis], o, d, enters, leaves);
         }
-        const int row = time * body_count + k;  // fits: CHUNK_POSES of moving.py bounds the poses
+        // The row fits into an int, because CHUNK_POSES in moving.py limits the number of poses.
+        const int row = time * body_count + k;
         const double absent = poses[12 * (Count)row];
         if (!(enters <= leaves) || absent != absent) continue;
         const BodyRays own = {rays, count, poses, row};
@@ -740,7 +747,8 @@ KERNEL cast_bodies(
 #undef BLOCKS
 #define BLOCKS (NESTED ? 4 : MASKED ? 5 : PLAIN_BLOCKS)
 
-// Weights of the second and third corner for hits of cast_table, for each listed ray.
+// Write the barycentric weights of the second and third vertex for the hits of listed rays in the
+// results of `cast_table`.
 KERNEL weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ instances,
@@ -761,10 +769,10 @@ KERNEL weigh_table(
     v[k] = hit.c / hit.det;
 }
 
-// ---- output of the hits ----
+// ---- output of hits ----
 
-// Hits of other surfaces, at most one a ray, take the place of those that are farther, divided by
-// `scale`: place becomes -2 - k for hit k.
+// Replace hits by external hits that are closer, at most one per ray. Local distances are divided by
+// `scale` for the comparison. The place of a replaced hit becomes -2 - k for external hit k.
 KERNEL replace(
     const unsigned int* __restrict__ ray, const double* __restrict__ meters, Count count,
     Count start, double scale, const double* __restrict__ distance, int* __restrict__ place)
@@ -775,8 +783,9 @@ KERNEL replace(
     if (place[i] < 0 || meters[k] < distance[i] / scale) place[i] = -2 - (int)k;
 }
 
-// Add 1 to a row of a tally for each thread that counts; all threads of a warp call. Neighboring rays
-// often hit the same triangle: the threads of a warp that count the same row add once.
+// Add 1 to a row of a tally for each thread with `counts`. All threads of a warp must call this function.
+// Neighboring rays often hit the same triangle, so the threads of a warp that count the same row add only
+// once.
 __device__ __forceinline__ void count_row(unsigned long long* tally, Count row, bool counts)
 {
     const unsigned counting = __ballot_sync(~0u, counts);
@@ -786,14 +795,15 @@ __device__ __forceinline__ void count_row(unsigned long long* tally, Count row, 
         atomicAdd(tally + row, (unsigned long long)__popc(same));
 }
 
-// Close up the hits that are kept, in ray order: number of the ray, from `start` on, distance in
-// meters, the caller's triangle, instance. `other_…` are those of `replace`.
+// Compact the hits to store, in ray order: index of the ray, starting at `start`, distance in meters, the
+// caller's triangle, and instance. The arguments `other_...` describe the external hits of `replace`.
 //
-// `ends` are the inclusive sums of hits up to each ray. Of each group of rays, the first kept hit
-// and every n-th after it are kept. `groups` has three rows of `group_count`: the first ray of each,
-// the first hit to keep, and the position of that hit among all kept hits; it is not read where `every`
-// is 1. `counters`, not read where `counting` is 0, are two numbers for each instance: hits of its
-// triangle t are counted in row first + step * t of `tally`, whether they are kept or not.
+// `ends` contains the inclusive cumulative sums of hits. In each group of rays, every n-th hit is stored,
+// where n is `every`. `groups` has three rows of `group_count`: the first ray of each group, the index of
+// its first hit to store among all hits, and the position of this hit in the output. It is not read if
+// `every` is 1. `counters` contains two numbers per instance, first and step. Hits on its triangle t are
+// counted in row first + step * t of `tally`, including hits that are not stored. It is not read if
+// `counting` is 0.
 KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ instance,
@@ -835,8 +845,8 @@ KERNEL pack(
     which[k] = in;
 }
 
-// Rays of a pattern, from one pose after another, as a table: 6 rows of `count`, origins in meters and
-// directions, with the bits of `pattern_rays`.
+// Compute the rays of a pattern as a table with 6 rows of `count`: origins in meters and directions. They
+// are bit-identical to the result of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,

@@ -1,4 +1,4 @@
-"""Files of compiled loops in numba's cache, with checksums."""
+"""Cache files of compiled loops, with checksums."""
 
 from __future__ import annotations
 
@@ -16,50 +16,50 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.serialize import dumps
 
 _log = logging.getLogger(__name__)
-_UNFINISHED = "*.nb[ic].tmp.*"  # files that numba renames once they are whole
-_ABANDONED_S = 3600.0  # age of an unfinished file that no process still writes
+_UNFINISHED = "*.nb[ic].tmp.*"  # temporary files, which numba renames when they are complete
+_ABANDONED_S = 3600.0  # older temporary files are considered abandoned
 
 
 class LoopFiles(IndexDataCacheFile):
-    """Index file of a loop (.nbi), and files of its compiled code (.nbc), one a signature.
+    """Cache files of a loop: an index (.nbi) and a file with compiled code (.nbc) per signature.
 
-    The files of numba itself have no checksums. Unpickling a damaged one ends in any error, and a
-    process that is killed between index and code leaves an index that names the code of an earlier
-    version of the loop. Here the index begins with its own checksum and holds the checksums of the
-    code, which is written first. A file that does not fit its checksum counts as missing, so that
-    the loop is compiled again.
+    numba's own cache files have no checksums. Unpickling a damaged file can raise any exception,
+    and if a process is killed after it has written the index but before it has written the code,
+    the index refers to code from an earlier version of the loop. Here, the code is written first,
+    and the index starts with its own checksum and contains the checksums of the code. If a checksum
+    does not match, the file is ignored and the loop is compiled again.
 
     Parameters
     ----------
     folder
         Folder of the files.
     name
-        Start of the names of the files, by numba.
+        Common prefix of the file names, which numba determines.
     stamp
         Value that changes with the sources of the loop.
     """
 
     def __init__(self, folder: str, name: str, stamp: object) -> None:
-        # Special names: numba and earlier versions of this package cannot read the index.
+        # The suffix differs from numba's, because numba cannot read this index.
         super().__init__(folder, f"{name}.checked", stamp)
 
     def load(self, key: Any) -> Any:
-        """Return the compiled code of a signature, or None without whole files."""
+        """Return the compiled code for a signature, or None if it is missing or damaged."""
         name, checksum = self._load_index().get(key, ("", b""))
         if not name:
             return None
         code = self._content(name)
         if code is None or _checksum(code) != checksum:
-            self._tell_damaged(name)
+            self._warn_damaged(name)
             return None
-        return pickle.loads(code)  # noqa: S301 - fits its checksum
+        return pickle.loads(code)  # noqa: S301 - the checksum matches
 
     def save(self, key: Any, data: Any) -> None:
-        """Write the compiled code of a signature, then the index.
+        """Write the compiled code for a signature, and then the index.
 
-        Raises OSError if that is impossible.
+        Raises OSError if a file cannot be written.
         """
-        entries = self._load_index()  # {signature: name of the file of its code, its checksum}
+        entries = self._load_index()  # {signature: (file name of the code, checksum)}
         if key in entries:
             name = entries[key][0]
         else:
@@ -72,53 +72,52 @@ class LoopFiles(IndexDataCacheFile):
         self._save_index(entries)
 
     def _load_index(self) -> dict[Any, tuple[str, bytes]]:
-        """Return the entries of the index, or none if it is missing, damaged or outdated."""
+        """Return the entries of the index, or no entries if it is missing, damaged or outdated."""
         content = self._content(self._index_name)
         if content is None:
             return {}
         checksum = content[: hashlib.sha256().digest_size]
         pickled = content[len(checksum) :]
         if _checksum(pickled) != checksum:
-            self._tell_damaged(self._index_name)
+            self._warn_damaged(self._index_name)
             return {}
         file = io.BytesIO(pickled)
-        if pickle.load(file) != self._version:  # noqa: S301 - fits its checksum
-            return {}  # another version of numba may not unpickle the rest
+        if pickle.load(file) != self._version:  # noqa: S301 - the checksum matches
+            return {}  # A different version of numba may be unable to unpickle the rest.
         try:
-            stamp, entries = pickle.load(file)  # noqa: S301 - fits its checksum
+            stamp, entries = pickle.load(file)  # noqa: S301 - the checksum matches
         except (AttributeError, ImportError):
-            return {}  # after an update, signatures may contain types that no longer exist
+            return {}  # After an update, signatures may contain types that no longer exist.
         return entries if stamp == self._source_stamp else {}
 
     def _save_index(self, entries: dict[Any, tuple[str, bytes]]) -> None:
-        """Write the index."""
         pickled = pickle.dumps(self._version) + dumps((self._source_stamp, entries))
         self._write(self._index_path, _checksum(pickled) + pickled)
 
     def _content(self, name: str) -> bytes | None:
-        """Return the content of a file of the folder, or None if it cannot be read."""
+        """Return the content of a file in the folder, or None if it cannot be read."""
         try:
             return Path(self._data_path(name)).read_bytes()
         except OSError:
             return None
 
     def _write(self, path: str, content: bytes) -> None:
-        """Write a file under a temporary name, and rename it."""
+        """Write a file under a temporary name and rename it."""
         with self._open_for_write(path) as file:
             file.write(content)
 
-    def _tell_damaged(self, name: str) -> None:
-        """Say that a file is not used."""
-        _tell_once(
+    def _warn_damaged(self, name: str) -> None:
+        """Warn that a file is damaged."""
+        _warn_once(
             "Compiled loops in %s are damaged and will be compiled again. The first one is %s.",
             self._cache_path,
             name,
         )
 
 
-def tell_not_kept(folder: str, error: OSError) -> None:
-    """Say that compiled code cannot be written, so that each process compiles."""
-    _tell_once(
+def warn_not_cached(folder: str, error: OSError) -> None:
+    """Warn that compiled code cannot be stored, so that each process compiles the loops."""
+    _warn_once(
         "Compiled loops cannot be stored in %s, so each process compiles them: %s.",
         folder,
         error.strerror or str(error),
@@ -126,10 +125,10 @@ def tell_not_kept(folder: str, error: OSError) -> None:
 
 
 def remove_unfinished(folder: str, is_locked: bool) -> None:
-    """Remove files that killed processes were writing.
+    """Remove temporary files of processes that were killed while writing.
 
-    `is_locked` says that no other process writes in the folder; otherwise only old files are
-    removed.
+    If `is_locked` is true, no other process writes to the folder, and all temporary files are
+    removed. Otherwise, only old ones are removed.
     """
     abandoned_s = time.time() - _ABANDONED_S
     for path in Path(folder).glob(_UNFINISHED):
@@ -139,15 +138,14 @@ def remove_unfinished(folder: str, is_locked: bool) -> None:
 
 
 def _checksum(content: bytes) -> bytes:
-    """Return the checksum of the content of a file, 32 bytes."""
     return hashlib.sha256(content).digest()
 
 
-_told = set[tuple[str, str]]()  # messages of this process, and the folders that they name
+_warned = set[tuple[str, str]]()  # messages that this process has logged, with their folders
 
 
-def _tell_once(message: str, folder: str, example: str) -> None:
-    """Log a warning on a folder with an example, once for all loops of the folder."""
-    if (message, folder) not in _told:
-        _told.add((message, folder))
+def _warn_once(message: str, folder: str, example: str) -> None:
+    """Log a warning about a folder, once for all loops in the folder."""
+    if (message, folder) not in _warned:
+        _warned.add((message, folder))
         _log.warning(message, folder, example)

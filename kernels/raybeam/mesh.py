@@ -1,4 +1,4 @@
-"""A triangle mesh in local coordinates."""
+"""Triangle meshes in local coordinates."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from numpy.typing import ArrayLike
 
 from .arrays import Bools, Floats, Ints, Ints32
 from .opacity import LocalOpacity, Opacity, check_opacity
-from .rays import finite_rows, real_rows, refuse_rows
+from .rays import are_finite, as_real_rows, check_rows
 from .tree import PAD
 
-# Every traversal in float32 starts inside the box of a scene or mesh: a ray from outside is first
-# advanced to the box, so that float32 rounds by the size of the scene, not by the distance to it.
-# The box lies within [-1, 1] in local units, plus padding, so no hit is farther from the start than
-# its diagonal, 2 * sqrt(3) * (1 + 2**-16) = 3.47. Limits in float32 are clipped to ACROSS.
-ACROSS = 4.0
+# Traversals in float32 start inside the bounding box of a scene or mesh. A ray that starts outside
+# is first advanced to the box, so that rounding errors depend on the size of the scene and not on
+# the distance to it. The box lies within [-1, 1] in local units, plus padding, so the distance from
+# the start to a hit is at most its diagonal, 2 * sqrt(3) * (1 + 2**-16) = 3.47. Limits in float32
+# are clipped to MAX_DIAGONAL.
+MAX_DIAGONAL = 4.0
 TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
 
-_BLOCK = 1 << 16  # triangles that are processed together
+_BLOCK = 1 << 16  # triangles that are processed at a time
 
 
 @dataclass(frozen=True)
-class Frame:
-    """Local coordinates: moved to the center of a box and scaled into [-1, 1].
+class LocalFrame:
+    """Local coordinates, in which a bounding box is centered and scaled into [-1, 1].
 
-    The translation makes coordinates of hundreds of kilometers accurate enough in float32; the
-    scale is a power of two, so it rounds nothing, and makes every error bound of the
-    single-precision parts a plain number.
+    The translation makes float32 accurate enough even for coordinates of hundreds of kilometers.
+    The scale is a power of two, so that it does not cause rounding errors. Because of the scaling,
+    the error bounds of float32 computations are constants.
 
     Attributes
     ----------
     center
-        float64 (3,), meters: subtracted from points.
+        float64 (3,): point that becomes the origin, in meters.
     scale
-        Local units in a meter, a power of two.
+        Local units per meter, a power of two.
     lower, upper
-        float64 (3,): corners of the box around the triangles, local, padded as in the tree.
+        float64 (3,): corners of the bounding box of the triangles in local coordinates, padded like
+        the boxes of a tree.
     """
 
     center: Floats
@@ -48,28 +50,29 @@ class Frame:
     upper: Floats
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points (n, 3), meters, to local coordinates."""
+        """Convert points (n, 3) from meters to local coordinates."""
         return (points - self.center) * self.scale
 
     @property
     def table(self) -> Floats:
-        """Center, scale, lower and upper, as read by compiled code: float64 (10,)."""
+        """Center, scale, lower and upper corner as read by compiled code. Shape (10,)."""
         return np.concatenate([self.center, [self.scale], self.lower, self.upper])
 
 
-def clip(
+def clip_to_box(
     lower: Floats, upper: Floats, origins: Floats, directions: Floats
 ) -> tuple[Floats, Floats]:
-    """Return local distances at which rays enter (0 from inside) and leave a box: (n,) each.
+    """Return the distances at which rays enter and leave a box, (n,) each, in local units.
 
-    A ray meets the box if ``entry <= leave``.
+    A ray intersects the box if ``entry <= leave``. The entry distance is 0 if the ray starts
+    inside.
 
     Parameters
     ----------
     lower, upper
-        (3,), or (3, n) for a separate box of each ray.
+        Corners of the box, (3,), or (3, n) for a separate box for each ray.
     origins
-        (n, 3) or (1, 3), local.
+        (n, 3) or (1, 3), in local coordinates.
     directions
         (n, 3), unit vectors.
     """
@@ -94,16 +97,17 @@ class LocalMesh:
     frame
         Local coordinates of the mesh.
     corners
-        float64 (k, 3, 3), local: triangle, corner, coordinate, without triangles that have no area.
+        float64 (k, 3, 3): vertices of each triangle in local coordinates. Triangles with zero area
+        are omitted.
     index
-        int32 (k,): row of each triangle in the `faces` of the caller.
+        int32 (k,): index of each triangle in the caller's `faces`.
     face_count
         Number of rows of `faces`.
     opacity
-        Opacity of the triangles; None if all are opaque.
+        Opacity of the triangles. None if all are opaque.
     """
 
-    frame: Frame
+    frame: LocalFrame
     corners: Floats
     index: Ints32
     face_count: int
@@ -111,22 +115,13 @@ class LocalMesh:
 
 
 def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = None) -> LocalMesh:
-    """Check a mesh and convert vertices to local coordinates.
+    """Validate a mesh and convert it to local coordinates.
 
-    `Mesh` lists the errors.
-
-    Parameters
-    ----------
-    vertices
-        (v, 3) real and finite, meters.
-    faces
-        (f, 3) integers: rows of `vertices`.
-    opacity
-        Mask of the opaque parts of the triangles; None if all are opaque.
+    The parameters and exceptions are those of `Mesh`.
     """
-    points = real_rows("vertices", vertices)
+    points = as_real_rows("vertices", vertices)
     rows = _check_faces(faces, len(points))
-    refuse_rows("Vertex", points, finite_rows, "finite")
+    check_rows("Vertex", points, are_finite, "finite")
     points = points.astype(np.float64)
     is_used = np.zeros(len(points), np.bool_)
     is_used[rows.reshape(-1)] = True
@@ -145,7 +140,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     by_triangle = corners.reshape(-1, 9)
     lower = by_triangle.min(axis=0).reshape(3, 3).min(axis=0) - PAD
     upper = by_triangle.max(axis=0).reshape(3, 3).max(axis=0) + PAD
-    frame = Frame(center, scale, lower, upper)
+    frame = LocalFrame(center, scale, lower, upper)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(
         frame=frame,
@@ -157,14 +152,14 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
 
 
 def center_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Return center (3,) and scale of the frame of a box with corners (3,), meters."""
+    """Return the center (3,) and the scale of the frame for a bounding box in meters."""
     center = lower / 2 + upper / 2
     half = float(np.maximum(upper - center, center - lower).max())
     return center, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
 
 
 def _has_area(corners: Floats) -> Bools:
-    """Return a mask (k,) of the triangles that have an area."""
+    """Return a mask (k,) of the triangles with nonzero area."""
     edges = corners[:, 1:] - corners[:, :1]
     x, y, z = np.cross(edges[:, 0], edges[:, 1]).astype(np.bool_).T
     return x | y | z
@@ -173,7 +168,7 @@ def _has_area(corners: Floats) -> Bools:
 def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
     """Return faces as int64 (f, 3).
 
-    Raises ValueError for a wrong shape or row, or too many faces.
+    Raises ValueError if the shape is wrong, a vertex index is invalid, or there are too many faces.
     """
     rows = np.asarray(faces)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows) or rows.dtype.kind not in "iu":
@@ -181,13 +176,12 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
             "faces must be an integer array (vertex indices) with shape (f, 3) and f > 0, but has "
             f"dtype {rows.dtype} and shape {rows.shape}."
         )
-    if len(rows) >= 2**28:  # positions in the tree have 31 bits; a leaf takes 3 of them
+    if len(rows) >= 2**28:  # Positions in the tree have 31 bits, of which a leaf takes 3.
         raise ValueError(f"The mesh has {len(rows):,} triangles, but the limit is {2**28 - 1:,}.")
     invalid = np.flatnonzero(((rows < 0) | (rows >= vertex_count)).any(axis=1))
     if len(invalid):
         raise ValueError(
             f"Face {invalid[0]} contains the vertex indices {rows[invalid[0]].tolist()}, but the "
-            "mesh "
-            f"has {vertex_count} vertices, numbered from 0."
+            f"mesh has {vertex_count} vertices, numbered from 0."
         )
     return rows.astype(np.int64, copy=False)

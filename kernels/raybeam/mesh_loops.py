@@ -1,6 +1,6 @@
-"""Rays at meshes, their instances and masks, as parts of compiled loops.
+"""Compiled functions for rays, meshes, instances and masks.
 
-`mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_memory.py).
+`mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_record.py).
 """
 
 from __future__ import annotations
@@ -8,22 +8,22 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from . import cast_memory as memory
-from .cast_memory import float32s, float64s, int64s, uint8s
-from .compiled import compiled, inlined, stage
-from .triangle_loops import areas, shear
+from . import cast_record as memory
+from .cast_record import float32s, float64s, int64s, uint8s
+from .compiled import compiled, inlined, noinline
+from .triangle_loops import intersect_plane, shear_ray
 
 f64_1 = types.float64[::1]
 f64_2 = types.float64[:, ::1]
 i32_1 = types.int32[::1]
 
 
-@stage
-def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray from the scene's to the mesh's local coordinates, as `Scene.enter`.
+@noinline
+def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Transform a ray from scene to mesh coordinates, as `LocalScene.to_mesh_coordinates` does.
 
-    `m` points to the (3, 4) matrix of the instance, by rows. Returns origin, unit direction, and
-    the length of the direction before it was made a unit vector.
+    `m` points to the (3, 4) matrix of the instance. Return the origin, the unit direction, and the
+    length that the direction had before it was normalized.
     """
     x = (m[0] * dx + m[1] * dy) + m[2] * dz
     y = (m[4] * dx + m[5] * dy) + m[6] * dz
@@ -36,10 +36,10 @@ def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
-    """Return the three corners of a triangle, each as three coordinates with `axis` last.
+def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
+    """Return the three vertices of a triangle, each as three coordinates with `axis` last.
 
-    `triangle` is the row in `table`.
+    `triangle` is the row of the triangle in `table`.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
@@ -51,11 +51,11 @@ def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
     )
 
 
-@stage
+@noinline
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`.
+    """Return whether a mesh is opaque at a hit, as `MaskTables.is_opaque` does.
 
-    `mesh` points to a `MESH`, `triangle` is the row in its corners.
+    `mesh` points to a `MESH` record, and `triangle` is the row in its corners.
     """
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
@@ -73,14 +73,14 @@ def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 
 
 @compiled(types.void(memory.CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
-def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     casts, origins, directions, triangle_row, instance, u, v
 ):
-    """Write the weights `u` and `v` (m,) of the second and third corner for hits of a `CAST`.
+    """Write the barycentric weights `u` and `v` (m,) of the second and third vertex of hits.
 
-    Rays (m, 3) are local to the scene; origins are (1, 3) if all rays share their origin.
-    `triangle_row`, the row in the corners of all meshes, and `instance` are hits that `trace` wrote
-    with `index` 0.
+    The rays (m, 3) are in local scene coordinates. `origins` is (1, 3) if all rays share an origin.
+    `triangle_row` is the row of each hit in the corners of all meshes, as `cast_rays` writes it if
+    the field `index` of the cast is 0.
     """
     mesh = casts[0].mesh
     instances = casts[0].instances
@@ -100,13 +100,13 @@ def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
             record = int64s(address)
             mesh_address = record[memory.MESH_FIELD]
             row = row - record[memory.FIRST_ROW_FIELD]
-            ox, oy, oz, dx, dy, dz, _ = enter_instance(
+            ox, oy, oz, dx, dy, dz, _ = to_mesh_coordinates(
                 float64s(address), ox=ox, oy=oy, oz=oz, dx=dx, dy=dy, dz=dz
             )
-        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
-        corners = corners_of(float64s(int64s(mesh_address)[0]), row, axis)
-        a, b, c, det, _ = areas(corners, (p, q, r, sx, sy, sz))
-        sign = -1.0 if det < 0 else 1.0  # areas of a hit have the sign of `det`, or are 0
+        axis, p, q, r, sx, sy, sz = shear_ray(ox, oy, oz, dx, dy, dz)
+        corners = triangle_corners(float64s(int64s(mesh_address)[0]), row, axis)
+        a, b, c, det, _ = intersect_plane(corners, (p, q, r, sx, sy, sz))
+        sign = -1.0 if det < 0 else 1.0  # The areas of a hit have the sign of `det` or are 0.
         a = max(sign * a, 0.0)
         b = max(sign * b, 0.0)
         c = max(sign * c, 0.0)

@@ -1,14 +1,17 @@
-"""Bodies that move while rays are cast: the rays that come near each body, and their hits.
+"""Casting rays at bodies that move while the rays are fired.
 
-No tree is ever built again. Consecutive rays are fired nearly at the same time: the cone around
-each cell of rays, and the plane of a fan, is compared with the sphere around each body, along its
-path while rays are fired; where the two meet, each ray is compared with the body's box, at its pose
-when the cell is fired. The remaining rays are transformed to the body's axes at their own time, and
-cast there, at near bodies first. The comparisons are loops of moving_loops.py, and decide no hit. A
-cell is `CELL` consecutive rays.
+No tree is rebuilt. On the CPU, consecutive rays, which are fired at almost the same time, form
+cells of `CELL_RAYS` rays. First, the cone and the plane around the directions of each cell are
+compared with the bounding sphere of each body along its path. Then the rays of the remaining cells
+are compared with the bounding box of the body at its pose when the cell is fired. Finally, the
+remaining rays are transformed to the frame of the body at their own firing times and cast at its
+shape, at close bodies first. The comparisons are compiled loops (moving_loops.py). They are
+conservative, so they do not affect the hits.
 
-A CUDA device compares each ray with a box around each body's path, and has the body's poses at all
-times of the rays. A shape that deforms has frames: vertices at known times (deforming.py).
+On a CUDA device, each ray is compared with boxes around the paths of the bodies, and the device
+holds the poses of all bodies at all ray times.
+
+A deforming shape has frames, which are its vertices at known times (deforming.py).
 """
 
 from __future__ import annotations
@@ -23,27 +26,27 @@ import numpy as np
 
 from .arrays import Bools, Floats, Indices, Ints, Ints32
 from .backend import BackendUnavailable
+from .body_rays import TIMES_PER_BOX, BodyHits, NearestHits, RayBodyPairs, TimedBodies
 from .caster import RayCaster
-from .crossing import SPAN, BodyHits, Crossing, Nearest, TimedBodies
-from .deforming import Deforming
+from .deforming import DeformingMesh
 from .installation import install_command
 from .scan import Scan, host_rays
 
 if TYPE_CHECKING:
     from .moving_loops import BodySamples
 
-CHUNK_RAYS = 1 << 17  # rays at a time
-CHUNK_PAIRS = 1 << 14  # pairs of cells and bodies at a time
-DEVICE_RAYS = 1 << 20  # rays on a device at a time: 80 MB
-CHUNK_POSES = 1 << 18  # poses on a device at a time: 25 MB
-_BOXES = 128  # static boxes at a time
-_CELLS_PER_SAMPLE = 256  # cells for each sample of the bodies' boxes
+CHUNK_RAYS = 1 << 17  # rays that are processed at a time
+CHUNK_PAIRS = 1 << 14  # pairs of cells and bodies that are processed at a time
+DEVICE_RAYS = 1 << 20  # rays on a device at a time, which take 80 MB
+CHUNK_POSES = 1 << 18  # poses on a device at a time, which take 25 MB
+_BOXES = 128  # static boxes that are compared at a time
+_CELLS_PER_SAMPLE = 256  # number of cells for which the boxes of the bodies are sampled once
 _NO_FRAMES = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
-    """Moving bodies, each with a shape and a pose at every time.
+class MovingBodies:
+    """Moving bodies, each with a shape and with a pose at any time.
 
     Attributes
     ----------
@@ -62,10 +65,10 @@ class Moving:
     frames
         Function of body indices (m,) and times (m,) that returns the frame number of the shape of
         each body, float64 (m,). It is only called for deforming bodies. Frame 1.5 is halfway
-        between frames 1 and 2 of a `Deforming` mesh. None if there are no deforming bodies.
+        between frames 1 and 2 of a `DeformingMesh`. None if there are no deforming bodies.
     """
 
-    shapes: tuple[RayCaster | Deforming, ...]
+    shapes: tuple[RayCaster | DeformingMesh, ...]
     boxes: Floats
     shape: Indices
     presence: Floats
@@ -78,19 +81,19 @@ class Moving:
         return np.array([shape.on_device for shape in self.shapes], np.bool_)[self.shape]
 
     @cached_property
-    def middle(self) -> Floats:
+    def box_centers(self) -> Floats:
         """Centers of the bounding boxes in the frames of the shapes, in meters. Shape (s, 3)."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
-    def half(self) -> Floats:
+    def box_half_sizes(self) -> Floats:
         """Half side lengths of the bounding boxes of the shapes, in meters. Shape (s, 3)."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
-    def radius(self) -> Floats:
+    def radii(self) -> Floats:
         """Radii of the bounding spheres of the boxes, in meters. Shape (s,)."""
-        return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
+        return np.asarray(np.sqrt((self.box_half_sizes**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
         """Return whether each body (m,) is present at its time (m,)."""
@@ -98,20 +101,22 @@ class Moving:
         return np.asarray((first <= times) & (times <= last))
 
 
-def hits_on(
-    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
-) -> Nearest:
-    """Return the nearest hit of each ray of a scan on a body.
+def nearest_body_hits(
+    moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
+) -> NearestHits:
+    """Return the closest hit of each ray of a scan on a moving body.
 
     Parameters
     ----------
-    moving, scan
-        Bodies and rays.
+    moving
+        The bodies.
+    scan
+        The rays.
     times
-        Function of numbers of rays (m,) that returns their times (m,), seconds.
+        Function of ray indices (m,) that returns the firing times (m,) in seconds.
     limits
-        float64 (n,): distance before which a hit of each ray counts, meters; None for the limit of
-        the scan.
+        float64 (n,): only hits at a shorter distance are returned, in meters. None for the maximum
+        range of the scan.
 
     Raises
     ------
@@ -122,58 +127,61 @@ def hits_on(
         raise BackendUnavailable(
             f"Moving bodies require numba. Install it with `{install_command('numba')}`."
         )
-    from . import moving_loops as loops  # numba takes half a second to import
+    from . import moving_loops as loops  # Importing numba takes half a second.
 
-    end = _end(scan)
-    nearest = Nearest.without_hits(
+    end = _exclusive_limit(scan)
+    nearest = NearestHits.empty(
         np.full(len(scan), end) if limits is None else np.minimum(limits, end)
     )
     on_device = moving.on_device
     for hits in _hits_on_device(moving, scan, times, np.flatnonzero(on_device)):
-        nearest.take(hits)
+        nearest.update(hits)
     bodies = np.flatnonzero(~on_device)
     if len(bodies):
         for start, stop in scan.chunks(CHUNK_RAYS):
             rays = host_rays(scan, start, stop)
             ray_times = times(np.arange(start, stop, dtype=np.int64))
-            chunk = _Chunk(loops, moving, scan, rays, ray_times, nearest.part(start, stop))
+            chunk = _Chunk(loops, moving, scan, rays, ray_times, nearest.view(start, stop))
             chunk.cast(bodies)
     return nearest
 
 
-def listed_hits_on(moving: Moving, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
-    """Return the hits of `hits_on`, for the same arguments, without the rays that hit no body.
+def body_hits(moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
+    """Return the result of `nearest_body_hits` without rays that hit no body.
 
-    Without host memory for each ray, if all shapes are on a device.
+    If all shapes are on a device, no host memory per ray is needed.
     """
     if not moving.on_device.all():
-        return hits_on(moving, scan, times).hits()
+        return nearest_body_hits(moving, scan, times).compact()
     parts = [*_hits_on_device(moving, scan, times, np.arange(len(moving.shape)))]
     if not parts:
-        return Nearest.without_hits(np.zeros(0)).hits()
+        return NearestHits.empty(np.zeros(0)).compact()
     return BodyHits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _end(scan: Scan) -> float:
-    """Return the distance before which hits of a scan count, meters: its limit counts."""
+def _exclusive_limit(scan: Scan) -> float:
+    """Return the shortest distance that exceeds the maximum range of a scan, in meters.
+
+    The maximum range is inclusive, but the limits of `NearestHits` are not.
+    """
     return float(np.nextafter(scan.t_max, np.inf))
 
 
 def _hits_on_device(
-    moving: Moving, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
+    moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
 ) -> Iterator[BodyHits]:
-    """Yield the nearest hits of consecutive rays of a scan on bodies (b,) on a device."""
+    """Yield the closest hits of consecutive rays on bodies (b,) whose shapes are on a device."""
     if not len(bodies):
         return
     limits = (scan.t_min, scan.t_max)
-    step = max(1, CHUNK_POSES // (SPAN * len(bodies))) * SPAN
+    step = max(1, CHUNK_POSES // (TIMES_PER_BOX * len(bodies))) * TIMES_PER_BOX
     shape = moving.shape[bodies]
     casters = {number: moving.shapes[number] for number in np.unique(shape).tolist()}
     for start, stop in scan.chunks(DEVICE_RAYS):
         distinct_times, time_index = _distinct(times(np.arange(start, stop, dtype=np.int64)))
         caster = casters[int(shape[0])]
         assert isinstance(caster, RayCaster)
-        nearest = caster.device_nearest(scan, start, stop, time_index, _end(scan))
+        nearest = caster.upload_rays(scan, start, stop, time_index, _exclusive_limit(scan))
         for first in range(0, len(distinct_times), step):
             poses, boxes = _poses_and_boxes(moving, bodies, distinct_times[first : first + step])
             for number, caster in casters.items():
@@ -187,14 +195,14 @@ def _hits_on_device(
                     limits,
                 )
                 caster.cast_bodies(timed, nearest)
-        hits = nearest.hits()
+        hits = nearest.compact()
         yield hits._replace(ray=hits.ray + start)
 
 
 def _distinct(times: Floats) -> tuple[Floats, Ints32]:
-    """Return the distinct values of times (n,), ascending, and the number of each: int32 (n,)."""
+    """Return the distinct times in ascending order, and the index of each time among them."""
     later = times[1:] > times[:-1]
-    if np.array_equal(later, times[1:] != times[:-1]):  # ascending: no sort is needed
+    if np.array_equal(later, times[1:] != times[:-1]):  # ascending, so sorting is not necessary
         index = np.zeros(len(times), np.int32)
         np.cumsum(later, out=index[1:])
         return times[np.flatnonzero(np.append(True, later))], index
@@ -202,11 +210,8 @@ def _distinct(times: Floats) -> tuple[Floats, Ints32]:
     return distinct_times, inverse.astype(np.int32)
 
 
-def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-    """Return the poses and the boxes of bodies (b,) at times (t,).
-
-    `TimedBodies` describes poses (t, b, 12), and boxes (t / SPAN, b, 6) around the paths of bodies.
-    """
+def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+    """Return the poses of bodies at times, and boxes around their paths, as in `TimedBodies`."""
     body = np.tile(bodies, len(times))
     time = np.repeat(times, len(bodies))
     present = moving.is_present(body, time)
@@ -216,23 +221,24 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
         rows = np.flatnonzero(present)
         table = np.full((12, len(body)), np.nan)
         table[:, rows] = moving.poses(body[rows], time[rows])
-    corners = _corners(moving, moving.shape[body], table)
+    corners = _bounding_boxes(moving, moving.shape[body], table)
     lower, upper = corners.reshape(2, 3, len(times), len(bodies))
-    spans = np.arange(0, len(times), SPAN)
+    spans = np.arange(0, len(times), TIMES_PER_BOX)
     boxes = [np.fmin.reduceat(lower, spans, axis=1), np.fmax.reduceat(upper, spans, axis=1)]
     poses = table.T.reshape(len(times), len(bodies), 12)
     return poses, np.moveaxis(np.concatenate(boxes), 0, -1)
 
 
-def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
-    """Return the lower and upper corners (2, 3, m) of boxes around shapes (m,) at poses (12, m).
+def _bounding_boxes(moving: MovingBodies, shape: Indices, poses: Floats) -> Floats:
+    """Return the bounding boxes of shapes at poses (12, m), as lower and upper corners (2, 3, m).
 
-    The boxes are along the axes of the scene, meters, with a margin for rounding errors.
+    The boxes are aligned with the axes of the scene and include a margin for rounding errors, in
+    meters.
     """
     from .moving_loops import PADS_M
 
-    middle = moving.middle[shape].T
-    half = moving.half[shape].T
+    middle = moving.box_centers[shape].T
+    half = moving.box_half_sizes[shape].T
     corners = np.empty((2, *middle.shape))
     for axis in range(3):
         x, y, z = poses[3 + 3 * axis : 6 + 3 * axis]
@@ -243,35 +249,35 @@ def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
     return corners
 
 
-def near_boxes(
+def pair_cells_with_boxes(
     rays: Floats, times: Floats, boxes: Floats, presence: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
-    """Return pairs of a cell of rays and a static box that may meet.
+    """Return pairs of a cell of rays and a static box that the rays may intersect.
 
     Parameters
     ----------
     rays
-        float64 (6, n): origins, meters, and directions.
+        float64 (6, n): origins in meters and directions.
     times
-        float64 (n,): time of each ray, seconds.
+        float64 (n,): firing times in seconds.
     boxes
-        float64 (b, 12): centers, and halves of the sides as vectors, meters.
+        float64 (b, 12): center of each box, and its three half side vectors, in meters.
     presence
         float64 (b, 2): first and last time at which each box is present.
     reach
-        Greatest distance at which a ray ends, meters.
+        Maximum distance at which a ray ends, in meters.
 
     Returns
     -------
     cell, box
-        int64 (k,): numbers of cells and boxes, by box, then by cell.
+        int64 (k,): indices of cells and boxes, sorted by box and then by cell.
     size
-        Number of rays of a cell.
+        Number of rays per cell.
     """
     from . import moving_loops as loops
 
-    cells = loops.cells_of(rays, times, loops.CELL)
-    wide_cells = loops.cells_of(rays, times, loops.CELL * loops.WIDE)
+    cells = loops.make_cells(rays, times, loops.CELL_RAYS)
+    wide_cells = loops.make_cells(rays, times, loops.CELL_RAYS * loops.CELLS_PER_WIDE_CELL)
     radius = np.sqrt((boxes[:, 3:] ** 2).sum(axis=1))
     spheres = np.column_stack([radius, np.full(len(boxes), loops.PADS_M), presence])
     sample_of_cell = np.zeros((len(cells), 2), np.int64)
@@ -280,27 +286,30 @@ def near_boxes(
     for first in range(0, len(boxes), _BOXES):
         span = slice(first, first + _BOXES)
         samples = loops.BodySamples(sample_of_cell, sampled[span], spheres[span])
-        cell, box = loops.cells_near_bodies(wide_cells, cells, samples, reach)
+        cell, box = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         parts.append(np.stack([cell, box + first]))
     cell, box = np.concatenate(parts, axis=1)
-    return cell, box, loops.CELL
+    return cell, box, loops.CELL_RAYS
 
 
 class _CellPoses(NamedTuple):
-    """Pairs of a cell and a body, with the pose of the body for each.
+    """Pairs of a cell and a body, and the pose of the body when the cell is fired.
 
     Attributes
     ----------
     cell, body
-        int64 (m,): number of the cell, and of the body.
+        int64 (m,): indices of the cell and of the body.
     pose
-        int64 (m,): column in `poses` of the body's pose at the first time of the cell.
+        int64 (m,): column in `poses` that contains the pose of the body at the first time of the
+        cell.
     poses
-        float64 (12, p): positions, meters, and rotations from the bodies' axes by rows.
+        float64 (12, p): positions in meters, and rotation matrices from the body frames, row by
+        row.
     pads
-        float64 (m,): margin around the body's box for its motion during the cell, meters.
-    straddles
-        bool (m,): whether the rays of the cell have different times.
+        float64 (m,): margin around the box of the body, in meters, for its motion while the cell is
+        fired.
+    has_several_times
+        bool (m,): whether the rays of the cell are fired at different times.
     """
 
     cell: Indices
@@ -308,23 +317,29 @@ class _CellPoses(NamedTuple):
     pose: Ints
     poses: Floats
     pads: Floats
-    straddles: Bools
+    has_several_times: Bools
 
 
 class _RayPairs(NamedTuple):
-    """Pairs of a ray and a body whose box the ray passes, as in `Crossing`."""
+    """Pairs of a ray and a body whose bounding box the ray intersects, as in `RayBodyPairs`."""
 
-    row: Ints  # (m,), number of the ray in the chunk
-    body: Ints  # (m,), number of the body
-    pose: Ints  # (m,), column in `poses` of the body's pose at the time of the ray
-    poses: Floats  # (12, p), positions, meters, and rotations from the bodies' axes by rows
+    row: Ints  # (m,): index of the ray in the chunk
+    body: Ints  # (m,): index of the body
+    pose: Ints  # (m,): column in `poses` with the body's pose at the time of the ray
+    poses: Floats  # (12, p): positions in meters, and rotation matrices, row by row
 
 
 class _Chunk:
-    """Consecutive rays of a scan: float64 (6, n), their times (n,), and their nearest hits (n,)."""
+    """Consecutive rays (6, n) of a scan, their firing times (n,), and their closest hits (n,)."""
 
     def __init__(
-        self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
+        self,
+        loops: Any,
+        moving: MovingBodies,
+        scan: Scan,
+        rays: Floats,
+        times: Floats,
+        nearest: NearestHits,
     ) -> None:
         self._loops = loops
         self._moving = moving
@@ -334,34 +349,39 @@ class _Chunk:
         self._nearest = nearest
 
     def cast(self, bodies: Ints) -> None:
-        """Cast the rays on the bodies that are present, and write nearer hits."""
+        """Cast the rays at the bodies that are present, and record closer hits."""
         first, last = self._moving.presence[bodies].T
         present = bodies[(first <= self._times.max()) & (last >= self._times.min())]
         if len(present):
             self._cast_near_cells(present)
 
     def _cast_near_cells(self, bodies: Ints) -> None:
-        """Cast the cells on bodies (b,) near them: first on near bodies, where rays then end."""
+        """Cast cells at bodies (b,) that they may hit, at the closest bodies first.
+
+        The hits on close bodies shorten the rays for the following bodies.
+        """
         loops = self._loops
-        cells = loops.cells_of(self._rays, self._times, loops.CELL)
-        wide_cells = loops.cells_of(self._rays, self._times, loops.CELL * loops.WIDE)
-        samples = self._samples(bodies, cells)
-        centers = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
+        cells = loops.make_cells(self._rays, self._times, loops.CELL_RAYS)
+        wide_cells = loops.make_cells(
+            self._rays, self._times, loops.CELL_RAYS * loops.CELLS_PER_WIDE_CELL
+        )
+        samples = self._sample_bodies(bodies, cells)
+        centers = samples.boxes[:, 0, :3] - cells[0, loops.CENTER : loops.CENTER + 3]
         order = np.argsort((centers**2).sum(axis=1), kind="stable")
         samples = samples._replace(boxes=samples.boxes[order], spheres=samples.spheres[order])
         reach = float(self._nearest.distance.max())
-        cell, sampled_body = loops.cells_near_bodies(wide_cells, cells, samples, reach)
+        cell, sampled_body = loops.pair_cells_with_bodies(wide_cells, cells, samples, reach)
         body = bodies[order][sampled_body]
-        spans = cells[:, loops.BEGIN : loops.END + 1]
+        spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
         for start in range(0, len(cell), CHUNK_PAIRS):
             pairs = slice(start, start + CHUNK_PAIRS)
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
-    def _samples(self, bodies: Ints, cells: Floats) -> BodySamples:
-        """Return the boxes of bodies (b,) at equal steps of time over cells (c, 15)."""
+    def _sample_bodies(self, bodies: Ints, cells: Floats) -> BodySamples:
+        """Sample the boxes of bodies (b,) at regular time steps while cells (c, 15) are fired."""
         loops = self._loops
         moving = self._moving
-        spans = cells[:, loops.BEGIN : loops.END + 1]
+        spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
         first = spans[:, 0].min()
         last = spans[:, 1].max()
         steps = max(1, len(cells) // _CELLS_PER_SAMPLE)
@@ -372,7 +392,7 @@ class _Chunk:
         boxes = self._sampled_boxes(bodies, times)
         change = np.abs(np.diff(boxes, axis=1))
         slack = 2 * change.sum(axis=2).max(axis=1) + loops.PADS_M
-        radius = moving.radius[moving.shape[bodies]]
+        radius = moving.radii[moving.shape[bodies]]
         spheres = np.column_stack([radius, slack, moving.presence[bodies]])
         samples: BodySamples = loops.BodySamples(sample_of_cell, boxes, spheres)
         return samples
@@ -384,17 +404,17 @@ class _Chunk:
         table = moving.poses(body, times.ravel())
         rotations = _rotations(table)
         shape = moving.shape[body]
-        centers = table[:3].T + _rotated(rotations, moving.middle[shape])
-        halves = rotations.transpose(0, 2, 1) * moving.half[shape][..., None]
+        centers = table[:3].T + _rotate(rotations, moving.box_centers[shape])
+        halves = rotations.transpose(0, 2, 1) * moving.box_half_sizes[shape][..., None]
         boxes = np.empty((*times.shape, 12))
         boxes[..., :3] = centers.reshape(len(bodies), -1, 3)
         boxes[..., 3:] = halves.reshape(len(bodies), -1, 9)
         return boxes
 
     def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast each cell (m,) on its body (m,), and write nearer hits.
+        """Cast each cell (m,) at its body (m,), and record closer hits.
 
-        `spans` (2, m) are the first and last time of each cell, seconds.
+        `spans` (2, m) contains the first and last time of each cell in seconds.
         """
         cell_poses = self._cell_poses(cell, spans, body)
         pairs = self._passing_rays(cell_poses)
@@ -409,10 +429,10 @@ class _Chunk:
             body = pairs.body[rows]
             caster = moving.shapes[number]
             frame = _NO_FRAMES
-            if isinstance(caster, Deforming):
-                assert moving.frames is not None, "of bodies that deform"
+            if isinstance(caster, DeformingMesh):
+                assert moving.frames is not None, "required for deforming bodies"
                 frame = moving.frames(body, self._times[row])
-            crossing = Crossing(
+            ray_body_pairs = RayBodyPairs(
                 rays=self._rays,
                 row=row,
                 body=body,
@@ -422,51 +442,52 @@ class _Chunk:
                 limits=limits,
                 frame=frame,
             )
-            caster.cast_crossing(crossing, self._nearest)
+            caster.cast_pairs(ray_body_pairs, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
-        """Return pairs of a cell and a body (m,) with the body's pose and the margin of its box."""
+        """Return the pose of each body when its cell is fired, and a margin for its motion."""
         moving = self._moving
         starts, stops = np.clip(spans, *moving.presence[body].T)
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(starts, prepend=np.nan) != 0)
-        pose = np.cumsum(new) - 1  # consecutive cells of a body may have the same first time
+        # Consecutive cells may have the same first time and then share a pose.
+        pose = np.cumsum(new) - 1
         poses = moving.poses(body[new], starts[new])
         pads = np.full(len(cell), self._loops.PADS_M)
-        straddles = spans[1] > spans[0]
-        late = np.flatnonzero(straddles)
-        if len(late):  # a margin for the motion until the cell's last time
+        has_several_times = spans[1] > spans[0]
+        late = np.flatnonzero(has_several_times)
+        if len(late):  # Add a margin for the motion until the last time of the cell.
             change = np.abs(moving.poses(body[late], stops[late]) - poses[:, pose[late]])
             size = np.abs(moving.boxes).max(axis=(1, 2))[moving.shape[body[late]]]
             pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
-        return _CellPoses(cell, body, pose, poses, pads, straddles)
+        return _CellPoses(cell, body, pose, poses, pads, has_several_times)
 
     def _passing_rays(self, pairs: _CellPoses) -> _RayPairs:
-        """Return the rays of cells that pass through bodies' boxes, and their poses.
+        """Return the rays that intersect the boxes of bodies, with the poses of the bodies.
 
-        A ray of a cell with several times has the pose at its own time.
+        If the rays of a cell are fired at different times, each ray gets the pose at its own time.
         """
         loops = self._loops
         moving = self._moving
         times = self._times
         shape = moving.shape[pairs.body]
-        cell_pairs = loops.CellPairs(pairs.cell, pairs.pose, shape, pairs.pads)
+        cell_pairs = loops.CellBodyPairs(pairs.cell, pairs.pose, shape, pairs.pads)
         boxes = moving.boxes.reshape(-1, 6)
         row, pair = loops.rays_through_boxes(
             self._rays, self._nearest.distance, cell_pairs, pairs.poses, boxes
         )
         body = pairs.body[pair]
         pose = pairs.pose[pair]
-        if not pairs.straddles.any():
+        if not pairs.has_several_times.any():
             return _RayPairs(row, body, pose, pairs.poses)
-        # A body may be present at the cell's first time, and absent at the time of a ray.
+        # A body that is present at the first time of the cell may be absent at the time of a ray.
         present = moving.is_present(body, times[row])
         if not present.all():
             row = row[present]
             body = body[present]
             pose = pose[present]
             pair = pair[present]
-        late = pairs.straddles[pair]
-        if late.all():  # true for a lidar whose lasers take turns
+        late = pairs.has_several_times[pair]
+        if late.all():  # This is the case for a lidar whose lasers fire one after the other.
             return _RayPairs(row, body, np.arange(len(row)), moving.poses(body, times[row]))
         late_rows = np.flatnonzero(late)
         pose[late_rows] = pairs.poses.shape[1] + np.arange(len(late_rows))
@@ -475,10 +496,10 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m) of `Moving.poses`."""
+    """Return the rotation matrices (m, 3, 3) of poses (12, m)."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 
-def _rotated(rotations: Floats, vectors: Floats) -> Floats:
-    """Return vectors (m, 3) or (1, 3) rotated by matrices (m, 3, 3), in a fixed order."""
+def _rotate(rotations: Floats, vectors: Floats) -> Floats:
+    """Rotate vectors (m, 3) or (1, 3) by matrices (m, 3, 3), with a fixed order of operations."""
     return (rotations * vectors[:, None, :]).sum(axis=2)

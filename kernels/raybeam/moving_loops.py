@@ -1,8 +1,8 @@
-"""Loops of moving.py, which compare rays with the boxes and spheres around moving bodies.
+"""Compiled loops that find the rays that may hit moving bodies (moving.py).
 
-Rays are float64 (6, n): origins, meters, and directions of about unit length. Times are in
-seconds. A pose is a column of a table (12, p): position, meters, and rotation from the body's axes
-by rows.
+Rays are float64 (6, n): origins in meters and directions of approximately unit length. Times are in
+seconds. A pose is a column of a table (12, p): position in meters, and rotation matrix from the
+body frame, row by row. The comparisons include margins for rounding errors, so that no hit is lost.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ import numpy as np
 from numba import types
 
 from .arrays import Floats, Indices, Ints
-from .cast_memory import float64s, int64s
-from .compiled import compiled, inlined, stage
-from .crossing import Crossing, Nearest
+from .body_rays import NearestHits, RayBodyPairs
+from .cast_record import float64s, int64s
+from .compiled import compiled, inlined, noinline
 
-CELL = 64  # rays of a cell
-WIDE = 16  # cells of a wide cell
-PADS_M = 1e-3  # margin around boxes, besides 2e-6 of the distance: far more than rounding
-# Columns of cells: axis, and cosine and sine of the half angle, of the cone around the directions;
-# center and radius of the sphere around the origins, meters; first and last time; normal of the
-# plane that the directions lie near, and the sine of the greatest angle between a direction and
-# the plane.
+CELL_RAYS = 64  # rays per cell
+CELLS_PER_WIDE_CELL = 16  # cells per wide cell
+# Margin around boxes, in addition to 2e-6 of the distance; exceeds all rounding errors.
+PADS_M = 1e-3
+# Columns of the table of cells: axis of the cone around the directions, and cosine and sine of its
+# half angle; center and radius, in meters, of the sphere around the origins; first and last time;
+# normal of a plane close to the directions, and sine of the largest angle between a direction and
+# this plane.
 AXIS = 0
 COSINE = 3
 SINE = 4
-MIDDLE = 5
+CENTER = 5
 RADIUS = 8
-BEGIN = 9
-END = 10
+FIRST_TIME = 9
+LAST_TIME = 10
 NORMAL = 11
 MAX_SINE = 14
 _TINY = 1e-300
@@ -42,19 +43,19 @@ _i32_1 = types.int32[::1]
 
 
 class BodySamples(NamedTuple):
-    """Boxes of bodies, sampled at steps of time.
+    """Bounding boxes of bodies, sampled at regular time steps.
 
     Attributes
     ----------
     sample_of_cell
-        int64 (c, 2): number of the last sample up to the first time, and up to the last time of
-        each cell of rays.
+        int64 (c, 2): last sample before the first time and before the last time of each cell of
+        rays.
     boxes
-        float64 (b, s, 12): centers of the bodies' boxes, and halves of their sides as vectors,
-        meters.
+        float64 (b, s, 12): center of each box, and its three half side vectors, in meters.
     spheres
-        float64 (b, 4): radius of the sphere around the box, meters; slack: how far the box may be
-        from its sample during a step of time, meters; first and last time of the body's presence.
+        float64 (b, 4): radius of the box's bounding sphere in meters; slack, which is the distance
+        in meters by which the box may move during a time step; first and last time at which the
+        body is present.
     """
 
     sample_of_cell: Ints
@@ -62,19 +63,19 @@ class BodySamples(NamedTuple):
     spheres: Floats
 
 
-class CellPairs(NamedTuple):
+class CellBodyPairs(NamedTuple):
     """Pairs of a cell of rays and a body.
 
     Attributes
     ----------
     cell
-        int64 (m,): number of the cell.
+        int64 (m,): index of the cell.
     pose
-        int64 (m,): column of the body's pose in a table.
+        int64 (m,): column of a pose table that contains the pose of the body.
     shape
-        int64 (m,): number of the body's shape.
+        int64 (m,): index of the shape of the body.
     pads
-        float64 (m,): margin around the body's box, meters.
+        float64 (m,): margin around the box of the body, in meters.
     """
 
     cell: Ints
@@ -84,24 +85,24 @@ class CellPairs(NamedTuple):
 
 
 def named_tuple_type(kind: type, *fields: types.Type) -> types.Type:
-    """Return the numba type of a NamedTuple class `kind`, whose fields have these types."""
+    """Return the numba type of a NamedTuple class whose fields have the given types."""
     return types.BaseTuple.from_types(fields, kind)
 
 
 _SAMPLES = named_tuple_type(BodySamples, _i64_2, types.float64[:, :, ::1], _f64_2)
-_PAIRS = named_tuple_type(CellPairs, _i64_1, _i64_1, _i64_1, _f64_1)
+_PAIRS = named_tuple_type(CellBodyPairs, _i64_1, _i64_1, _i64_1, _f64_1)
 LIMITS = types.UniTuple(types.float64, 2)
-CROSSING = named_tuple_type(
-    Crossing, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1
+PAIRS = named_tuple_type(
+    RayBodyPairs, _f64_2, _i64_1, _i64_1, _i64_1, _f64_2, _f64_1, LIMITS, _f64_1
 )
-NEAREST = named_tuple_type(Nearest, _f64_1, _i64_1, _i32_1, _i32_1)
+NEAREST_HITS = named_tuple_type(NearestHits, _f64_1, _i64_1, _i32_1, _i32_1)
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
-def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Return cells (c, 15): each is `size` consecutive rays (6, n), fired at times (n,).
+def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Return the table (c, 15) of cells of `size` consecutive rays each.
 
-    The constants `AXIS` to `MAX_SINE` are the columns of cells.
+    The constants `AXIS` to `MAX_SINE` are the indices of its columns.
     """
     count = -(-len(times) // size)
     cells = np.empty((count, 15))
@@ -158,12 +159,12 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR091
         cells[c, AXIS + 2] = az
         cells[c, COSINE] = cosine
         cells[c, SINE] = np.sqrt(1 - cosine * cosine)
-        cells[c, MIDDLE] = px
-        cells[c, MIDDLE + 1] = py
-        cells[c, MIDDLE + 2] = pz
+        cells[c, CENTER] = px
+        cells[c, CENTER + 1] = py
+        cells[c, CENTER + 2] = pz
         cells[c, RADIUS] = np.sqrt(max_squared)
-        cells[c, BEGIN] = first
-        cells[c, END] = last
+        cells[c, FIRST_TIME] = first
+        cells[c, LAST_TIME] = last
         cells[c, NORMAL] = nx
         cells[c, NORMAL + 1] = ny
         cells[c, NORMAL + 2] = nz
@@ -172,33 +173,32 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR091
 
 
 @inlined
-def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return whether rays of a cell may meet a body in its box.
+def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return whether the rays of a cell may hit a body.
 
-    `cell` points to a row of `cells_of`, `box` and `sphere` point to rows of `BodySamples`. `reach`
-    is the greatest distance at which a ray ends, meters.
+    `cell` points to a row of the table of cells, and `box` and `sphere` point to rows of
+    `BodySamples`. `reach` is the maximum distance at which a ray ends, in meters.
     """
     radius = sphere[0]
     slack = sphere[1]
     first = sphere[2]
     last = sphere[3]
-    x = box[0] - cell[MIDDLE]
-    y = box[1] - cell[MIDDLE + 1]
-    z = box[2] - cell[MIDDLE + 2]
+    x = box[0] - cell[CENTER]
+    y = box[1] - cell[CENTER + 1]
+    z = box[2] - cell[CENTER + 2]
     nx = cell[NORMAL]
     ny = cell[NORMAL + 1]
     nz = cell[NORMAL + 2]
     plane_distance = abs(x * nx + y * ny + z * nz)
     distance_bound = abs(x) + abs(y) + abs(z)
     reach_bound = radius + slack + cell[RADIUS] + 1e-6 * distance_bound
-    if (
-        plane_distance > reach_bound + (distance_bound + reach_bound) * cell[MAX_SINE]
-    ):  # which needs no root
+    # This coarse comparison avoids the square root.
+    if plane_distance > reach_bound + (distance_bound + reach_bound) * cell[MAX_SINE]:
         return False
     distance = np.sqrt(x * x + y * y + z * z)
     margin = slack + cell[RADIUS] + 1e-6 * distance
     radius = radius + margin
-    if distance - radius > reach or cell[END] < first or cell[BEGIN] > last:
+    if distance - radius > reach or cell[LAST_TIME] < first or cell[FIRST_TIME] > last:
         return False
     side = 0.0
     for k in range(3, 12, 3):
@@ -208,7 +208,8 @@ def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa
     if distance > radius:
         sine = radius / distance
         cosine = np.sqrt(1 - sine * sine)
-        if cell[SINE] * cosine + cell[COSINE] * sine >= 0:  # within a half turn
+        # The sum of the two half angles is at most 180 degrees.
+        if cell[SINE] * cosine + cell[COSINE] * sine >= 0:
             edge = distance * (cell[COSINE] * cosine - cell[SINE] * sine)
             return (
                 x * cell[AXIS] + y * cell[AXIS + 1] + z * cell[AXIS + 2] >= edge - 1e-6 * distance
@@ -216,13 +217,13 @@ def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa
     return True
 
 
-# Loops write to arrays that are long enough: numba takes 8 s to compile slices and copies.
+# The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write pairs (2, k) of a cell and a body that may meet, and return the number of pairs k."""
+    """Write pairs (2, k) of a cell and a body that it may hit, and return their number k."""
     sample_of_cell, boxes, spheres = samples
     count = 0
-    # Pointers: views of arrays would be counted, which takes longer than the comparisons.
+    # Pointers are used because reference counting of array views takes longer than the comparisons.
     cell = cells.ctypes.data
     wide_cell = wide_cells.ctypes.data
     box = boxes.ctypes.data
@@ -230,18 +231,18 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
         sphere = float64s(spheres.ctypes.data + 32 * b)
         body_boxes = box + 96 * boxes.shape[1] * b
         for w in range(len(wide_cells)):
-            begin = w * WIDE
-            end = min((w + 1) * WIDE, len(cells))
+            begin = w * CELLS_PER_WIDE_CELL
+            end = min((w + 1) * CELLS_PER_WIDE_CELL, len(cells))
             first = sample_of_cell[begin, 0]
-            if sample_of_cell[end - 1, 1] - first <= 1:  # the slack of spheres covers a step
+            if sample_of_cell[end - 1, 1] - first <= 1:  # The slack covers one time step.
                 sampled_box = float64s(body_boxes + 96 * first)
-                if not _may_meet(float64s(wide_cell + 120 * w), sampled_box, sphere, reach):
+                if not _may_hit(float64s(wide_cell + 120 * w), sampled_box, sphere, reach):
                     continue
             for c in range(begin, end):
                 first = sample_of_cell[c, 0]
                 if sample_of_cell[c, 1] - first <= 1:
                     sampled_box = float64s(body_boxes + 96 * first)
-                    if not _may_meet(float64s(cell + 120 * c), sampled_box, sphere, reach):
+                    if not _may_hit(float64s(cell + 120 * c), sampled_box, sphere, reach):
                         continue
                 pairs[0, count] = c
                 pairs[1, count] = b
@@ -249,25 +250,25 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
     return count
 
 
-def cells_near_bodies(
+def pair_cells_with_bodies(
     wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
-    """Return pairs of a cell and a body that its rays may meet, by body, then by cell.
+    """Return pairs of a cell and a body that its rays may hit, sorted by body and then by cell.
 
     Parameters
     ----------
     wide_cells, cells
-        float64 (w, 15) and (c, 15), from `cells_of`: cells of `WIDE` times as many rays, and cells
-        of `CELL` rays. Most wide cells rule out all their cells at once.
+        float64 (w, 15) and (c, 15), from `make_cells`: cells of `CELL_RAYS * CELLS_PER_WIDE_CELL`
+        rays and cells of `CELL_RAYS` rays. Most wide cells exclude all of their cells at once.
     samples
         The bodies.
     reach
-        Greatest distance at which a ray ends, meters.
+        Maximum distance at which a ray ends, in meters.
 
     Returns
     -------
     cell, body
-        int64 (k,): rows of `cells`, and of the arrays of `samples`.
+        int64 (k,): indices of cells and of bodies in `samples`.
     """
     pairs = np.empty((2, len(cells) * len(samples.spheres)), np.int64)
     count = _pair_cells(wide_cells, cells, samples, reach, pairs)
@@ -276,7 +277,7 @@ def cells_near_bodies(
 
 @inlined
 def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
-    """Return the rotation from the body's axes, three rows, of the pose in column p."""
+    """Return the rows of the rotation matrix in column `p` of a pose table."""
     return (
         (poses[3, p], poses[4, p], poses[5, p]),
         (poses[6, p], poses[7, p], poses[8, p]),
@@ -286,20 +287,20 @@ def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
 
 @inlined
 def to_body_axes(rotation, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate a vector in the scene to the axes of a body, by the transposed `pose_rotation`."""
+    """Rotate a vector from scene axes to body axes, by the transpose of `rotation`."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     return (x * a + y * d) + z * g, (x * b + y * e) + z * h, (x * c + y * f) + z * i
 
 
 @inlined
 def box_corners(box):  # type: ignore[no-untyped-def]
-    """Return the lower and the upper corner of a box, which points to six numbers."""
+    """Return the lower and upper corner of a box, given a pointer to six numbers."""
     return (box[0], box[1], box[2]), (box[3], box[4], box[5])
 
 
 @inlined
 def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
-    """Return the part of an interval of distances along a ray that lies within a slab."""
+    """Clip an interval of distances along a ray to the part between two planes across an axis."""
     enters, leaves = interval
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
     lower = (slab[0] - o) * inverse
@@ -308,10 +309,10 @@ def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
-    """Return whether a ray passes through a box, enlarged by `pad`, before the distance `reach`.
+def intersects_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
+    """Return whether a ray intersects a box, enlarged by `pad`, before the distance `reach`.
 
-    The ray and the corners of the box are in the axes of the body, meters.
+    The ray and the corners of the box are in the frame of the body, in meters.
     """
     (a, b, c), (d, e, f) = corners
     x, y, z = origin
@@ -323,11 +324,12 @@ def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyp
 
 
 @inlined
-def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the center (3), in the scene, and the radius of a sphere around a box at a pose.
+def _bounding_sphere(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the center, in the scene, and the radius of a sphere around a box at a pose.
 
-    The sphere encloses what `passes_box` adds to the box for a ray from the sphere's center;
-    `_near_sphere` adds what grows with the distance.
+    The sphere encloses the box with the margins of `intersects_box` for a ray that starts at the
+    center of the sphere. `_find_rays_near_sphere` adds the part of the margin that grows with the
+    distance.
     """
     (a, b, c), (d, e, f) = corners
     (px, py, pz), (row_1, row_2, row_3) = pose
@@ -346,17 +348,18 @@ def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa:
     return center, radius
 
 
-@stage
-def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
-    """Write which rays of a cell pass through the sphere around a body, and return their number.
+@noinline
+def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
+    """Write which rays of a cell intersect a sphere, and return their number.
 
-    `rays` is the address of the cell's first ray in (6, n). `x`, `y`, `z` and `radius` are of the
-    sphere, meters. The output `near`, 0 or 1, is the address of int64 (`CELL`,).
+    `rays` is the address of the first ray of the cell in a table (6, n). The output `near` is the
+    address of int64 (`CELL_RAYS`,) and receives 0 or 1 for each ray. The center and the radius are
+    in meters.
     """
     ray = float64s(rays)
     is_near = int64s(near)
     near_count = np.int64(0)
-    for k in range(CELL):
+    for k in range(CELL_RAYS):
         u = x - ray[k]
         v = y - ray[n + k]
         w = z - ray[2 * n + k]
@@ -366,7 +369,7 @@ def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def
         along = u * dx + v * dy + w * dz
         squared = u * u + v * v + w * w
         reach = radius + 8e-6 * (abs(u) + abs(v) + abs(w))
-        outside = squared - reach * reach  # above 0 for a ray that starts outside
+        outside = squared - reach * reach  # positive if the ray starts outside
         length = dx * dx + dy * dy + dz * dz
         is_near[k] = np.int64((outside <= 0) | ((along >= 0) & (outside * length <= along * along)))
         near_count += is_near[k]
@@ -374,38 +377,40 @@ def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def
 
 
 @inlined
-def _ray_passes_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray k of rays (6, n), at an address, passes through a box at a pose."""
+def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
+    """Return whether ray `k` of rays (6, n), given by their address, intersects a box at a pose."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
     direction = to_body_axes(rotation, ray[3 * n + k], ray[4 * n + k], ray[5 * n + k])
-    return passes_box(corners, pad, reach, origin, direction)
+    return intersects_box(corners, pad, reach, origin, direction)
 
 
 @compiled(types.int64(_f64_2, _f64_1, _PAIRS, _f64_2, _f64_2, _i64_1, _i64_2))
 def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the rays that pass through boxes to `ray_pairs`, with the pair of each.
+    """Write the rays that intersect boxes to `ray_pairs`, and return the number of columns written.
 
-    Returns the number of columns written: number of the ray, and of the pair of a cell and a body.
-    `near` is memory for a cell. The other arguments are as in `rays_through_boxes`.
+    Each column contains the index of a ray and the index of a pair of a cell and a body. `near` is
+    scratch memory for one cell. The other arguments are as in `rays_through_boxes`.
     """
     cell, pose_of_pair, shape, pads = pairs
     written = 0
     count = rays.shape[1]
     for pair in range(len(cell)):
-        begin = cell[pair] * CELL
-        end = min((cell[pair] + 1) * CELL, len(reaches))
+        begin = cell[pair] * CELL_RAYS
+        end = min((cell[pair] + 1) * CELL_RAYS, len(reaches))
         corners = box_corners(float64s(boxes.ctypes.data + 48 * shape[pair]))
         p = pose_of_pair[pair]
-        first = min(begin, count - CELL)
+        first = min(begin, count - CELL_RAYS)
         pose = (poses[0, p], poses[1, p], poses[2, p]), pose_rotation(poses, p)
         ray = rays.ctypes.data + 8 * first
-        (x, y, z), radius = _sphere_around(corners, pose, pads[pair])
-        if not _near_sphere(ray, count, x=x, y=y, z=z, radius=radius, near=near.ctypes.data):
+        (x, y, z), radius = _bounding_sphere(corners, pose, pads[pair])
+        if not _find_rays_near_sphere(
+            ray, count, x=x, y=y, z=z, radius=radius, near=near.ctypes.data
+        ):
             continue
         for k in range(begin, end):
-            if near[k - first] and _ray_passes_box(
+            if near[k - first] and _ray_intersects_box(
                 ray, count, k - first, reach=reaches[k], pose=pose, corners=corners, pad=pads[pair]
             ):
                 ray_pairs[0, written] = k
@@ -415,35 +420,36 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
 
 
 def rays_through_boxes(
-    rays: Floats, reaches: Floats, pairs: CellPairs, poses: Floats, boxes: Floats
+    rays: Floats, reaches: Floats, pairs: CellBodyPairs, poses: Floats, boxes: Floats
 ) -> tuple[Indices, Indices]:
-    """Return the rays of cells that pass through boxes of bodies, and the pair of each.
+    """Return the rays of cells that intersect the boxes of bodies, with the pair of each ray.
 
     Parameters
     ----------
     rays
-        float64 (6, n): origins, meters, and directions.
+        float64 (6, n): origins in meters and directions.
     reaches
-        float64 (n,): distance at which each ray ends, meters.
+        float64 (n,): distance at which each ray ends, in meters.
     pairs
         Pairs of a cell and a body.
     poses
-        float64 (12, p): positions, meters, and rotations from the bodies' axes by rows.
+        float64 (12, p): positions in meters, and rotation matrices from the body frames, row by
+        row.
     boxes
-        float64 (s, 6): lower and upper corner of the box of each shape, meters.
+        float64 (s, 6): lower and upper corner of the box of each shape, in meters.
 
     Returns
     -------
     ray, pair
-        int64 (k,): numbers of rays and pairs, by pair, then by ray.
+        int64 (k,): indices of rays and pairs, sorted by pair and then by ray.
     """
     cell = np.ascontiguousarray(pairs.cell)
     pairs = pairs._replace(cell=cell, shape=np.ascontiguousarray(pairs.shape))
-    ray_pairs = np.empty((2, len(cell) * CELL), np.int64)
-    if len(reaches) < CELL:  # the loop over a cell has a constant length
-        rays = np.concatenate([rays, np.zeros((6, CELL - len(reaches)))], axis=1)
-        # A ray that ends at NaN passes no box.
-        reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
-    near = np.empty(CELL, np.int64)
+    ray_pairs = np.empty((2, len(cell) * CELL_RAYS), np.int64)
+    if len(reaches) < CELL_RAYS:  # The loop over a cell always processes `CELL_RAYS` rays.
+        rays = np.concatenate([rays, np.zeros((6, CELL_RAYS - len(reaches)))], axis=1)
+        # Padding rays end at NaN, so they do not intersect any box.
+        reaches = np.concatenate([reaches, np.full(CELL_RAYS - len(reaches), np.nan)])
+    near = np.empty(CELL_RAYS, np.int64)
     count = _pair_rays(rays, reaches, pairs, poses, boxes, near=near, ray_pairs=ray_pairs)
     return ray_pairs[0, :count], ray_pairs[1, :count]

@@ -1,11 +1,12 @@
-"""Ray casting in NumPy: the reference, which runs wherever Python does.
+"""Ray casting in NumPy, which needs no other package and serves as the reference.
 
-Many rays traverse a wide tree together. The unit of work is a pair of a ray and a node. A block of
-pairs is tested against the children's boxes in float32; pairs of a ray and an inner child make new
-blocks, pairs with a leaf are tested against its triangles. Blocks are processed last in, first out;
-in a block that is too large, the pairs nearest to their rays' starts go first. So memory is bounded
-for any scene, and early hits discard later pairs behind them. Ordering the children of every node
-would test a sixth fewer boxes, but in many small blocks, which takes twice as long.
+Many rays traverse a wide tree together. The unit of work is a pair of a ray and a node. The boxes
+of the node's children are tested in float32 for a block of pairs at a time. Pairs of a ray and an
+inner child form new blocks, and pairs with a leaf are tested against its triangles. Blocks are
+processed last in, first out. If a block is too large, the pairs whose boxes are closest to the
+origins of their rays are processed first. This bounds the memory for any scene, and early hits
+discard more distant pairs. Sorting the children of each node would save a sixth of the box tests,
+but the blocks would be smaller, which takes twice as long.
 """
 
 from __future__ import annotations
@@ -19,31 +20,32 @@ import numpy as np
 from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, ClosestHits
-from .instances import Scene
-from .mesh import ACROSS, TINY, clip
+from .instances import LocalScene
+from .mesh import MAX_DIAGONAL, TINY, clip_to_box
 from .opacity import join_masks
 from .rays import Rays
-from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
+from .tree import LEAF_BITS, PAD, WideTree, build_instance_tree, build_tree, join_trees
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller blocks need more calls
-_SHIFT = 32  # keys of hits have the instance from this bit on (`_Best`)
-_SLACK = 2.0**-20  # margin of distance limits in float32: far more than their rounding
+# Pairs per block; the arrays of a step take about 6 MiB, and smaller blocks need more calls.
+_BLOCK = 1 << 15
+_SHIFT = 32  # position of the instance in the keys of hits (`_Best`)
+_SLACK = 2.0**-20  # margin of distance limits in float32, much more than their rounding errors
 
 
 @dataclass
 class _Best:
-    """Closest hits so far, or candidates, with an entry for each ray.
+    """Closest hits so far, or candidate hits, with one row per ray.
 
     Attributes
     ----------
     t
-        Distance, local to the scene.
+        Distance in local scene coordinates.
     key
-        int64: ``instance << 32 | triangle``, so that the lowest wins at equal distance; -1: no hit.
+        int64: ``instance << 32 | triangle``, so that the lowest key wins ties; -1 for no hit.
     u, v
-        Weights of the second and third corner.
+        Barycentric weights of the second and third vertex.
     """
 
     t: Floats
@@ -54,14 +56,14 @@ class _Best:
 
 @dataclass(frozen=True)
 class _Query:
-    """Rays of a call of `closest` that meet the scene's box, and their closest hits.
+    """Rays that intersect the bounding box of the scene, and their closest hits.
 
     Attributes
     ----------
     origins, directions
-        float64 (n, 3), local to the scene; unit directions.
+        float64 (n, 3), in local scene coordinates. The directions are unit vectors.
     t_min
-        Closest distance of a hit, local to the scene.
+        Minimum distance of a hit in local scene coordinates.
     best
         Closest hits so far, (n,).
     """
@@ -74,17 +76,16 @@ class _Query:
 
 @dataclass(frozen=True)
 class _Visit:
-    """Rays at instances.
+    """The instances that rays are cast at.
 
     Attributes
     ----------
     ray
-        (m,): number of the ray in the query.
+        (m,): index of the ray in the query.
     key
-        int64 (m,): key of triangle 0 of the instance (`_Best`).
+        int64 (m,): key of triangle 0 of the instance (see `_Best`).
     length
-        float64 (m,): length of the direction in the mesh's coordinates, before it was made a unit
-        vector.
+        float64 (m,): length of the direction in mesh coordinates before it was normalized.
     """
 
     ray: Indices
@@ -94,24 +95,24 @@ class _Visit:
 
 @dataclass(frozen=True)
 class _Packet:
-    """Rays ready for traversal, in the local coordinates of the scene or of a mesh.
+    """Rays prepared for traversal, in the local coordinates of the scene or of a mesh.
 
     Attributes
     ----------
     entry
-        float64 (n,): distance at which the ray enters the box, 0 from inside. The float32 part
-        starts there, so that its rounding errors do not grow with the distance to the
-        box.
+        float64 (n,): distance at which the ray enters the bounding box; 0 if it starts inside. The
+        float32 computations start there, so that their rounding errors do not grow with the
+        distance to the box.
     scaled_origin, inverse
         float32 (3, n): ``origin / direction`` and ``1 / direction``.
-    near
-        intp (3, n): 1 where the ray meets the upper plane of a box first, else 0.
+    near_side
+        intp (3, n): 1 if the ray intersects the upper plane of a box first, otherwise 0.
     limit
-        float32 (n,): hits farther than this from `entry` do not count; shrinks.
+        float32 (n,): maximum distance of a hit from `entry`. It decreases during the traversal.
     sheared
-        The rays for the exact test.
+        The rays prepared for the exact intersection test.
     visit
-        The rays and instances, for rays in the coordinates of meshes.
+        The instances that the rays are cast at. None in a plain scene.
     """
 
     entry: Floats
@@ -125,16 +126,17 @@ class _Packet:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of a ray and a node to visit, and the distance at which the box is entered: (m,)."""
+    """Pairs of a ray and a node, and the distances at which the rays enter the nodes, (m,) each."""
 
     ray: Indices
     node: Indices
     enter: Floats32
 
     def select(self, row_indices: Indices) -> _Pairs:
-        """Return the pairs in rows.
+        """Return the pairs in the given rows, which must be distinct.
 
-        Rows are distinct, so as many rows as pairs select all.
+        If all rows are selected, the pairs themselves are returned, regardless of the order of the
+        rows.
         """
         if len(row_indices) == len(self.ray):
             return self
@@ -144,21 +146,21 @@ class _Pairs:
 
 
 class _Nodes:
-    """Boxes of a tree, or of several trees in sequence."""
+    """Boxes of one or more trees."""
 
     def __init__(self, tree: WideTree) -> None:
         self._count = len(tree.child)
-        # planes[axis]: lower planes of all nodes, then upper ones: row node + side * nodes
+        # For each axis, the lower planes of all nodes, followed by the upper planes.
         self._planes = [
             np.concatenate([tree.lower[:, axis], tree.upper[:, axis]]) for axis in range(3)
         ]
         self._child = tree.child.astype(np.intp)
 
     def walk(self, rays: _Packet, root: Indices, test: Callable[[_Pairs], None]) -> None:
-        """Traverse the tree from the root of each ray, and call `test` with pairs of ray and leaf.
+        """Traverse the tree from the root of each ray, and call `test` for rays at leaves.
 
-        The node of such a pair is the code of a leaf: first triangle and number of triangles.
-        `test` lowers `rays.limit`.
+        `test` receives pairs in which the node contains the first triangle and the number of
+        triangles of the leaf. It reduces `rays.limit` if it finds closer hits.
         """
         blocks = [_Pairs(np.arange(len(root)), root, np.zeros(len(root), np.float32))]
         while blocks:
@@ -167,9 +169,9 @@ class _Nodes:
                 order = np.argpartition(pairs.enter, _BLOCK)
                 blocks.append(pairs.select(order[_BLOCK:]))
                 pairs = pairs.select(order[:_BLOCK])
-            # Hits in front of some boxes may have been found since the block was made.
+            # Since the block was created, hits in front of some boxes may have been found.
             pairs = pairs.select(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
-            enter, meets = self._meets(rays, pairs.ray, pairs.node)
+            enter, meets = self._intersect_children(rays, pairs.ray, pairs.node)
             met_slots = np.flatnonzero(meets)
             child = self._child.take(pairs.node, axis=0).reshape(-1).take(met_slots)
             pairs = _Pairs(pairs.ray.take(met_slots // _WIDTH), child, enter.take(met_slots))
@@ -180,8 +182,13 @@ class _Nodes:
             if len(inner):
                 blocks.append(pairs.select(inner))
 
-    def _meets(self, rays: _Packet, ray: Indices, node: Indices) -> tuple[Floats32, Bools]:
-        """Return entry distances of children's boxes, and a mask of hit boxes: (m * width,)."""
+    def _intersect_children(
+        self, rays: _Packet, ray: Indices, node: Indices
+    ) -> tuple[Floats32, Bools]:
+        """Return the entry distances of the children's boxes, and a mask of the intersected boxes.
+
+        Both arrays have shape (m * width,).
+        """
         enter = np.zeros((len(ray), _WIDTH), np.float32)
         leave = np.empty_like(enter)
         leave[:] = rays.limit.take(ray)[:, None]
@@ -201,21 +208,23 @@ class _Nodes:
 
 
 class NumpyBackend(Backend):
-    """Bounding volume hierarchy, traversed by blocks of rays on a single thread."""
+    """Traversal of a bounding volume hierarchy by blocks of rays on a single thread."""
 
     name: ClassVar[str] = "numpy"
     chunk: ClassVar[int] = 1 << 16
 
     @classmethod
-    def missing(cls) -> str:
-        """Return "": NumPy is always usable."""
+    def unavailable_reason(cls) -> str:
+        """Return "", because NumPy is always available."""
         return ""
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
         super().__init__(scene, threads, device)
         meshes = scene.meshes
         trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
-        tree, self._roots = join(trees)
+        tree, self._roots = join_trees(trees)
         orders = [tree.order for tree in trees]
         self._masks = join_masks([mesh.opacity for mesh in meshes], orders)
         self._nodes = _Nodes(tree)
@@ -225,23 +234,23 @@ class NumpyBackend(Backend):
         self._face = np.concatenate([mesh.index for mesh in meshes])[tree.order]
         self.update_scene(scene)
 
-    def update_scene(self, scene: Scene) -> None:
-        """Replace the scene by a scene of the same instances with new transforms."""
+    def update_scene(self, scene: LocalScene) -> None:
+        """Replace the scene with a scene that has the same instances but new transforms."""
         super().update_scene(scene)
         if scene.nested:
-            self._top = _Nodes(build_top(scene.boxes, _WIDTH))
-            # Corners of the box of each instance's mesh: (3, n)
+            self._top = _Nodes(build_instance_tree(scene.boxes, _WIDTH))
+            # Corners (3, n) of the bounding box of each instance's mesh in mesh coordinates.
             frames = [mesh.frame for mesh in scene.meshes]
             self._lower = np.array([frame.lower for frame in frames])[scene.mesh].T
             self._upper = np.array([frame.upper for frame in frames])[scene.mesh].T
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         frame = self._scene.frame
         origins = np.broadcast_to(frame.to_local(rays.origins), rays.directions.shape)
         t_min = rays.t_min * frame.scale
         t_max = rays.t_max * frame.scale
-        entry, leave = clip(frame.lower, frame.upper, origins, rays.directions)
+        entry, leave = clip_to_box(frame.lower, frame.upper, origins, rays.directions)
         row = np.flatnonzero((entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min - PAD))
         count = len(row)
         best = _Best(
@@ -266,11 +275,11 @@ class NumpyBackend(Backend):
         )
 
     def _walk(self, query: _Query, rays: _Packet, root: Indices) -> None:
-        """Cast rays into the trees of meshes with these roots, and write closer hits."""
+        """Traverse the trees of meshes from these roots, and record closer hits."""
         self._nodes.walk(rays, root, lambda leaves: self._test(query, rays, leaves))
 
     def _visit(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
-        """Cast rays into the meshes of instances, round by round: for each ray the nearest."""
+        """Cast rays at instances in rounds, so that each ray visits its closest instance first."""
         for chosen in _rounds(leaves):
             pairs = leaves.select(chosen)
             pairs = pairs.select(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
@@ -283,11 +292,13 @@ class NumpyBackend(Backend):
             rays.limit[visit.ray] = _limit(query.best.t[visit.ray], rays.entry[visit.ray])
 
     def _inner_rays(self, query: _Query, ray: Indices, instance: Indices) -> _Packet:
-        """Return rays (m,) in the coordinates of instances (m,), if they meet the mesh's box."""
-        origins, directions, length = self._scene.enter(
+        """Return rays in the mesh coordinates of instances, without rays that miss the mesh."""
+        origins, directions, length = self._scene.to_mesh_coordinates(
             instance, query.origins[ray], query.directions[ray]
         )
-        entry, leave = clip(self._lower[:, instance], self._upper[:, instance], origins, directions)
+        entry, leave = clip_to_box(
+            self._lower[:, instance], self._upper[:, instance], origins, directions
+        )
         t_max = query.best.t[ray] * length
         rows = np.flatnonzero(
             (entry <= leave) & (entry <= t_max + PAD) & (leave >= query.t_min * length - PAD)
@@ -296,7 +307,7 @@ class NumpyBackend(Backend):
         return _packet(origins[rows], directions[rows], entry[rows], t_max[rows], visit)
 
     def _test(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
-        """Test rays against the triangles of leaves, and write closer hits."""
+        """Test rays against the triangles of leaves, and record closer hits."""
         row, position = _leaf_pairs(leaves)
         hits = exact.intersect(rays.sheared, row, self._corners, position)
         t = hits.t
@@ -304,13 +315,13 @@ class NumpyBackend(Backend):
         if rays.visit is not None:
             ray = rays.visit.ray[row]
             t = t / rays.visit.length[row]
-        passes = exact.inside(hits.a, hits.b, hits.c, hits.det)
+        passes = exact.is_inside(hits.a, hits.b, hits.c, hits.det)
         hit = np.flatnonzero(passes & (t >= query.t_min) & (t <= query.best.t.take(ray)))
         if self._masks is not None:
             instance = 0 if rays.visit is None else rays.visit.key[row[hit]] >> _SHIFT
             mesh = np.broadcast_to(self._scene.mesh[instance], len(hit))
             weights = (weight[hit] for weight in hits[:4])
-            hit = hit[self._masks.opaque(mesh, position[hit], *weights)]
+            hit = hit[self._masks.is_opaque(mesh, position[hit], *weights)]
         if not len(hit):
             return
         row = row[hit]
@@ -323,7 +334,7 @@ class NumpyBackend(Backend):
 
 
 def _leaf_pairs(leaves: _Pairs) -> tuple[Indices, Indices]:
-    """Return rays, and positions of triangles, of all pairs of a ray and a triangle of a leaf."""
+    """Return the ray and the triangle position of each pair of a ray and a triangle in its leaf."""
     count = (leaves.node & ((1 << LEAF_BITS) - 1)) + 1
     first = leaves.node >> LEAF_BITS
     row = np.repeat(leaves.ray, count)
@@ -332,7 +343,11 @@ def _leaf_pairs(leaves: _Pairs) -> tuple[Indices, Indices]:
 
 
 def _rounds(leaves: _Pairs) -> list[Indices]:
-    """Return rows of pairs by round: the nearest leaf of each ray, the second nearest, ..."""
+    """Return the rows of pairs by round.
+
+    The first round contains the closest leaf of each ray, the second round the second closest leaf,
+    and so on.
+    """
     order = np.lexsort((leaves.enter, leaves.ray))
     starts = np.flatnonzero(np.diff(leaves.ray[order], prepend=-1))
     counts = np.diff(starts, append=len(order))
@@ -343,15 +358,15 @@ def _rounds(leaves: _Pairs) -> list[Indices]:
 
 
 def _write_closer(best: _Best, rays: _Packet, row: Indices, hits: _Best) -> None:
-    """Write hits (m,) of the rays `row` (m,) of a packet that are closer, and lower the limits."""
+    """Record the hits (m,) of rays `row` of a packet that are closer, and reduce the limits."""
     ray = row if rays.visit is None else rays.visit.ray[row]
     order = np.lexsort((hits.key, hits.t, ray))
-    order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
+    order = order[np.diff(ray[order], prepend=-1) != 0]  # only the closest hit of each ray
     ray = ray[order]
     t = hits.t[order]
     key = hits.key[order]
     known_key = best.key[ray]
-    # At equal distance the lowest key wins; a ray without a hit has t_max, which counts too.
+    # The lowest key wins ties. A ray without a hit has the distance t_max, which is inclusive.
     closer = (t < best.t[ray]) | (known_key < 0) | (key < known_key)
     row = row[order][closer]
     ray = ray[closer]
@@ -370,8 +385,9 @@ def _packet(
     t_max: Floats | float,
     visit: _Visit | None = None,
 ) -> _Packet:
-    """Prepare rays (n, 3), local to the scene or a mesh, for traversal."""
-    # If the ray is too far away for float64 to compute the start, the start stays near the scene.
+    """Prepare rays (n, 3) in local coordinates of the scene or a mesh for traversal."""
+    # The start is clipped, because float64 cannot represent it accurately if the ray is too far
+    # away.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
     components = directions.T.astype(np.float32)
     components = np.where(
@@ -384,7 +400,7 @@ def _packet(
         inverse=inverse,
         near_side=(components < 0).astype(np.intp),
         limit=_limit(np.broadcast_to(t_max, len(entry)), entry),
-        sheared=exact.shear(origins, directions),
+        sheared=exact.shear_rays(origins, directions),
         visit=visit,
     )
 
@@ -392,4 +408,4 @@ def _packet(
 def _limit(t: Floats, entry: Floats) -> Floats32:
     """Return distances from `entry` as float32, never less than the exact distances."""
     remaining = (t - entry) * (1 + _SLACK) + _SLACK
-    return np.clip(remaining, -ACROSS, ACROSS).astype(np.float32)
+    return np.clip(remaining, -MAX_DIAGONAL, MAX_DIAGONAL).astype(np.float32)

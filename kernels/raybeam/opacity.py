@@ -1,7 +1,7 @@
-"""Masks that make parts of triangles transparent: leaves, fences, nets.
+"""Masks that make parts of triangles transparent, for example leaves, fences and nets.
 
-A triangle that a ray passes inside counts only where the mask is true. All backends compute the
-position in the mask in float64 with the operations of `Masks.opaque`, in that order.
+A ray hits a triangle only where the mask is true. All backends compute the position in the mask in
+float64, with the operations of `MaskTables.is_opaque` in the same order.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from .arrays import Bools, Bytes, Floats, Floats32, Indices, Ints, Ints32
 
-_MAX_COORDINATE = 2.0**31  # maximum of texture coordinates, so that none is infinite at a ray
+# Limit for texture coordinates, so that interpolated coordinates are finite.
+_MAX_COORDINATE = 2.0**31
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +38,14 @@ class Opacity:
 
 @dataclass(frozen=True, eq=False)
 class LocalOpacity:
-    """A checked `Opacity`.
+    """A validated `Opacity` for the triangles of a `LocalMesh`.
 
     Attributes
     ----------
     mask
-        uint8 (h, w): 1 where a ray is stopped.
+        uint8 (h, w): 1 where the surface is opaque.
     uv
-        float32 (k, 6): of each triangle of a `LocalMesh`, u and v of the three corners.
+        float32 (k, 6): u and v of the three vertices of each triangle.
     """
 
     mask: Bytes
@@ -52,9 +53,9 @@ class LocalOpacity:
 
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
-    """Check an opacity and select the triangles `index`.
+    """Validate an opacity and select the triangles `index`.
 
-    Raises ValueError for an invalid opacity.
+    Raises ValueError if the opacity is invalid.
     """
     mask = np.asarray(opacity.mask)
     uv = np.asarray(opacity.uv)
@@ -75,31 +76,32 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
             f"{uv[invalid[0]].tolist()}."
         )
     single = uv[index].astype(np.float32).reshape(-1, 6)
-    # Devices may flush subnormal numbers.
+    # GPUs may treat subnormal numbers as zero, so all backends do.
     single[np.abs(single) < np.finfo(np.float32).tiny] = 0
     return LocalOpacity(np.ascontiguousarray(mask).view(np.uint8), single)
 
 
 @dataclass(frozen=True, eq=False)
-class Masks:
+class MaskTables:
     """Opacities of several meshes as tables.
 
     Attributes
     ----------
     uv
-        float32 (q, 6): uv of the triangles of all meshes that have an opacity.
+        float32 (q, 6): u and v of the triangles of all meshes with an opacity.
     mask
-        uint8 (e,): all masks, by rows.
+        uint8 (e,): the elements of all masks, row by row.
     records
-        int64 (meshes, 4): offset from a triangle's position to its row of `uv`, the mask's first
-        element, height and width; height 0 for an opaque mesh.
+        int64 (meshes, 4): for each mesh, the offset from the position of a triangle to its row of
+        `uv`, the first element of the mask, and the height and width of the mask. The height is 0
+        if the mesh is opaque.
     """
 
     uv: Floats32
     mask: Bytes
     records: Ints
 
-    def opaque(
+    def is_opaque(
         self,
         mesh: Indices,
         position: Indices,
@@ -108,17 +110,17 @@ class Masks:
         c: Floats,
         det: Floats,
     ) -> Bools:
-        """Return a mask (m,) of the rays inside triangles that meet an opaque part.
+        """Return whether the surface is opaque at each hit (m,).
 
         Parameters
         ----------
         mesh, position
-            (m,): number of the mesh, position of the triangle in the tables of all meshes.
+            (m,): index of the mesh, and position of the triangle in the tables of all meshes.
         a, b, c, det
-            (m,): areas and their sum, from `triangle.intersect`.
+            (m,): areas and their sum, as computed by `triangle.intersect`.
         """
         shift, first, height, width = self.records[mesh].T
-        stopped = height == 0
+        opaque = height == 0
         (masked,) = np.nonzero(height)
         uv = self.uv[position[masked] + shift[masked]].astype(np.float64)
         p = a[masked] / det[masked]
@@ -128,14 +130,15 @@ class Masks:
         v = (p * uv[:, 1] + q * uv[:, 3]) + r * uv[:, 5]
         column = np.minimum(((u - np.floor(u)) * width[masked]).astype(np.int64), width[masked] - 1)
         row = np.minimum(((v - np.floor(v)) * height[masked]).astype(np.int64), height[masked] - 1)
-        stopped[masked] = self.mask[first[masked] + row * width[masked] + column] != 0
-        return stopped
+        opaque[masked] = self.mask[first[masked] + row * width[masked] + column] != 0
+        return opaque
 
 
-def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Masks | None:
-    """Join the opacities of meshes, with triangles in given orders, or None if all are opaque.
+def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> MaskTables | None:
+    """Join the opacities of meshes, or return None if all meshes are opaque.
 
-    A mask that meshes share, as the same memory, is stored once.
+    `orders` contains the order of the triangles of each mesh. A mask that several meshes share as
+    the same memory is stored once.
     """
     uv = [np.zeros((0, 6), np.float32)]
     mask = [np.zeros(0, np.uint8)]
@@ -155,4 +158,4 @@ def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Ma
             uv.append(opacity.uv[order])
             rows += len(order)
         triangles += len(order)
-    return Masks(np.concatenate(uv), np.concatenate(mask), records) if rows else None
+    return MaskTables(np.concatenate(uv), np.concatenate(mask), records) if rows else None

@@ -1,4 +1,4 @@
-"""Rays in a sensor's axes, cast from one pose after another."""
+"""Ray patterns, which are cast from many poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from .poses import Poses
 from .rays import check_origins, unit_directions
 from .sub_rays import SubRays
 
-# Fractional part of the golden ratio: its multiples, modulo 1, are evenly spread.
+# Fractional part of the golden ratio. Its multiples modulo 1 are evenly distributed.
 GOLDEN = 0.618033988749895
-_MAX_STEP = 256  # largest step that is guessed
-_SAMPLES = 384  # consecutive rows that are compared with later rows: more than `_MAX_STEP`
-# Relative differences of squared lengths that count as equal: in float64, in float32, with jitter.
+_MAX_STEP = 256  # largest step that is estimated
+_SAMPLES = 384  # number of rows that are compared with later rows; more than `_MAX_STEP`
+# Relative differences up to which squared lengths count as equal: for directions in float64, for
+# directions in float32, and for directions with jitter.
 _EXACT = 1e-9
 _NEAR = 1e-3
 _ROUGH = 0.1
@@ -77,19 +78,17 @@ class Pattern:
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
         self._origins: Floats | None = None
-        self.max_origin = 0.0  # upper bound of the coordinates of origins, meters
         rows = self._directions.shape[1]
         if origins is not None:
             self._origins = np.empty((3, rows))
             self._origins[...] = check_origins(origins, rows).T
             self._origins.flags.writeable = False
-            self.max_origin = float(np.abs(self._origins).max(initial=0))
         self.sub_rays = sub_rays
         self.offsets: Floats | None = None  # (2, n)
         if sub_rays is not None and offsets is not None:
             self.offsets = np.ascontiguousarray(np.asarray(offsets, np.float64).T)
 
-    def divided(
+    def with_sub_rays(
         self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
         """Return a copy with sub-rays, for all beams or for the beams `beam_indices` (m,).
@@ -97,7 +96,8 @@ class Pattern:
         Beam indices beyond the last row wrap around. `offsets` (m, 2) contains the angles across
         and up, in radians, that are added to the angles of the sub-rays of each beam.
         """
-        _ = self.step  # guessed here for all copies: takes as long as 5,000 rays
+        # Estimating takes as long as casting 5,000 rays, so do it once for all copies.
+        _ = self.step
         pattern = copy(self)
         if beam_indices is not None:
             pattern._directions = self._directions.take(beam_indices, axis=1, mode="wrap")
@@ -136,24 +136,25 @@ class Pattern:
         """Number of rows between consecutive firings of a channel, as passed or estimated."""
         if self._step is not None:
             return self._step
-        return _repetition(self._directions) or _least_difference(self._directions)
+        return _repetition_step(self._directions) or _closest_step(self._directions)
 
     def shares_origin(self, poses: Poses) -> bool:
-        """Return whether all rays start at a single position."""
+        """Return whether all rays have the same origin."""
         own_origins = self._origins is not None or (
             self.sub_rays and self.sub_rays.starts is not None
         )
         return len(poses) == 1 and poses.motion is None and not own_origins
 
 
-def _repetition(directions: Floats) -> int:
-    """Return the step after which the distances between neighboring rows are the same, or 0.
+def _repetition_step(directions: Floats) -> int:
+    """Return the step at which the distances between neighboring rows repeat, or 0.
 
-    `directions` (3, n) are unit vectors. Where a firing has all rings, the head has turned after
-    as many rows, and all distances are the same. Where rings follow each other, those within a ring
-    are the same after a single row, but not after the length of a ring, since rings are of
-    different radius. Distances do not depend on the axis of the head. Nearness shows no step:
-    rings may be nearer to each other than the firings.
+    `directions` (3, n) contains unit vectors. If each firing contains all rings, the distances
+    repeat after one firing, because the head has rotated as a whole in between. If the rows are
+    stored ring by ring, the distances within a ring are equal, so they repeat after a single row,
+    but not after the length of a ring, because rings have different radii. The distances do not
+    depend on the rotation axis of the head. The step cannot be found from the nearest neighbors,
+    because rings may be closer to each other than firings.
     """
     rows = directions.shape[1]
     steps = min(rows // 2, _MAX_STEP)
@@ -166,24 +167,25 @@ def _repetition(directions: Floats) -> int:
     first = squared[:samples]
     deviations = np.abs(sliding_window_view(squared[1:], samples) - first)  # (steps, samples)
 
-    def equal(difference: float) -> Floats:
-        """Return the share of equal distances of each step, up to a relative difference."""
+    def equal_shares(difference: float) -> Floats:
+        """Return, for each step, the fraction of distances that are equal within a tolerance."""
         return np.asarray((deviations <= difference * first).mean(axis=1))
 
-    # Distances that are equal in float64 tell apart rings of nearly the same radius. In directions
-    # of float32 such distances are chance: then the share of them is reached by an earlier step.
+    # The strict tolerance distinguishes rings of nearly the same radius if the directions are
+    # float64. If they are float32, such matches are coincidences, and a smaller step has the same
+    # share of matches with the loose tolerance.
     for strict, loose in ((_EXACT, _NEAR), (_NEAR, _NEAR), (_ROUGH, _ROUGH)):
-        shares = equal(strict)
+        shares = equal_shares(strict)
         share = shares.max()
-        if share >= (0.5 if share == shares[0] else 0.9):  # short rings have many ends
-            return int((equal(loose) >= share).argmax()) + 1
+        if share >= (0.5 if share == shares[0] else 0.9):  # Short rings have many ends.
+            return int((equal_shares(loose) >= share).argmax()) + 1
     return 0
 
 
-def _least_difference(directions: Floats) -> int:
-    """Return the step with the least angles between a row and later rows of a packet.
+def _closest_step(directions: Floats) -> int:
+    """Return the step with the smallest angles between a row and later rows.
 
-    `directions` (3, n) are unit vectors. 32 rows of the directions are sampled.
+    `directions` (3, n) contains unit vectors, of which 32 rows are sampled.
     """
     rows = directions.shape[1]
     steps = np.arange(1, min(rows // 32, _MAX_STEP) + 1)
@@ -198,9 +200,9 @@ def _least_difference(directions: Floats) -> int:
 
 
 def sample_rows(count: int, stop: int) -> Ints:
-    """Return `count` numbers from 0 to `stop`, ascending and evenly spread, at no regular step.
+    """Return `count` integers from 0 to `stop` in ascending order, evenly but irregularly spaced.
 
-    Rows at a regular step may all be of one ring.
+    Rows at regular intervals may all belong to the same ring.
 
     Examples
     --------

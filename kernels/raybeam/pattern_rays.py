@@ -1,4 +1,4 @@
-"""Origins and directions of the rays of a pattern, as a cast computes them."""
+"""Origins and directions of the rays of a pattern."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, Ints
 from .pattern import Pattern
 from .poses import PoseMotion, Poses, check_poses
-from .sub_rays import spread
+from .sub_rays import sub_ray_directions
 
-_BLOCK_RAYS = 1 << 14  # rays that are computed at a time: their arrays stay in a core's cache
+_BLOCK_RAYS = 1 << 14  # number of rays per block, chosen so that their arrays fit into the cache
 
 
 def pattern_rays(
@@ -73,28 +73,31 @@ def pattern_rays(
             f"with {len(pattern)} rows. Ray and row numbers start at 0."
         )
     poses = check_poses(positions, rotations, rays_per_pose, stop, motion)
-    return checked_rays(pattern, first, ray, poses)
+    return compute_rays(pattern, first, ray, poses)
 
 
-def checked_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return origins and directions of rays without checks, by compiled loops if possible.
+def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
+    """Return the origins and directions of rays, with compiled loops if numba is installed.
 
-    `first` is the row of ray 0; `ray` (m,) are numbers of rays. The shapes are as in
-    `pattern_rays`.
+    `first` is the pattern row of ray 0, and `ray` (m,) contains ray indices. The arguments are not
+    validated. The result is as in `pattern_rays`.
     """
     if not (_numba_is_installed() and len(ray)):
-        return plain_rays(pattern, first, ray, poses)
-    from . import ray_loops  # numba takes half a second to import
+        return compute_rays_numpy(pattern, first, ray, poses)
+    from . import ray_loops  # Importing numba takes half a second.
 
-    origins, directions = ray_loops.compiled_rays(pattern, first, ray, poses)
+    origins, directions = ray_loops.compute_rays_compiled(pattern, first, ray, poses)
     return (poses.positions if origins is None else origins.T), directions.T
 
 
-def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return origins and directions of rays as `checked_rays` does, by NumPy.
+def compute_rays_numpy(
+    pattern: Pattern, first: int, ray: Ints, poses: Poses
+) -> tuple[Floats, Floats]:
+    """Return the origins and directions of rays like `compute_rays`, with NumPy.
 
-    Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
-    lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
+    Vectors are rotated to the mesh frame and then translated: ``((x a + y b) + z c) + p``. If the
+    lidar moves while the rays of a pose are fired, rotations are followed by ``v + t (w x v)`` and
+    translations by ``p + t u``.
     """
     shares_origin = pattern.shares_origin(poses)
     origins, directions = np.empty((2, 3, len(ray)))
@@ -102,32 +105,34 @@ def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[F
     for start in range(0, len(ray), _BLOCK_RAYS):
         block = slice(start, start + _BLOCK_RAYS)
         numbers = ray[block]
-        ray_poses = poses.look_up(numbers, scratch[:, : len(numbers)])
+        ray_poses = poses.per_ray(numbers, scratch[:, : len(numbers)])
         direction, offset = _sensor_rays(pattern, first + numbers)
-        directions[:, block] = ray_poses.rotated(direction)
+        directions[:, block] = ray_poses.rotate(direction)
         if shares_origin:
             continue
         origin = ray_poses.positions
         if offset is not None:
-            origin = ray_poses.rotated(offset) + origin
-        origins[:, block] = ray_poses.translated(origin)
+            origin = ray_poses.rotate(offset) + origin
+        origins[:, block] = ray_poses.translate(origin)
     return (poses.positions if shares_origin else origins.T), directions.T
 
 
 def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
-    """Return directions (3, m), and offsets of origins (3, m), in the sensor's axes.
+    """Return the directions and the origins, (3, m) each, of rays in the sensor frame.
 
-    `row` (m,) are rows of rays, which may be beyond the end of the pattern. Offsets are relative
-    to the sensor's position, meters; None for zero.
+    `row` (m,) contains pattern rows, which may be beyond the end of the pattern. The origins are
+    relative to the sensor position, in meters. They are None if all are zero.
     """
-    row = row - row // len(pattern) * len(pattern)  # takes half as long as the remainder
+    row = row - row // len(pattern) * len(pattern)  # takes half as long as the % operator
     beam = row // pattern.subrays_per_beam
     direction = _columns(pattern.directions.T, beam)
     offset = None
     sub_rays = pattern.sub_rays
     if sub_rays is not None:
         angles = None if pattern.offsets is None else pattern.offsets[:, beam]
-        direction, offset = spread(sub_rays, direction, row - beam * len(sub_rays), angles)
+        direction, offset = sub_ray_directions(
+            sub_rays, direction, row - beam * len(sub_rays), angles
+        )
     if pattern.origins is not None:
         beam_origin = _columns(pattern.origins.T, beam)
         offset = beam_origin if offset is None else beam_origin + offset

@@ -1,6 +1,6 @@
-"""The steps of ploc.py that take most of its time, with the same results, as compiled loops.
+"""Compiled versions of the slowest steps in ploc.py, with the same results.
 
-Clusters are float32 (3, m) boxes `lower`, `upper`, and int32 (m,) nodes.
+Clusters are boxes `lower` and `upper`, float32 (3, m), and nodes, int32 (m,).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from .compiled import compiled, inlined
 
 @inlined
 def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
-    """Return half the surface of the box around boxes i and j."""
+    """Return half the surface area of the box around boxes `i` and `j`."""
     x = max(upper[0, i], upper[0, j]) - min(lower[0, i], lower[0, j])
     y = max(upper[1, i], upper[1, j]) - min(lower[1, i], lower[1, j])
     z = max(upper[2, i], upper[2, j]) - min(lower[2, i], lower[2, j])
@@ -21,10 +21,10 @@ def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
 
 @compiled()
 def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
-    """Write the position of each cluster's best partner to `best`, int64 (m,).
+    """Write the position of the best partner of each cluster to `best`, int64 (m,).
 
-    The best partner is the cluster, among `radius` neighbors on either side, whose common box has
-    the least area. Ties are as in `ploc._find_best_partners`.
+    The best partner is the cluster whose common box has the smallest area, among `radius` neighbors
+    on each side. Ties are resolved as in `ploc._find_best_partners`.
     """
     n = lower.shape[1]
     for i in range(n):
@@ -46,22 +46,23 @@ def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
 def merge_pairs(  # type: ignore[no-untyped-def]
     clusters, first, second, next_node, boxes, children, count
 ):
-    """Create nodes of pairs of clusters, replace the clusters, and return how many are left.
+    """Create nodes for pairs of clusters, replace the clusters, and return their new number.
 
     Parameters
     ----------
     clusters
-        Lower and upper corners, and nodes, which are moved to the front.
+        Lower and upper corners and nodes of the clusters. The remaining clusters are moved to the
+        front.
     first, second
-        int64 (k,): positions of the clusters of each pair; `first` ascends.
+        int64 (k,): positions of the clusters of each pair. `first` is in ascending order.
     next_node
-        Number of the first new node.
+        Index of the first new node.
     boxes
         Lower and upper corners of all nodes.
     children
-        int32: first and second child of all nodes.
+        First and second child of all nodes, int32.
     count
-        int32: number of boxes under each node.
+        Number of boxes below each node, int32.
     """
     lower, upper, node = clusters
     all_lower, all_upper = boxes

@@ -1,4 +1,4 @@
-"""Poses of a sensor: positions and rotations, each for a number of rays."""
+"""Poses of a sensor, each of which applies to a number of consecutive rays."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Floats, Indices, Ints
-from .rays import finite_rows, real_rows, refuse_rows
+from .rays import are_finite, as_real_rows, check_rows
 
-_SLACK = 2e-9  # tolerance for products of a rotation's rows
+_SLACK = 2e-9  # tolerance for the dot products of the rows of a rotation matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +38,21 @@ class PoseMotion:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses that have been checked.
+    """Validated poses.
 
     Attributes
     ----------
     positions
-        float64 (k, 3), meters.
+        float64 (k, 3), in meters.
     rotations
-        float64 (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are the same. Each
-        matrix entry is contiguous over the poses, as are the components of positions and motion.
+        float64 (k, 3, 3): rotations from the sensor frame to the mesh frame. None if their axes are
+        parallel. Each matrix element is contiguous over the poses, as are the components of
+        positions and motion.
     rays_per_pose
-        Rays of a pose, at least 1: ray i belongs to pose ``i // rays_per_pose``.
+        Number of rays per pose, at least 1. Ray i belongs to pose ``i // rays_per_pose``.
     motion
-        Motion within each pose; None if the lidar stands still during the rays of a pose.
+        Motion of the lidar while the rays of a pose are fired. None if the lidar does not move
+        during this time.
     """
 
     positions: Floats
@@ -61,47 +63,50 @@ class Poses:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def look_up(self, ray: Ints, room: Floats) -> RayPoses:
-        """Look up the poses of rays (m,), into the memory `room`, float64 (18, m)."""
+    def per_ray(self, ray: Ints, out: Floats) -> RayPoses:
+        """Return the pose of each ray (m,), using `out` as memory, float64 (18, m)."""
         pose = ray // self.rays_per_pose
         delay = np.zeros(1)
         rates = None
         velocities = None
         if self.motion is not None:
             delay = self.motion.delays.take(ray - pose * self.rays_per_pose)
-            velocities = self._per_ray(self.motion.velocities, pose, room[12:15])
+            velocities = self._per_ray(self.motion.velocities, pose, out[12:15])
             if self.motion.rates.any():
-                rates = self._per_ray(self.motion.rates, pose, room[15:])
+                rates = self._per_ray(self.motion.rates, pose, out[15:])
         rotations = self.rotations
         if rotations is not None:
-            rotations = self._per_ray(rotations, pose, room[:9])
+            rotations = self._per_ray(rotations, pose, out[:9])
         return RayPoses(
-            self._per_ray(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
+            self._per_ray(self.positions, pose, out[9:12]), rotations, delay, velocities, rates
         )
 
-    def _per_ray(self, table: Floats, pose: Indices, room: Floats) -> Floats:
+    def _per_ray(self, table: Floats, pose: Indices, out: Floats) -> Floats:
         columns = np.moveaxis(table, 0, -1).reshape(-1, len(self))
         if len(self) == 1:
             return columns
-        for column, row in zip(columns, room, strict=True):
+        for column, row in zip(columns, out, strict=True):
             column.take(pose, out=row, mode="clip")  # other modes use a buffer
-        return room
+        return out
 
 
 @dataclass(frozen=True, eq=False)
 class RayPoses:
-    """Poses of m rays: arrays (components, m), or (components, 1) if all rays share a pose.
+    """Poses of m rays.
+
+    The arrays have shape (components, m), or (components, 1) if all rays share a pose.
 
     Attributes
     ----------
     positions
-        float64 (3, m), meters.
+        float64 (3, m), in meters.
     rotations
-        float64 (9, m): matrices by rows, from the sensor's axes to the mesh's; None if equal.
+        float64 (9, m): matrices from the sensor frame to the mesh frame, row by row. None if their
+        axes are parallel.
     delay
-        float64 (m,) or (1,): delay of each ray after the time of its pose, seconds.
+        float64 (m,) or (1,): delay of each ray relative to the time of its pose, in seconds.
     velocities, rates
-        float64 (3, m): as in `PoseMotion`; None if the lidar does not move, or does not rotate.
+        float64 (3, m): as in `PoseMotion`. None if the lidar does not move or does not rotate.
     """
 
     positions: Floats
@@ -110,10 +115,11 @@ class RayPoses:
     velocities: Floats | None
     rates: Floats | None
 
-    def rotated(self, vectors: Floats) -> Floats:
-        """Rotate vectors (3, m) from the sensor's axes to the mesh's, in a fixed order of rounding.
+    def rotate(self, vectors: Floats) -> Floats:
+        """Rotate vectors (3, m) from the sensor frame to the mesh frame.
 
-        ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
+        The order of operations is fixed. The last bit of ``matrices @ vectors`` would depend on the
+        BLAS library.
         """
         if self.rotations is not None:
             x, y, z = vectors
@@ -132,8 +138,8 @@ class RayPoses:
         crosses += vectors
         return crosses
 
-    def translated(self, positions: Floats) -> Floats:
-        """Move positions (3, m), or (3, 1), by the velocity during the delay of each ray."""
+    def translate(self, positions: Floats) -> Floats:
+        """Move positions, (3, m) or (3, 1), by the velocity during the delay of each ray."""
         if self.velocities is None:
             return positions
         pairs = zip(positions, self.velocities, strict=True)
@@ -147,17 +153,17 @@ def check_poses(
     ray_count: int,
     motion: PoseMotion | None = None,
 ) -> Poses:
-    """Check the poses of a number of rays.
+    """Validate the poses of a number of rays.
 
-    Raises ValueError for an invalid pose, or too few poses.
+    `RayCaster.scan` describes the arguments. If `positions` is a `Poses` object, which has already
+    been validated, it is returned unchanged.
 
-    `RayCaster.scan` describes the arguments. `Poses` in place of positions have been checked
-    before, and are returned as such.
+    Raises ValueError if a pose is invalid or there are too few poses.
     """
     if isinstance(positions, Poses):
         return positions
-    position_rows = real_rows("positions", positions)
-    refuse_rows("Position", position_rows, finite_rows, "finite")
+    position_rows = as_real_rows("positions", positions)
+    check_rows("Position", position_rows, are_finite, "finite")
     matrices = None if rotations is None else _check_rotations(rotations)
     count = max(len(position_rows), 1 if matrices is None else len(matrices))
     for table in (position_rows, matrices):
@@ -176,15 +182,15 @@ def check_poses(
             "Pass more poses, a larger rays_per_pose, or a smaller window."
         )
     return Poses(
-        _repeated(by_component(position_rows), count),
-        None if matrices is None else _repeated(matrices, count),
+        _broadcast_rows(component_major(position_rows), count),
+        None if matrices is None else _broadcast_rows(matrices, count),
         rays_of_pose,
         None if motion is None else _check_motion(motion, count, rays_of_pose),
     )
 
 
-def _repeated(table: Floats, count: int) -> Floats:
-    """Return a table (1, ...) or (count, ...) as (count, ...)."""
+def _broadcast_rows(table: Floats, count: int) -> Floats:
+    """Repeat a table (1, ...) along the first axis if it does not have `count` rows."""
     return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
 
@@ -195,7 +201,7 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
         ("velocities", (pose_count, 3)),
         ("rates", (pose_count, 3)),
     ):
-        array = by_component(np.asarray(getattr(motion, name), dtype=np.float64))
+        array = component_major(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
                 f"PoseMotion.{name} must be an array of finite numbers with shape {shape} for "
@@ -208,14 +214,16 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 def _check_rotations(rotations: ArrayLike) -> Floats:
     """Return rotations (k, 3, 3) as float64.
 
-    Raises ValueError for a matrix that deforms or mirrors.
+    Raises ValueError if a matrix is not orthonormal or contains a reflection.
     """
-    matrices = by_component(real_rows("rotations", rotations, (3, 3)))
+    matrices = component_major(as_real_rows("rotations", rotations, (3, 3)))
     rows = matrices.transpose(1, 2, 0)
     x, y, z = rows.transpose(1, 0, 2)
-    # NaN compares as false.
+    # Comparisons with NaN are false, so matrices with NaN count as invalid.
     with np.errstate(over="ignore", invalid="ignore"):
-        products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # products of two rows each
+        products = (x[:, None] * x + y[:, None] * y) + z[
+            :, None
+        ] * z  # dot products of two rows each
         deviations = np.abs(products - np.eye(3)[:, :, None])
         orthonormal = (deviations <= _SLACK).all(axis=(0, 1))
         mirrored = orthonormal & ~(determinants(rows) > 0)
@@ -226,25 +234,24 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     if mirrored[first]:
         raise ValueError(
             f"The determinant of rotation {first} must be 1, but {matrices[first].tolist()} "
-            "contains a "
-            f"reflection. {len(invalid)} of {len(matrices)} matrices are invalid."
+            f"contains a reflection. {len(invalid)} of {len(matrices)} matrices are invalid."
         )
     raise ValueError(
         f"Rotation {first} must be an orthonormal matrix from the sensor frame to the mesh frame, "
-        "but "
-        f"is {matrices[first].tolist()}. {len(invalid)} of {len(matrices)} matrices are invalid."
+        f"but is {matrices[first].tolist()}. {len(invalid)} of {len(matrices)} matrices are "
+        "invalid."
     )
 
 
 def determinants(matrix_rows: Floats) -> Floats:
-    """Return the determinants (k,) of matrices by rows (3, 3, k)."""
+    """Return the determinants (k,) of matrices with shape (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix_rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 
-def by_component(table: AnyArray) -> Floats:
-    """Return a table (k, ...) as float64, each component contiguous over the k entries."""
-    # Not by `numpy.moveaxis`, which takes as long as casting 100 rays.
+def component_major(table: AnyArray) -> Floats:
+    """Return a table (k, ...) as float64 with each component contiguous over the k rows."""
+    # `numpy.moveaxis` would take as long as casting 100 rays.
     components_first = table.transpose(*range(1, table.ndim), 0)
     contiguous = np.ascontiguousarray(components_first, dtype=np.float64)
     return contiguous.transpose(-1, *range(table.ndim - 1))

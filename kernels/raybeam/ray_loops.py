@@ -1,9 +1,10 @@
-"""Rays of a pattern, a tile at a time in compiled loops, with the operations of `plain_rays`.
+"""Compiled loops that compute the rays of a pattern, with the operations of `compute_rays_numpy`.
 
-A ray is a beam of the pattern, or a sub-ray of a beam, cast from a pose. `cast` is a `CAST` record
-(cast_memory.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py).
-`floats` and `numbers` point to this memory as float64 and int64. Tables that a `CAST` names come as
-addresses, with one column for each beam or pose. A vector has four rays.
+A ray is a beam of the pattern, or a sub-ray of a beam, that is cast from a pose. The rays of one
+tile are computed at a time. `cast` is a `CAST` record (cast_record.py), and `tile` is the address
+of the memory of a tile with `rays` rays (tile_memory.py), which `floats` and `numbers` access as
+float64 and int64. Arrays of a `CAST` are passed by address and have one column per beam or pose. A
+vector contains four rays.
 """
 
 from __future__ import annotations
@@ -13,31 +14,32 @@ from typing import NamedTuple
 import numpy as np
 from numba import carray, types
 
-from . import cast_memory as memory
+from . import cast_record as memory
 from .arrays import Floats, Ints
-from .cast_memory import casts_at, float64s, int64s
-from .compiled import WHOLE, compiled, inlined, part, stage
+from .cast_record import casts_at, float64s, int64s
+from .compiled import INT64, called_by_address, compiled, inlined, noinline
 from .pattern import Pattern
 from .poses import Poses
-from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_at, thread_tiles
+from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_index, thread_tiles
+from .tile_sizes import VECTOR_RAYS
 from .vectors import load, splat, square_root, store
 
-_TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
-_LONE = 8  # numbers of a row of the table of shares of a single sub-ray
-_BEAMS = 64  # beams per tile when rays are only computed
+_TINY = 2.0**-60  # replaces zero components of directions, to avoid 0 * inf
+_SINGLE_ROW = VECTOR_RAYS  # columns of `SubRays.loop_table` if beams have a single sub-ray
+_BEAMS = 64  # beams per tile if rays are computed but not cast
 
 
 class FirstRay(NamedTuple):
-    """The ray with number 0 of a call.
+    """The first ray of a call.
 
     Attributes
     ----------
     row
-        Row in the pattern, counted in sub-rays.
+        Row in the pattern, counting each sub-ray as a row.
     pose, within
-        Number of the pose, and number of the ray within the pose.
+        Index of its pose, and index of the ray within the pose.
     ray
-        Number of the ray in the scan.
+        Index of the ray in the scan.
     """
 
     row: int
@@ -47,14 +49,14 @@ class FirstRay(NamedTuple):
 
 
 @inlined
-def _quotient(number, divisor):  # type: ignore[no-untyped-def]
-    """Return ``number // divisor``, for whole numbers below 2^52: exact, faster than `//`."""
+def _floor_divide(number, divisor):  # type: ignore[no-untyped-def]
+    """Return ``number // divisor`` for integers below 2**52, faster than `//`."""
     return np.int64(np.floor(np.float64(number) / np.float64(divisor)))
 
 
 @inlined
-def any_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """Return the two axes across a unit direction of `sub_rays.any_axes`, as six numbers."""
+def perpendicular_axes(x, y, z):  # type: ignore[no-untyped-def]
+    """Return the six components of the two axes of `sub_rays.perpendicular_axes`."""
     sign = -1.0 if z < 0 else 1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -62,10 +64,10 @@ def any_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """Return the two axes across a unit direction of `sub_rays.axes_about`, as six numbers.
+def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
+    """Return the six components of the two axes of `sub_rays.oriented_axes`.
 
-    `axis` is `SubRays.axis`: three numbers.
+    `axis` contains the three components of `SubRays.axis`.
     """
     a, b, c = axis
     p = b * z - c * y
@@ -80,49 +82,51 @@ def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
     v = z * p - x * r
     w = x * q - y * p
     if length < 1e-6:
-        p, q, r, u, v, w = any_axes(x, y, z)
+        p, q, r, u, v, w = perpendicular_axes(x, y, z)
     return p, q, r, u, v, w
 
 
-@stage
+@noinline
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
-    """Write the rows in the pattern of a tile's rays, counted in sub-rays.
+    """Write the pattern rows of a tile's rays, counting each sub-ray as a row.
 
-    `first_row` is the row of the call's first ray; the pattern, of `row_count` rows, repeats.
+    `first_row` is the row of the first ray of the call. The pattern has `row_count` rows and
+    repeats.
     """
     numbers = int64s(tile)
-    number_at = row_at(NUMBER, rays)
-    target = row_at(ROW, rays)
+    number_at = row_index(NUMBER, rays)
+    target = row_index(ROW, rays)
     for lane in range(rays):
         row = first_row + numbers[number_at + lane]
-        numbers[target + lane] = row - _quotient(row, row_count) * row_count
+        numbers[target + lane] = row - _floor_divide(row, row_count) * row_count
 
 
-@stage
+@noinline
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
-    """Write the poses of a tile's rays, and the numbers of the rays within their poses.
+    """Write the poses of a tile's rays, and the indices of the rays within their poses.
 
-    `first` is the `FirstRay`. Rays outside the call take the nearest pose.
+    `first` is the `FirstRay` of the call. Rays before or after the rays of the call use the closest
+    pose.
     """
     numbers = int64s(tile)
-    number_at = row_at(NUMBER, rays)
-    pose_at = row_at(POSE, rays)
-    within_at = row_at(WITHIN, rays)
+    number_at = row_index(NUMBER, rays)
+    pose_at = row_index(POSE, rays)
+    within_at = row_index(WITHIN, rays)
     for lane in range(rays):
         inside = first.within + numbers[number_at + lane]
-        later = _quotient(inside, rays_per_pose)
+        later = _floor_divide(inside, rays_per_pose)
         numbers[pose_at + lane] = min(max(first.pose + later, 0), poses - 1)
         numbers[within_at + lane] = inside - later * rays_per_pose
 
 
-@stage
+@noinline
 def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyped-def]
-    """Write the directions of a tile's rays, by their rows in the pattern."""
+    """Write the directions of a tile's rays, given their pattern rows."""
     numbers = int64s(tile)
     floats = float64s(tile)
     table = float64s(directions)
-    row_of = row_at(ROW, rays)
-    target = row_at(DX, rays)
+    row_of = row_index(ROW, rays)
+    target = row_index(DX, rays)
     for lane in range(rays):
         row = numbers[row_of + lane]
         floats[target + lane] = table[row]
@@ -132,111 +136,114 @@ def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyp
 
 @inlined
 def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
-    """Return ``a x + b y`` of vectors."""
+    """Return ``a x + b y`` for vectors."""
     return a * x + b * y
 
 
-@stage
+@noinline
 def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the directions of a tile's sub-rays, and their starts relative to the beams' origins.
+    """Write the directions of a tile's sub-rays, and their starts relative to the beam origins.
 
-    The rows of the sub-rays become rows of their beams. `lanes_per_beam` consecutive lanes are of a
-    beam. With `offsets` of the beams, radians, rows 1 and 2 of the table of shares are tangents of
-    angles. The offsets are added to these angles.
+    The pattern rows of the sub-rays are replaced by the rows of their beams. Each beam occupies
+    `lanes_per_beam` consecutive lanes. If beams have `offsets`, rows 1 and 2 of the sub-ray table
+    contain angles, to which the offsets are added, instead of components.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
-    shares = float64s(cast.shares)
+    table = float64s(cast.sub_ray_table)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
     beam_count = cast.beam_count
     lanes = cast.lanes_per_beam
-    row_of = row_at(ROW, rays)
-    origin = row_at(OX, rays)
-    target = row_at(DX, rays)
+    row_of = row_index(ROW, rays)
+    origin = row_index(OX, rays)
+    target = row_index(DX, rays)
     one = splat(1.0)
     axis = cast.axis[0], cast.axis[1], cast.axis[2]
     for first in range(0, rays, lanes):
-        beam = _quotient(numbers[row_of + first], cast.subrays)
+        beam = _floor_divide(numbers[row_of + first], cast.subrays)
         for lane in range(first, first + lanes):
             numbers[row_of + lane] = beam
         x = directions[beam]
         y = directions[beam_count + beam]
         z = directions[2 * beam_count + beam]
         if cast.has_axis:
-            a, b, c, d, e, f = axes_about(x, y, z, axis)
+            a, b, c, d, e, f = oriented_axes(x, y, z, axis)
         else:
-            a, b, c, d, e, f = any_axes(x, y, z)
+            a, b, c, d, e, f = perpendicular_axes(x, y, z)
         for k in range(0, lanes, 4):
-            straight = load(shares, k)
-            across = load(shares, lanes + k)
-            up = load(shares, 2 * lanes + k)
+            forward = load(table, k)
+            across = load(table, lanes + k)
+            up = load(table, 2 * lanes + k)
             if cast.offsets != 0:
                 across = across + splat(offsets[beam])
                 up = up + splat(offsets[beam_count + beam])
-                straight = one / square_root((one + across * across) + up * up)
-                across = across * straight
-                up = up * straight
+                forward = one / square_root((one + across * across) + up * up)
+                across = across * forward
+                up = up * forward
             i = target + first + k
-            store(floats, i, _combine(straight, splat(x), across, splat(a)) + up * splat(d))
-            store(floats, i + rays, _combine(straight, splat(y), across, splat(b)) + up * splat(e))
+            store(floats, i, _combine(forward, splat(x), across, splat(a)) + up * splat(d))
+            store(floats, i + rays, _combine(forward, splat(y), across, splat(b)) + up * splat(e))
             store(
-                floats, i + 2 * rays, _combine(straight, splat(z), across, splat(c)) + up * splat(f)
+                floats, i + 2 * rays, _combine(forward, splat(z), across, splat(c)) + up * splat(f)
             )
             if cast.has_starts:
-                aside = load(shares, 3 * lanes + k)
-                above = load(shares, 4 * lanes + k)
+                lateral = load(table, 3 * lanes + k)
+                vertical = load(table, 4 * lanes + k)
                 i = origin + first + k
-                store(floats, i, _combine(aside, splat(a), above, splat(d)))
-                store(floats, i + rays, _combine(aside, splat(b), above, splat(e)))
-                store(floats, i + 2 * rays, _combine(aside, splat(c), above, splat(f)))
+                store(floats, i, _combine(lateral, splat(a), vertical, splat(d)))
+                store(floats, i + rays, _combine(lateral, splat(b), vertical, splat(e)))
+                store(floats, i + 2 * rays, _combine(lateral, splat(c), vertical, splat(f)))
 
 
-@stage
-def _make_lone_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write directions and starts as `_make_sub_rays`, of the only sub-ray of each beam."""
+@noinline
+def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write the directions and starts like `_make_sub_rays`, if each beam has a single sub-ray."""
     numbers = int64s(tile)
     floats = float64s(tile)
-    shares = float64s(cast.shares)
+    table = float64s(cast.sub_ray_table)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
     beam_count = cast.beam_count
-    row_of = row_at(ROW, rays)
-    origin = row_at(OX, rays)
-    target = row_at(DX, rays)
+    row_of = row_index(ROW, rays)
+    origin = row_index(OX, rays)
+    target = row_index(DX, rays)
     axis = cast.axis[0], cast.axis[1], cast.axis[2]
-    straight = shares[0]
-    across = shares[_LONE]
-    up = shares[2 * _LONE]
+    forward = table[0]
+    across = table[_SINGLE_ROW]
+    up = table[2 * _SINGLE_ROW]
     for lane in range(rays):
         beam = numbers[row_of + lane]
         x = directions[beam]
         y = directions[beam_count + beam]
         z = directions[2 * beam_count + beam]
         if cast.has_axis:
-            a, b, c, d, e, f = axes_about(x, y, z, axis)
+            a, b, c, d, e, f = oriented_axes(x, y, z, axis)
         else:
-            a, b, c, d, e, f = any_axes(x, y, z)
+            a, b, c, d, e, f = perpendicular_axes(x, y, z)
         if cast.offsets != 0:
-            across = shares[_LONE] + offsets[beam]
-            up = shares[2 * _LONE] + offsets[beam_count + beam]
-            straight = 1 / np.sqrt((1 + across * across) + up * up)
-            across = across * straight
-            up = up * straight
-        floats[target + lane] = (straight * x + across * a) + up * d
-        floats[target + rays + lane] = (straight * y + across * b) + up * e
-        floats[target + 2 * rays + lane] = (straight * z + across * c) + up * f
+            across = table[_SINGLE_ROW] + offsets[beam]
+            up = table[2 * _SINGLE_ROW] + offsets[beam_count + beam]
+            forward = 1 / np.sqrt((1 + across * across) + up * up)
+            across = across * forward
+            up = up * forward
+        floats[target + lane] = (forward * x + across * a) + up * d
+        floats[target + rays + lane] = (forward * y + across * b) + up * e
+        floats[target + 2 * rays + lane] = (forward * z + across * c) + up * f
         if cast.has_starts:
-            aside = shares[3 * _LONE]
-            above = shares[4 * _LONE]
-            floats[origin + lane] = aside * a + above * d
-            floats[origin + rays + lane] = aside * b + above * e
-            floats[origin + 2 * rays + lane] = aside * c + above * f
+            lateral = table[3 * _SINGLE_ROW]
+            vertical = table[4 * _SINGLE_ROW]
+            floats[origin + lane] = lateral * a + vertical * d
+            floats[origin + rays + lane] = lateral * b + vertical * e
+            floats[origin + 2 * rays + lane] = lateral * c + vertical * f
 
 
 @inlined
-def _turn(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
-    """Rotate four vectors, whose components are in three rows from `target` on, by nine vectors."""
+def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
+    """Rotate four vectors by a matrix of nine vectors.
+
+    The components of the vectors are in three rows of the tile, starting at index `target`.
+    """
     a, b, c, d, e, f, g, h, i = matrix
     p = load(floats, target)
     q = load(floats, target + rays)
@@ -248,7 +255,7 @@ def _turn(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
 
 @inlined
 def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
-    """Return the nine numbers of a pose's matrix, each as a vector."""
+    """Return the nine elements of a pose's matrix, each as a vector of equal numbers."""
     k = pose
     n = poses
     return (
@@ -265,8 +272,8 @@ def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _turn_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
-    """Rotate the vector with first component i by matrix k of n matrices."""
+def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
+    """Rotate the vector whose first component has index `i` by the `k`-th of `n` matrices."""
     p = floats[i]
     q = floats[i + rays]
     r = floats[i + 2 * rays]
@@ -276,43 +283,44 @@ def _turn_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
     floats[i] = (p * matrices[k + 6 * n] + q * matrices[k + 7 * n]) + r * matrices[k + 8 * n]
 
 
-@stage
+@noinline
 def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
-    """Rotate vectors of a tile, in three rows from `first_row` on, to the scene's axes.
+    """Rotate vectors of a tile to the axes of the scene.
 
-    `rotations` is the address of the matrices of the poses, float64 (9, poses).
+    The vectors are in three rows of the tile, starting at row `first_row`. `rotations` is the
+    address of the matrices of the poses, float64 (9, poses).
     """
     numbers = int64s(tile)
     floats = float64s(tile)
     matrices = float64s(rotations)
-    pose_at = row_at(POSE, rays)
-    target = row_at(first_row, rays)
+    pose_at = row_index(POSE, rays)
+    target = row_index(first_row, rays)
     if poses == 1:
         matrix = _matrix(matrices, 0, 1)
         for lane in range(0, rays, 4):
-            _turn(floats, target + lane, rays, matrix)
+            _rotate_four(floats, target + lane, rays, matrix)
         return
     for start in range(0, rays, 4):
         k = numbers[pose_at + start]
         others = numbers[pose_at + start + 1], numbers[pose_at + start + 2]
         if others[0] == k and others[1] == k and numbers[pose_at + start + 3] == k:
-            _turn(floats, target + start, rays, _matrix(matrices, k, poses))
+            _rotate_four(floats, target + start, rays, _matrix(matrices, k, poses))
             continue
         for lane in range(start, start + 4):
-            _turn_one(floats, target + lane, rays, matrices, numbers[pose_at + lane], poses)
+            _rotate_one(floats, target + lane, rays, matrices, numbers[pose_at + lane], poses)
 
 
-@stage
+@noinline
 def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Rotate vectors of a tile by the angular rates of their poses, as `PoseMotion` describes."""
+    """Rotate vectors of a tile by the angular velocities of their poses. See `PoseMotion`."""
     numbers = int64s(tile)
     floats = float64s(tile)
     delays = float64s(cast.delays)
     rates = float64s(cast.rates)
     poses = cast.poses
-    pose_at = row_at(POSE, rays)
-    within_at = row_at(WITHIN, rays)
-    target = row_at(first_row, rays)
+    pose_at = row_index(POSE, rays)
+    within_at = row_index(WITHIN, rays)
+    target = row_index(first_row, rays)
     for lane in range(rays):
         i = target + lane
         p = floats[i]
@@ -328,14 +336,17 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
         floats[i + 2 * rays] = r + delay * (a * q - b * p)
 
 
-@stage
+@noinline
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins, by each ray's column in row `field`."""
+    """Add vectors of a table (3, count) to the origins of a tile's rays.
+
+    Row `field` of the tile contains the column of the table for each ray.
+    """
     numbers = int64s(tile)
     floats = float64s(tile)
     vectors = float64s(table)
-    column_of = row_at(field, rays)
-    target = row_at(OX, rays)
+    column_of = row_index(field, rays)
+    target = row_index(OX, rays)
     for lane in range(rays):
         k = numbers[column_of + lane]
         floats[target + lane] += vectors[k]
@@ -343,19 +354,19 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
         floats[target + 2 * rays + lane] += vectors[k + 2 * count]
 
 
-@stage
+@noinline
 def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
-    """Add the position of the only pose, whose address is given, to the origins."""
+    """Add the position of the only pose, given its address, to the origins of a tile's rays."""
     floats = float64s(tile)
     vector = float64s(position)
-    target = row_at(OX, rays)
+    target = row_index(OX, rays)
     for axis in range(3):
         number = splat(vector[axis])
         for k in range(target + axis * rays, target + (axis + 1) * rays, 4):
             store(floats, k, load(floats, k) + number)
 
 
-@stage
+@noinline
 def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
     """Move the origins of a tile's rays by the velocities of their poses."""
     numbers = int64s(tile)
@@ -363,9 +374,9 @@ def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
     delays = float64s(cast.delays)
     velocities = float64s(cast.velocities)
     poses = cast.poses
-    pose_at = row_at(POSE, rays)
-    within_at = row_at(WITHIN, rays)
-    target = row_at(OX, rays)
+    pose_at = row_index(POSE, rays)
+    within_at = row_index(WITHIN, rays)
+    target = row_index(OX, rays)
     for lane in range(rays):
         k = numbers[pose_at + lane]
         delay = delays[numbers[within_at + lane]]
@@ -374,22 +385,22 @@ def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
         floats[target + 2 * rays + lane] += delay * velocities[k + 2 * poses]
 
 
-@stage
+@noinline
 def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
-    """Write zero to the origins of a tile's rays."""
+    """Set the origins of a tile's rays to zero."""
     floats = float64s(tile)
     zero = splat(0.0)
-    for k in range(row_at(OX, rays), row_at(OX + 3, rays), 4):
+    for k in range(row_index(OX, rays), row_index(OX + 3, rays), 4):
         store(floats, k, zero)
 
 
-@stage
+@noinline
 def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
-    """Write the origins of a tile's rays in the scene, meters.
+    """Write the origins of a tile's rays in the scene, in meters.
 
-    If sub-rays have starts, the rows of the origins hold these.
+    If sub-rays have starts, these must already be in the rows of the origins.
     """
-    has_starts = cast.shares != 0 and cast.has_starts != 0
+    has_starts = cast.sub_ray_table != 0 and cast.has_starts != 0
     if not has_starts:
         _clear_origins(tile, rays)
     if cast.origins != 0:
@@ -407,11 +418,11 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
         _apply_velocities(tile, rays, cast)
 
 
-@stage
-def _localise(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Convert the origins of a tile's rays, meters, to local coordinates."""
+@noinline
+def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
+    """Convert the origins of a tile's rays from meters to local coordinates."""
     floats = float64s(tile)
-    target = row_at(OX, rays)
+    target = row_index(OX, rays)
     factor = splat(scale)
     for k in range(0, rays, 4):
         i = target + k
@@ -420,17 +431,18 @@ def _localise(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
         store(floats, i + 2 * rays, (load(floats, i + 2 * rays) - splat(z)) * factor)
 
 
-@stage
-def _copy_out(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
-    """Write vectors of a tile to an output (3, total) of all rays.
+@noinline
+def _write_output(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
+    """Write vectors of a tile to an output array (3, total) for all rays of a cast.
 
-    `address` is of the output of the call's first ray, `count` the number of rays of the call.
+    `address` is the output for the first ray of the call, and `count` is the number of rays in the
+    call.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
     vectors = float64s(address)
-    number_at = row_at(NUMBER, rays)
-    source = row_at(first_row, rays)
+    number_at = row_index(NUMBER, rays)
+    source = row_index(first_row, rays)
     for lane in range(rays):
         k = numbers[number_at + lane]
         if 0 <= k < count:
@@ -441,7 +453,7 @@ def _copy_out(tile, rays, first_row, address, total, count):  # type: ignore[no-
 
 @inlined
 def first_ray(cast, ray):  # type: ignore[no-untyped-def]
-    """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
+    """Return the `FirstRay` of a call, given its index in the scan."""
     total = cast.beam_count * cast.subrays
     rays_per_pose = cast.rays_per_pose
     pose = ray // rays_per_pose
@@ -449,14 +461,15 @@ def first_ray(cast, ray):  # type: ignore[no-untyped-def]
     return FirstRay((cast.first + ray) % total, pose, within, ray)
 
 
-@part(types.void(*4 * WHOLE))
+@called_by_address(types.void(*4 * INT64))
 def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
-    """Compute the rays of a tile in local coordinates, by their numbers in the call.
+    """Compute the rays of a tile in local coordinates, given their indices in the call.
 
-    `address` is of the `CAST`, `start` the number of the call's first ray in the scan, and `count`
-    the number of the call's rays. Rays outside the call are neighbors of its rays, if these have
-    one pose. An origin that all rays share is in the tile already: `share_origin`. Rays are also
-    written to the outputs of rays of the cast, if any.
+    `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
+    scan, and `count` is the number of rays in the call. If there is a single pose, the tile may
+    also contain neighboring rays that do not belong to the call. If all rays share an origin,
+    `write_shared_origin` must have written it to the tile. The rays are also written to the ray
+    outputs of the cast, if there are any.
     """
     cast = carray(casts_at(address), 1)[0]
     tile = cast.tile
@@ -464,9 +477,9 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     _find_rows(tile, rays, first.row, cast.beam_count * cast.subrays)
     if cast.poses > 1 or cast.delays != 0:
         _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
-    if cast.shares != 0:
+    if cast.sub_ray_table != 0:
         if cast.lanes_per_beam == 1:
-            _make_lone_sub_rays(tile, rays, cast)
+            _make_single_sub_rays(tile, rays, cast)
         else:
             _make_sub_rays(tile, rays, cast)
     else:
@@ -477,29 +490,29 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
         _apply_rates(tile, rays, DX, cast)
     if cast.directions_out != 0:
         out = cast.directions_out + 8 * first.ray
-        _copy_out(tile, rays, DX, out, cast.ray_count, count)
+        _write_output(tile, rays, DX, out, cast.ray_count, count)
     if cast.shares_origin == 0:
         _write_origins(tile, rays, cast)
         if cast.origins_out != 0:
             out = cast.origins_out + 8 * first.ray
-            _copy_out(tile, rays, OX, out, cast.ray_count, count)
-        _localise(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
+            _write_output(tile, rays, OX, out, cast.ray_count, count)
+        _to_local(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
 
 
-@stage
-def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
-    """Write the origin that all rays of a cast share, in local coordinates, to a tile's rays.
+@noinline
+def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
+    """Write the origin that all rays of a cast share to the rays of a tile, in local coordinates.
 
-    All tiles of a cast use the same memory, where `make_rays` leaves this origin unchanged. So
-    the origin is written once, before the first tile.
+    All tiles of a cast use the same memory, and `make_rays` does not change this origin, so it is
+    written only once before the first tile.
     """
     _write_origins(tile, rays, cast)
-    _localise(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
+    _to_local(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
 
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the larger of `entry` and the distance at which a ray enters a slab of the box."""
+    """Return the larger of `entry` and the distance at which a ray enters the slab of one axis."""
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY
@@ -508,10 +521,10 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the box from -half to half; 0 if it starts inside.
+    """Return the distance at which a ray enters the cube from -half to half, 0 if it starts inside.
 
-    All lengths are in local units; `o` and `d` are the ray's origin and direction. For a ray that
-    misses the box, the result has no meaning.
+    All lengths are in local units. `o` and `d` are the origin and the direction of the ray. The
+    result is meaningless if the ray misses the cube.
     """
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > half:
@@ -523,7 +536,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write the directions (3, m), and the origins unless (3, 0), of rays with numbers (m,)."""
+    """Write the directions (3, m) of rays (m,), and their origins unless `origins` is (3, 0)."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -532,12 +545,12 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
     count = len(rays)
     numbers = int64s(tile)
     floats = float64s(tile)
-    number_at = row_at(NUMBER, lanes)
-    origin = row_at(OX, lanes)
-    direction = row_at(DX, lanes)
+    number_at = row_index(NUMBER, lanes)
+    origin = row_index(OX, lanes)
+    direction = row_index(DX, lanes)
     beams = lanes // each
     for start in range(0, count, beams):
-        # Each ray fills the lanes of a beam. One of these lanes is the ray.
+        # Each requested ray takes the lanes of a whole beam, of which one lane contains the ray.
         for k in range(beams):
             number = rays[min(start + k, count - 1)]
             first_of_beam = number - (cast.first + number) % cast.subrays
@@ -554,18 +567,17 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
                     origins[axis, start + k] = floats[origin + axis * lanes + lane]
 
 
-def compiled_rays(
+def compute_rays_compiled(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats | None, Floats]:
-    """Return origins and directions, float64 (3, m), of rays with numbers (m,).
+    """Return the origins and directions of rays (m,), float64 (3, m) each.
 
-    The arguments are as in `pattern_rays.checked_rays`. Origins are None if all rays start at the
-    position of a single pose.
+    The arguments are as in `pattern_rays.compute_rays`. The origins are None if all rays share one.
     """
-    cast = memory.Cast(np.zeros(1, memory.CAST))
+    cast = memory.CastRecord(np.zeros(1, memory.CAST))
     record = cast.record
     cast.set_pattern(pattern, poses, first)
-    record["scale"] = 1.0  # local coordinates are meters, about the origin of the scene
+    record["scale"] = 1.0  # local coordinates are scene coordinates in meters
     lanes = _BEAMS * int(record["lanes_per_beam"][0])
     record["tile_rays"] = lanes
     record["tile"] = thread_tiles.address(lanes, 0, 0)

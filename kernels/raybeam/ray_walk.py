@@ -1,4 +1,4 @@
-"""A single ray's way down the trees that tiles descend."""
+"""Traversal of the trees of tiles by a single ray."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from .cast_memory import (
+from .cast_record import (
     BLOCKS,
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,
@@ -18,42 +18,43 @@ from .cast_memory import (
     int32s,
     int64s,
 )
-from .compiled import WHOLE, inlined, part, stage
-from .mesh import ACROSS
-from .mesh_loops import enter_instance
+from .compiled import INT64, called_by_address, inlined, noinline
+from .mesh import MAX_DIAGONAL
+from .mesh_loops import to_mesh_coordinates
 from .ray_loops import entry_distance
-from .tile_exact import decide_one
+from .tile_exact import intersect_ray
 from .tile_frame import ONE, ZERO, cross, dot
-from .tile_leaf import EDGE, FLOOR, LEAF_MASK, norm
-from .tile_memory import AXIS, ENTRY, IX, LENGTH, OX, T, U, at, row_at
+from .tile_leaf import EDGE, FLOOR, LEAF_MASK, l1_norm
+from .tile_memory import AXIS, ENTRY, IX, LENGTH, OX, T, U, field_index, row_index
 from .tile_tree import BLOCK, NODE
-from .tile_walk import put, sort_farthest_first
+from .tile_walk import sort_farthest_first, write_entry
 from .tree import LEAF_BITS
-from .triangle_loops import shear
-from .vectors import at_least, higher_of, load, lower_of, lowest_bit, multiply_add, splat, store
+from .triangle_loops import shear_ray
+from .vectors import greater_equal, load, lowest_bit, maximum, minimum, multiply_add, splat, store
 
-_NEAR = at("near")
-_STACK = at("stack")
+_NEAR = field_index("near")
+_STACK = field_index("stack")
 _TINY = np.float32(2.0**-60)
 SLACK = 2.0**-20
-_MAX_ENTRY = 1e9  # see tree.py
+_MAX_ENTRY = 1e9  # local distance that the padding in tree.py allows for
 
 
 class _Start(NamedTuple):
-    """A ray in float32, from where it enters the box of a scene or mesh.
+    """A ray in float32, starting where it enters the box of a scene or mesh.
 
     Attributes
     ----------
     entry
-        Distance of the start from the ray's origin, float64; 0 if the origin is inside the box.
+        Distance of the start from the origin of the ray, float64; 0 if the origin is inside the
+        box.
     x, y, z, dx, dy, dz
         Start and direction.
     ix, iy, iz
-        Reciprocals of the direction.
+        Reciprocals of the direction components.
     near_x, near_y, near_z
-        Where in a node the coordinates of its children's nearer sides are.
+        Positions, within a node, of the coordinates of the children's closer sides.
     undecided
-        Whether the start is too inexact to discard triangles: -1 if so, else 0.
+        -1 if the start is too inaccurate to discard triangles, otherwise 0.
     """
 
     entry: float
@@ -73,10 +74,10 @@ class _Start(NamedTuple):
 
 
 @inlined
-def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `_Start` of a ray, the first of whose six numbers has index k.
+def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the `_Start` of a ray, whose six numbers start at index `k` with a stride of `rays`.
 
-    The box of a scene or mesh is within [-1, 1] and its padding.
+    The box of a scene or mesh is within [-1, 1], plus padding.
     """
     ox = floats[k]
     oy = floats[k + rays]
@@ -94,7 +95,7 @@ def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR
     near_x = 0 if ix >= 0 else 24
     near_y = 8 if iy >= 0 else 32
     near_z = 16 if iz >= 0 else 40
-    # So far away, the start is off by more than the margins of the test in float32.
+    # Beyond this distance, the error of the start exceeds the margins of the test in float32.
     undecided = -1 if entry > _MAX_ENTRY else 0
     return _Start(
         entry=entry,
@@ -123,13 +124,16 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
-    """Return a distance after the entry as float32, never less than the exact distance."""
-    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -ACROSS), ACROSS))
+    """Return a distance from the entry as float32, never less than the exact distance."""
+    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -MAX_DIAGONAL), MAX_DIAGONAL))
 
 
 @inlined
 def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untyped-def]
-    """Return the distances at which a ray meets the nearer and the farther side of eight boxes."""
+    """Return the distances at which a ray intersects the two sides of eight boxes across an axis.
+
+    The first vector contains the closer sides.
+    """
     far_at = (24 + 16 * axis) - near_at
     factor = splat(inverse)
     shift = splat(start * inverse)
@@ -140,11 +144,11 @@ def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untype
 
 
 @inlined
-def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Add the children of a node that a ray meets to a list, nearest last, and return its length.
+def _push_children(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Push the children of a node that a ray intersects, and return the new size of the stack.
 
-    `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
-    at which the ray ends.
+    The closest child is pushed last. `address` is the stack, which has `count` entries, `nodes` is
+    the address of the nodes, and `limit` is the distance at which the ray ends.
     """
     singles = float32s(tile)
     stack = float32s(address)
@@ -155,9 +159,9 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
     near_x, far_x = _slab(boxes, base, start.near_x, 0, start.ix, start.x)
     near_y, far_y = _slab(boxes, base, start.near_y, 1, start.iy, start.y)
     near_z, far_z = _slab(boxes, base, start.near_z, 2, start.iz, start.z)
-    near = higher_of(higher_of(near_x, near_y), higher_of(near_z, splat(ZERO)))
-    far = lower_of(lower_of(far_x, far_y), lower_of(far_z, splat(limit)))
-    hit = at_least(far, near)
+    near = maximum(maximum(near_x, near_y), maximum(near_z, splat(ZERO)))
+    far = minimum(minimum(far_x, far_y), minimum(far_z, splat(limit)))
+    hit = greater_equal(far, near)
     store(singles, _NEAR, near)
     first = count
     while hit != 0:
@@ -167,7 +171,7 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
         codes[ENTRY * count + 1] = children[base + 48 + child]
         count += 1
     if count == first + 2:
-        # Mostly there are one or two, and which is nearer cannot be predicted.
+        # This common case is handled without a branch, which would often be mispredicted.
         k = ENTRY * first
         here = stack[k]
         there = stack[k + ENTRY]
@@ -184,8 +188,8 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
 
 
 @inlined
-def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test the triangles of a leaf and a ray, and return whether it has a closer hit."""
+def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Test a ray against the triangles of a leaf, and return whether a closer hit was found."""
     record = int64s(mesh)
     blocks = float32s(record[BLOCKS])
     block = (code >> LEAF_BITS) * BLOCK
@@ -200,57 +204,60 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ig
     n1 = dot(f[0], f[1], f[2], moment[0], moment[1], moment[2])
     n2 = splat(ZERO) - dot(e[0], e[1], e[2], moment[0], moment[1], moment[2])
     n0 = (dot(normal[0], normal[1], normal[2], d[0], d[1], d[2]) - n1) - n2
-    size = norm(e) + norm(f)
-    distance = splat(ONE) + norm((ax, ay, az))
+    size = l1_norm(e) + l1_norm(f)
+    distance = splat(ONE) + l1_norm((ax, ay, az))
     margin = multiply_add(splat(EDGE) * distance, size, splat(FLOOR))
-    positive = at_least(lower_of(lower_of(n0, n1), n2) + margin, splat(ZERO))
-    negative = at_least(margin, higher_of(higher_of(n0, n1), n2))
+    positive = greater_equal(minimum(minimum(n0, n1), n2) + margin, splat(ZERO))
+    negative = greater_equal(margin, maximum(maximum(n0, n1), n2))
     left = (positive | negative | start.undecided) & ((2 << (code & LEAF_MASK)) - 1)
     first = np.int64(int32s(record[BLOCKS])[block + 72])
     closer = np.int64(0)
     while left != 0:
         lane = lowest_bit(left)
         left &= left - 1
-        closer |= np.int64(decide_one(tile, rays, ray, mesh, instance, first + lane))
+        closer |= np.int64(intersect_ray(tile, rays, ray, mesh, instance, first + lane))
     return closer
 
 
-@part(types.void(*7 * WHOLE))
-def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
-    """Cast a ray in a mesh, with `waiting` entries of the tree above in the list of nodes."""
+@called_by_address(types.void(*7 * INT64))
+def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: ignore[no-untyped-def]
+    """Cast a ray at a mesh.
+
+    `pending` is the number of entries of the instance tree that are on the stack.
+    """
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
     codes = int32s(address)
     nodes = int64s(mesh)[NODES]
-    start = _start_of_ray(floats, row_at(first_row, rays) + ray, rays)
+    start = _make_start(floats, row_index(first_row, rays) + ray, rays)
     entry = start.entry
-    t_at = row_at(T, rays) + ray
-    length = floats[row_at(LENGTH, rays) + ray]
+    t_at = row_index(T, rays) + ray
+    length = floats[row_index(LENGTH, rays) + ray]
     limit = _limit_of(floats[t_at] * length, entry)
-    put(stack, codes, waiting, ZERO, 0, 0)
-    count = waiting + 1
-    while count > waiting:
+    write_entry(stack, codes, pending, ZERO, 0, 0)
+    count = pending + 1
+    while count > pending:
         count -= 1
         if stack[ENTRY * count] > limit:
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(
+            count = _push_children(
                 tile, address, nodes, node=code, start=start, limit=limit, count=count
             )
-        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, code=~code, start=start):
+        elif _test_leaf(tile, rays, ray, mesh, instance, code=~code, start=start):
             limit = _limit_of(floats[t_at] * length, entry)
 
 
-@stage
-def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write a ray in the coordinates of the mesh of an instance, whose record is at an address."""
+@noinline
+def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Write a ray in the mesh coordinates of an instance, whose record is given by its address."""
     floats = float64s(tile)
     numbers = int64s(tile)
-    k = row_at(OX, rays) + ray
-    i = row_at(IX, rays) + ray
-    ox, oy, oz, dx, dy, dz, length = enter_instance(
+    k = row_index(OX, rays) + ray
+    i = row_index(IX, rays) + ray
+    ox, oy, oz, dx, dy, dz, length = to_mesh_coordinates(
         float64s(instance),
         ox=floats[k],
         oy=floats[k + rays],
@@ -265,10 +272,10 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
     floats[i + 3 * rays] = dx
     floats[i + 4 * rays] = dy
     floats[i + 5 * rays] = dz
-    floats[row_at(LENGTH, rays) + ray] = length
-    axis, u, v, w, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
-    numbers[row_at(AXIS, rays) + ray] = axis
-    i = row_at(U, rays) + ray
+    floats[row_index(LENGTH, rays) + ray] = length
+    axis, u, v, w, sx, sy, sz = shear_ray(ox, oy, oz, dx, dy, dz)
+    numbers[row_index(AXIS, rays) + ray] = axis
+    i = row_index(U, rays) + ray
     floats[i] = u
     floats[i + rays] = v
     floats[i + 2 * rays] = w
@@ -277,17 +284,17 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
     floats[i + 5 * rays] = sz
 
 
-@part(types.void(*5 * WHOLE))
-def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
-    """Cast a ray at all instances, from the address `nodes` of the tree over the instances."""
+@called_by_address(types.void(*5 * INT64))
+def walk_ray_over_instances(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
+    """Cast a ray at all instances. `nodes` is the address of the nodes of the instance tree."""
     floats = float64s(tile)
     numbers = int64s(tile)
     address = numbers[_STACK]
     stack = float32s(address)
     codes = int32s(address)
-    start = _start_of_ray(floats, row_at(OX, rays) + ray, rays)
-    t_at = row_at(T, rays) + ray
-    put(stack, codes, 0, ZERO, 0, 0)
+    start = _make_start(floats, row_index(OX, rays) + ray, rays)
+    t_at = row_index(T, rays) + ray
+    write_entry(stack, codes, 0, ZERO, 0, 0)
     count = np.int64(1)
     while count > 0:
         count -= 1
@@ -296,13 +303,13 @@ def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(
+            count = _push_children(
                 tile, address, nodes, node=code, start=start, limit=limit, count=count
             )
             continue
         number = ~code >> LEAF_BITS
         record = instances + INSTANCE_BYTES * number
-        _enter(tile, rays, ray, record)
+        _transform_ray(tile, rays, ray, record)
         mesh = int64s(record)[MESH_FIELD]
         key = KEYS_PER_INSTANCE * number
-        walk_by_one(tile, rays, ray, IX, mesh, key, count)
+        walk_ray(tile, rays, ray, IX, mesh, key, count)

@@ -1,4 +1,4 @@
-"""Rays from the caller: checked, in float64, with unit directions."""
+"""Validation and normalization of rays."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Bools, Floats
 
-# A vector with a squared length this close to 1 is a unit vector up to rounding, and is left as it
-# is, so that the last bits of normalized directions do not change.
+# Vectors whose squared length differs from 1 by at most this value count as unit vectors and are
+# not normalized again, so that normalizing twice has no effect.
 UNIT_SLACK = 1e-14
 
-# Rows that are checked at a time, so that extra memory does not grow with the rays.
+# Number of rows that are processed at a time, so that temporary memory does not grow with the rays.
 _BLOCK = 1 << 18
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays that have been checked.
+    """Validated rays.
 
     Attributes
     ----------
     origins
-        (n, 3), or (1, 3) if all rays share an origin, meters.
+        (n, 3), or (1, 3) if all rays share an origin, in meters.
     directions
-        (n, 3), of any length but zero.
+        (n, 3), of any length greater than zero.
     t_min, t_max
-        Closest and farthest distance of a reported hit, meters; both limits count.
+        Minimum and maximum distance of a hit in meters, both inclusive.
     """
 
     origins: Floats
@@ -40,10 +40,11 @@ class Rays:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def part(self, start: int, stop: int) -> Rays:
-        """Convert rays `start` to `stop` for an engine: float64, directions as unit vectors.
+    def normalized(self, start: int, stop: int) -> Rays:
+        """Return rays `start` to `stop` in float64 with unit directions.
 
-        Rays are converted part by part, so that a cast needs memory for a single part only.
+        Backends normalize rays part by part, so that the temporary memory does not grow with the
+        rays.
         """
         origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
         directions = _float64(self.directions[start:stop])
@@ -51,42 +52,42 @@ class Rays:
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
-    """Check the rays of a caller.
+    """Validate rays.
 
-    Raises ValueError for an invalid ray.
+    Raises ValueError if a ray is invalid.
 
     Parameters
     ----------
     origins
-        (3,) or (n, 3), meters.
+        (3,) or (n, 3), in meters.
     directions
         (n, 3), or (3,) for a single ray.
     t_min, t_max
-        Meters, ``0 <= t_min <= t_max``.
+        Minimum and maximum distance in meters, ``0 <= t_min <= t_max``.
     """
     table = _check_directions(directions)
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
 def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
-    """Return checked origins (n, 3), or (1, 3) if shared.
+    """Return validated origins, (n, 3), or (1, 3) if all rays share one.
 
-    Raises ValueError for another shape.
+    Raises ValueError if the shape is wrong or a value is not finite.
     """
-    rows = real_rows("origins", origins)
+    rows = as_real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
         raise ValueError(
             f"origins must have length 1 or the same length as directions, which is {ray_count}, "
             f"but has length {len(rows)}."
         )
-    refuse_rows("Origin", rows, finite_rows, "finite")
+    check_rows("Origin", rows, are_finite, "finite")
     return rows
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """Return the two limits as floats.
+    """Return the minimum and maximum distance as floats.
 
-    Raises ValueError unless ``0 <= t_min <= t_max``.
+    Raises ValueError unless ``0 <= t_min <= t_max`` and `t_min` is finite.
     """
     t_min = float(t_min)
     t_max = float(t_max)
@@ -101,17 +102,17 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 def unit_directions(directions: ArrayLike) -> Floats:
     """Return directions as new float64 unit vectors (n, 3).
 
-    Raises ValueError for zero, NaN and inf.
+    The transposed array is contiguous. Each row of the result depends only on the same row of the
+    input, so that batches can be split anywhere.
 
-    The memory is in columns, so that the transposed array is contiguous.
-    Each row's result depends only on that row, so that batches may be cut anywhere.
+    Raises ValueError if a direction is zero or not finite.
     """
-    table = real_rows("directions", directions)
+    table = as_real_rows("directions", directions)
     columns = np.empty((3, len(table)))
     columns[...] = table.T
     if _are_units(columns):
         return columns.T
-    _refuse_directions(table)
+    _check_nonzero(table)
     result = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
         result[start : start + _BLOCK] = _normalized(_float64(table[start : start + _BLOCK]))
@@ -119,9 +120,9 @@ def unit_directions(directions: ArrayLike) -> Floats:
 
 
 def _normalized(table: Floats) -> Floats:
-    """Normalize checked directions (n, 3), or return the same array if all are unit vectors."""
+    """Return directions (n, 3) as unit vectors. If all are unit vectors, return the same array."""
     x, y, z = table.T
-    # No einsum or norm, which may fuse multiply and add, so the last bit would depend on the
+    # `einsum` and `norm` may use fused multiply-adds, so that the last bit would depend on the
     # machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
@@ -129,7 +130,7 @@ def _normalized(table: Floats) -> Floats:
     if not not_unit.any():
         return table
     rows = table[not_unit]
-    # Squares of 1e200 or 1e-200 overflow or underflow.
+    # Scale the rows first, because squares of very large or small numbers overflow or underflow.
     rows = rows / np.abs(rows).max(axis=1, keepdims=True)
     x, y, z = rows.T
     result = table.copy()
@@ -137,10 +138,10 @@ def _normalized(table: Floats) -> Floats:
     return result
 
 
-def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
-    """Return real numbers (n, *shape), copied only if no array.
+def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
+    """Return an array of real numbers with shape (n, *shape), copied only if necessary.
 
-    A single row may omit n.
+    An array with the shape `shape` counts as a single row.
     """
     rows = np.asarray(values)
     if rows.shape == shape:
@@ -154,19 +155,22 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> An
     return rows
 
 
-def finite_rows(block: Floats) -> Bools:
-    """Return a mask (n,) of the rows (n, 3) that have only finite numbers."""
+def are_finite(block: Floats) -> Bools:
+    """Return a mask (n,) of the rows (n, 3) that contain only finite numbers."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
 
-def refuse_rows(
+def check_rows(
     subject: str,
     table: AnyArray,
     is_valid: Callable[[Floats], Bools],
     expected: str,
 ) -> None:
-    """Raise ValueError for the first row that is not valid, and count the invalid rows in it."""
+    """Raise ValueError if a row is invalid.
+
+    The message contains the first invalid row and the number of invalid rows.
+    """
     invalid = [np.zeros(0, np.intp)]
     for start in range(0, len(table), _BLOCK):
         block = _float64(table[start : start + _BLOCK])
@@ -180,7 +184,7 @@ def refuse_rows(
 
 
 def _are_units(columns: Floats) -> bool:
-    """Return whether all vectors (3, n) are finite unit vectors, which need no further check."""
+    """Return whether all vectors (3, n) are finite unit vectors."""
     x, y, z = columns
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squared = x * x
@@ -191,16 +195,16 @@ def _are_units(columns: Floats) -> bool:
 
 
 def _check_directions(directions: ArrayLike) -> AnyArray:
-    table = real_rows("directions", directions)
-    _refuse_directions(table)
+    table = as_real_rows("directions", directions)
+    _check_nonzero(table)
     return table
 
 
-def _refuse_directions(table: AnyArray) -> None:
-    refuse_rows(
+def _check_nonzero(table: AnyArray) -> None:
+    check_rows(
         "Direction",
         table,
-        lambda block: finite_rows(block) & block.any(axis=1),
+        lambda block: are_finite(block) & block.any(axis=1),
         "finite and nonzero",
     )
 

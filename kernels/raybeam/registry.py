@@ -1,4 +1,4 @@
-"""The list of engines, and the choice of an engine."""
+"""The available backends, and how one of them is selected."""
 
 from __future__ import annotations
 
@@ -21,38 +21,41 @@ def available_backends() -> dict[str, str]:
     >>> available_backends()["numpy"]
     ''
     """
-    return {backend.name: backend.missing() for backend in BACKENDS}
+    return {backend.name: backend.unavailable_reason() for backend in BACKENDS}
 
 
-def backend_build(name: str) -> str:
-    """Return the versions that the bits of a backend's results depend on, besides NumPy's.
+def backend_versions(name: str) -> str:
+    """Return the versions, besides NumPy's, that affect the bits of a backend's results.
 
-    Two processes with equal versions of these and of NumPy give the same hits, to the bit.
-
-    Raises
-    ------
-    ValueError, BackendUnavailable
-        If no backend has that name, or the backend cannot be used on this machine.
-    """
-    return choose(name).build()
-
-
-def choose(name: str) -> type[Backend]:
-    """Return the backend with a name or, for "auto", the first backend that can be used.
+    Two processes with the same versions, and with the same version of NumPy, return bit-identical
+    hits.
 
     Raises
     ------
     ValueError
-        If no backend has that name.
+        If no backend has this name.
+    BackendUnavailable
+        If the backend cannot be used on this machine.
+    """
+    return choose_backend(name).versions()
+
+
+def choose_backend(name: str) -> type[Backend]:
+    """Return the backend with a name, or the first available one if the name is "auto".
+
+    Raises
+    ------
+    ValueError
+        If no backend has this name.
     BackendUnavailable
         If the backend cannot be used on this machine.
     """
     if name == "auto":
-        return next(backend for backend in BACKENDS if not backend.missing())
+        return next(backend for backend in BACKENDS if not backend.unavailable_reason())
     by_name = {backend.name: backend for backend in BACKENDS}
     if name not in by_name:
         raise ValueError(f"Unknown backend {name!r}. The backends are auto, {', '.join(by_name)}.")
-    reason = by_name[name].missing()
+    reason = by_name[name].unavailable_reason()
     if reason:
         raise BackendUnavailable(
             f"Backend {name!r} cannot be used: {reason}. Use 'auto' to select an available backend."

@@ -1,4 +1,4 @@
-"""Scans: rays of a pattern, their poses, and which hits are kept and counted."""
+"""Scans: the rays of a pattern with their poses, and the selection of the hits to store."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Floats, Indices, Integers, Ints, Ints32
-from .hits import Part, ScanReturns, join_hits
+from .hits import HitColumns, ScanReturns, join_hits
 from .pattern import Pattern
-from .pattern_rays import checked_rays
+from .pattern_rays import compute_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MAX_RAYS = 1 << 32  # limit for a scan: numbers of rays in `ScanReturns` have 32 bits
+_MAX_RAYS = 1 << 32  # ray indices in `ScanReturns` have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Checked arguments of `RayCaster.scan`.
+    """Validated arguments of `RayCaster.scan`.
 
     Attributes
     ----------
     pattern
-        Rays in the sensor's axes.
+        Rays in the sensor frame.
     first
         Row of ray 0 in the pattern, which repeats after its last row.
     count
@@ -34,16 +34,16 @@ class Scan:
     poses
         Poses of all rays.
     t_min, t_max
-        Closest and farthest distance of a reported hit, meters; both limits count.
+        Minimum and maximum distance of a hit in meters, both inclusive.
     keep_every
-        Number n: the first and then every n-th hit of each group is kept.
+        The first hit of each group and then every n-th hit are stored.
     groups
-        int64 (g,): number of the first ray of each group; ascending, from 0.
+        int64 (g,): index of the first ray of each group, in ascending order and starting at 0.
     tally
-        Whether to count hits by triangle.
-    room
-        float64 (6, count): output for origins and directions of all rays; (3, count) for
-        directions alone, None for no output.
+        Whether hits are counted per triangle.
+    out
+        float64 (6, count): output array for the origins and directions of all rays, or (3, count)
+        for the directions only. None if they are not needed.
     """
 
     pattern: Pattern
@@ -55,24 +55,27 @@ class Scan:
     keep_every: int
     groups: Ints
     tally: bool
-    room: Floats | None = None
+    out: Floats | None = None
 
     def __len__(self) -> int:
         return self.count
 
     def chunks(self, size: int) -> Iterator[tuple[int, int]]:
-        """Yield half-open ranges of at most `size` rays, in ray order."""
+        """Yield the start and stop of ranges of at most `size` rays, in ray order."""
         for start in range(0, self.count, size):
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `room`, if any."""
+        """Compute rays `start` to `stop`, bit-identical to `pattern_rays`.
+
+        If the scan has an output array, the rays are written to it.
+        """
         ray = np.arange(start, stop, dtype=np.int64)
-        origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
-        if self.room is not None:
-            self.room[-3:, start:stop] = directions.T
-            if len(self.room) > 3:
-                self.room[:3, start:stop] = origins.T
+        origins, directions = compute_rays(self.pattern, self.first, ray, self.poses)
+        if self.out is not None:
+            self.out[-3:, start:stop] = directions.T
+            if len(self.out) > 3:
+                self.out[:3, start:stop] = origins.T
         return Rays(origins, directions, self.t_min, self.t_max)
 
 
@@ -89,11 +92,11 @@ def check_scan(
     groups: ArrayLike | None = None,
     tally: bool = False,
     motion: PoseMotion | None = None,
-    room: Floats | None = None,
+    out: Floats | None = None,
 ) -> Scan:
-    """Check the arguments of a scan.
+    """Validate the arguments of a scan.
 
-    `RayCaster.scan` describes arguments and errors.
+    `RayCaster.scan` describes the arguments and exceptions.
     """
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
@@ -121,14 +124,17 @@ def check_scan(
         keep_every=index(keep_every),
         groups=np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally=tally,
-        room=room,
+        out=out,
     )
 
 
 def host_rays(scan: Scan, start: int, stop: int) -> Floats:
-    """Return origins, meters, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
-    if scan.room is not None:  # the caster has written the rays
-        return np.ascontiguousarray(scan.room[:, start:stop])
+    """Return the origins in meters and directions of rays `start` to `stop` of a scan.
+
+    The result has shape (6, n).
+    """
+    if scan.out is not None:  # The caster has already written the rays.
+        return np.ascontiguousarray(scan.out[:, start:stop])
     scan_rays = scan.rays(start, stop)
     rays = np.empty((6, stop - start))
     rays[:3] = scan_rays.origins.T
@@ -136,97 +142,100 @@ def host_rays(scan: Scan, start: int, stop: int) -> Floats:
     return rays
 
 
-class Groups:
-    """Counts of the hits in each group of rays of a scan that keeps every n-th hit of a group.
+class HitGroups:
+    """Counts the hits in each group of rays, and selects every n-th hit of a group.
 
     Parameters
     ----------
     starts
-        int64 (g,): number of the first ray of each group; ascending, from 0.
+        int64 (g,): index of the first ray of each group, in ascending order and starting at 0.
     keep_every
-        n: the first and then every n-th hit of a group is kept.
+        The first hit of each group and then every n-th hit are stored.
     """
 
     def __init__(self, starts: Ints, keep_every: int) -> None:
         self._starts = starts
         self.keep_every = keep_every
-        self.hit_counts = np.zeros(len(starts), np.int64)  # hits of each group so far
+        self.hit_counts = np.zeros(len(starts), np.int64)  # number of hits in each group so far
 
-    def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
+    def find_groups(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
 
         Returns
         -------
         groups
-            Range of the groups.
+            Range of groups.
         later_starts
-            int64: first ray of each of these groups but the first, counted from `start`.
+            int64: first ray of the second and later of these groups, relative to `start`.
         """
         first = int(np.searchsorted(self._starts, start, side="right")) - 1
         last = int(np.searchsorted(self._starts, stop, side="left"))
         return slice(first, last), self._starts[first + 1 : last] - start
 
-    def count(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
-        """Count the hits of groups in a chunk, and find the hits to keep.
+    def count_hits(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
+        """Count the hits of groups in a chunk, and determine the hits to store.
 
         Parameters
         ----------
-        groups, counts
-            Range of the groups (g), and their numbers of hits in the chunk, int64 (g,).
+        groups
+            Range of g groups.
+        counts
+            int64 (g,): number of hits of each group in the chunk.
 
         Returns
         -------
-        first_kept, kept_counts
-            int64 (g,): index among each group's hits in the chunk of the first hit to keep, and
-            the number of hits to keep.
+        first_kept
+            int64 (g,): index of the first hit to store among the hits of each group in the chunk.
+        kept_counts
+            int64 (g,): number of hits to store.
         """
-        # Hits in the chunks before: not 0 for the first group.
+        # Only the first of these groups can have hits in earlier chunks.
         earlier_hits = self.hit_counts[groups].copy()
         self.hit_counts[groups] += counts
         first_kept = -earlier_hits % self.keep_every
         return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
 
 
-class Collector(Groups):
-    """Collects the hits of a scan, chunk after chunk in ray order.
+class HitCollector(HitGroups):
+    """Collects the hits of a scan, chunk by chunk in ray order.
 
     Parameters
     ----------
     scan
-        The scan, with the selection of hits to keep and the tally to count.
+        The scan, which determines the hits to store and whether hits are counted per triangle.
     face_count
-        Rows of the tally.
+        Number of rows of the tally.
 
     Examples
     --------
     >>> pattern = Pattern([[1, 0, 0]] * 10)
-    >>> collector = Collector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
+    >>> collector = HitCollector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
     >>> ray = np.array([1, 2, 3, 6, 7])
-    >>> ray[collector.keep(ray, 0, 10)].tolist()
+    >>> ray[collector.select_kept(ray, 0, 10)].tolist()
     [1, 3, 6]
     """
 
     def __init__(self, scan: Scan, face_count: int) -> None:
         super().__init__(scan.groups, scan.keep_every)
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
-        self._parts: list[Part] = []
+        self._parts: list[HitColumns] = []
 
-    def keep(self, ray: Integers, start: int, stop: int) -> slice | Indices:
-        """Count the hits of rays `start` to `stop`, and select the hits to keep.
+    def select_kept(self, ray: Integers, start: int, stop: int) -> slice | Indices:
+        """Count the hits of rays `start` to `stop`, and select the hits to store.
 
         Parameters
         ----------
         ray
-            (m,): numbers of the rays that hit, ascending, counted from `start`.
+            (m,): indices of the rays that hit, relative to `start`, in ascending order.
 
         Returns
         -------
-        The selection of kept hits: rows of `ray`, or all.
+        The rows of `ray` to store, as a slice or as indices.
         """
-        groups, later_starts = self.spans(start, stop)
+        groups, later_starts = self.find_groups(start, stop)
         cuts = np.searchsorted(ray, later_starts.astype(ray.dtype))
         cuts = np.concatenate([[0], cuts, [len(ray)]])
-        first_kept, kept_counts = self.count(groups, np.diff(cuts))
+        first_kept, kept_counts = self.count_hits(groups, np.diff(cuts))
         if self.keep_every == 1:
             return slice(None)
         if len(first_kept) == 1:
@@ -236,12 +245,15 @@ class Collector(Groups):
         row_indices += self.keep_every * np.arange(len(row_indices))
         return row_indices
 
-    def tally(self, tally_indices: Integers) -> None:
-        """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
+    def count_triangles(self, tally_indices: Integers) -> None:
+        """Add the hits of a chunk to the tally, given their tally rows (m,).
+
+        Without a tally, the call has no effect.
+        """
         if self._tally is not None:
             np.add.at(self._tally, tally_indices.astype(np.intp), 1)
 
-    def add(
+    def add_hits(
         self,
         start: int,
         ray: Integers,
@@ -249,7 +261,7 @@ class Collector(Groups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add the kept hits of a chunk, whose numbers of rays `ray` are counted from `start`."""
+        """Add the stored hits of a chunk, whose indices `ray` are relative to `start`."""
         ray_number = ray.astype(np.uint32, copy=False)
         ray_number = ray_number + np.uint32(start) if start else ray_number
         self._parts.append((ray_number, distance, triangle, instance))

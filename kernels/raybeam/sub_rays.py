@@ -1,4 +1,4 @@
-"""Sub-rays of a beam, computed from the direction of the beam during a cast."""
+"""Sub-rays of a beam, which are computed from the direction of the beam during a cast."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import Floats, Indices
+from .tile_sizes import VECTOR_RAYS
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class SubRays:
     def __len__(self) -> int:
         return len(self.angles)
 
-    def shares(
+    def components(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
         """Return the forward, lateral and vertical components of the sub-ray directions.
@@ -44,8 +45,8 @@ class SubRays:
         if offsets is not None:
             across = across + offsets[0]
             up = up + offsets[1]
-        straight = 1 / np.sqrt((1 + across * across) + up * up)
-        return straight, across * straight, up * straight
+        forward = 1 / np.sqrt((1 + across * across) + up * up)
+        return forward, across * forward, up * forward
 
     def loop_table(self, offsets: Floats | None) -> Floats:
         """Return the table of sub-rays for compiled loops.
@@ -58,50 +59,58 @@ class SubRays:
         instead.
         """
         rows = np.zeros((5, len(self)))
-        rows[:3] = self.shares()
-        if offsets is not None:  # shares differ by beam
+        rows[:3] = self.components()
+        if offsets is not None:  # The components differ between beams.
             rows[1:3] = self.angles.T
         if self.starts is not None:
             rows[3:] = self.starts.T
-        padded = np.minimum(np.arange(-(-len(self) // 8) * 8), len(self) - 1)
+        padded = np.minimum(np.arange(-(-len(self) // VECTOR_RAYS) * VECTOR_RAYS), len(self) - 1)
         return rows[:, padded]
 
 
-def spread(
-    sub_rays: SubRays, ahead: Floats, subray: Indices, offsets: Floats | None
+def sub_ray_directions(
+    sub_rays: SubRays, beam_directions: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
-    """Return directions (3, m) of sub-rays, and their origins relative to the beams' origins.
+    """Return the directions (3, m) of sub-rays, and their origins relative to the beam origins.
 
     Parameters
     ----------
     sub_rays
-        Sub-rays of every beam.
-    ahead
-        (3, m): direction of the beam of each sub-ray.
+        Sub-rays of each beam.
+    beam_directions
+        (3, m): direction of each sub-ray's beam.
     subray
-        (m,): number of each sub-ray within its beam.
+        (m,): index of each sub-ray within its beam.
     offsets
-        (2, m): angles across and up, radians, added to the angles of each sub-ray; or None.
+        (2, m): angles across and up, in radians, that are added to the angles of each sub-ray. None
+        for no offsets.
 
     Returns
     -------
     directions
         (3, m), unit vectors.
     starts
-        (3, m), meters; None if sub-rays start at the beam's origin.
+        (3, m), in meters. None if sub-rays start at the beam origin.
     """
-    straight, across, up = sub_rays.shares(subray, offsets)
+    forward, across, up = sub_rays.components(subray, offsets)
     axis = sub_rays.axis
-    first, second = any_axes(ahead) if axis is None else axes_about(ahead, axis)
-    directions = (straight * ahead + across * first) + up * second
+    first, second = (
+        perpendicular_axes(beam_directions)
+        if axis is None
+        else oriented_axes(beam_directions, axis)
+    )
+    directions = (forward * beam_directions + across * first) + up * second
     if sub_rays.starts is None:
         return directions, None
-    aside, above = sub_rays.starts[subray].T
-    return directions, aside * first + above * second
+    lateral, vertical = sub_rays.starts[subray].T
+    return directions, lateral * first + vertical * second
 
 
-def any_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Return two axes across unit directions (3, n), by Duff et al. 2017: defined everywhere."""
+def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
+    """Return two axes (3, n) each that are perpendicular to unit directions (3, n).
+
+    The method of Duff et al. (2017) works for all directions.
+    """
     x, y, z = directions
     sign = np.where(z < 0, -1.0, 1.0)
     a = -1.0 / (sign + z)
@@ -110,10 +119,11 @@ def any_axes(directions: Floats) -> tuple[Floats, Floats]:
     return first, np.stack([b, sign + y * y * a, -y])
 
 
-def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Return axes across unit directions (3, n): counter-clockwise about an axis, and upward.
+def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
+    """Return two axes perpendicular to unit directions (3, n), oriented by an axis (3,).
 
-    For directions parallel to the axis (3,), the two are the axes of `any_axes`.
+    The first one points counterclockwise about the axis and the second one upward along it. For
+    directions parallel to the axis, they are the axes of `perpendicular_axes`.
     """
     x, y, z = directions
     a, b, c = axis
@@ -124,5 +134,5 @@ def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
     upward = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
     parallel = length < 1e-6
     if parallel.any():
-        unit_across[:, parallel], upward[:, parallel] = any_axes(directions[:, parallel])
+        unit_across[:, parallel], upward[:, parallel] = perpendicular_axes(directions[:, parallel])
     return unit_across, upward

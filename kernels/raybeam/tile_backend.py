@@ -1,4 +1,4 @@
-"""Ray casting by tiles of neighboring rays, in loops that numba compiles: on every processor."""
+"""Ray casting with tiles of neighboring rays, in loops that numba compiles for any CPU."""
 
 from __future__ import annotations
 
@@ -13,58 +13,63 @@ import numpy as np
 
 from .arrays import AnyArray, Floats
 from .backend import Backend, ClosestHits
-from .crossing import Crossing, Nearest
-from .hits import Part, join_hits
+from .body_rays import NearestHits, RayBodyPairs
+from .hits import HitColumns, join_hits
 from .installation import install_command
-from .instances import Scene
+from .instances import LocalScene
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
-from .tile_plan import TilePlan, consecutive, plan_tiles
+from .tile_plan import TilePlan, plan_consecutive, plan_tiles
 
 if TYPE_CHECKING:
-    from .cast_memory import Cast
+    from .cast_record import CastRecord
 
-_SHARE = 1 << 14  # rays that a thread casts in a call, if there are several threads
-_BODY_RAYS = 64  # rays per tile of rays at bodies
-_MAX_PLANS = 16
+_SHARE = 1 << 14  # number of rays that a thread casts at a time, if there are several threads
+_BODY_RAYS = 64  # rays per tile if rays are cast at bodies
+_MAX_PLANS = 16  # cached tile plans
 
 
 class TileBackend(Backend):
-    """Tiles of rays in float32, whose candidates the watertight test in float64 decides.
+    """Traversal by tiles of rays in float32, followed by the watertight test in float64.
 
-    Margins cover all rounding in float32, so hits have the bits of the numpy backend.
+    The margins of the float32 tests exceed all rounding errors, so the hits have the same bits as
+    those of the numpy backend.
     """
 
     name: ClassVar[str] = "tiles"
-    chunk: ClassVar[int] = 1 << 17  # rays; hits take 20 bytes a ray, until chunks are joined
+    chunk: ClassVar[int] = 1 << 17  # Hits take 20 bytes per ray until the chunks are joined.
 
     @classmethod
-    def missing(cls) -> str:
+    def unavailable_reason(cls) -> str:
         """Return why numba cannot be used and the remedy, or "" if it can be used."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed; run {install_command('numba')}"
         return ""
 
-    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
-        from . import cast_memory, mesh_loops, tile_casts, tile_memory, tile_tree
+    def __init__(
+        self, scene: LocalScene, threads: int | None = None, device: int | None = None
+    ) -> None:
+        from . import cast_record, mesh_loops, tile_casts, tile_memory, tile_tree
 
         super().__init__(scene, threads, device)
         self._count = threads or os.cpu_count() or 1
-        self._threads = ThreadPoolExecutor(self._count, "tiles")  # threads start on first use
+        # Threads are started on first use.
+        self._threads = ThreadPoolExecutor(self._count, "tiles")
         self._process = os.getpid()
         self._loops = tile_casts
-        self._weigh = mesh_loops.weigh
-        self._memory = cast_memory
+        self._weigh = mesh_loops.barycentric_weights
+        self._memory = cast_record
         self._tiles = tile_memory.thread_tiles
-        self._top_nodes = tile_tree.top_nodes
-        self._trees = [tile_tree.tile_tree(mesh.corners) for mesh in scene.meshes]
-        self._waiting = 2 + max(tree.stack for tree in self._trees)
+        self._top_nodes = tile_tree.build_instance_nodes
+        self._trees = [tile_tree.build_tile_tree(mesh.corners) for mesh in scene.meshes]
+        self._pending_nodes = 2 + max(tree.stack for tree in self._trees)
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = self._mesh_records(scene)
-        # Row of each triangle in the caller's `faces`, by row of the corners of all meshes.
+        # The index of each triangle in the caller's `faces`, in the order of the corners of all
+        # meshes.
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
-        cast = np.zeros(1, cast_memory.CAST)
+        cast = np.zeros(1, cast_record.CAST)
         cast["mesh"] = self._meshes.ctypes.data
         cast["index"] = self._index.ctypes.data
         self._records = self._instance_records(scene)
@@ -74,7 +79,7 @@ class TileBackend(Backend):
         self._plans: dict[tuple[int, int, int], tuple[ref[AnyArray], TilePlan]] = {}
         self.update_scene(scene)
 
-    def _mesh_records(self, scene: Scene) -> AnyArray:
+    def _mesh_records(self, scene: LocalScene) -> AnyArray:
         """Return a `MESH` record for each mesh of a scene."""
         records = np.zeros(len(scene.meshes), self._memory.MESH)
         for record, mesh, tree, corners in zip(
@@ -91,16 +96,16 @@ class TileBackend(Backend):
                 record["mask_height"], record["mask_width"] = opacity.mask.shape
         return records
 
-    def _instance_records(self, scene: Scene) -> AnyArray:
-        """Return an `INSTANCE` record for each instance of a scene, without matrices."""
+    def _instance_records(self, scene: LocalScene) -> AnyArray:
+        """Return an `INSTANCE` record for each instance of a scene, without its matrix."""
         records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
         first_rows = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
         records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
         records["first"] = first_rows[scene.mesh]
         return records
 
-    def update_scene(self, scene: Scene) -> None:
-        """Replace the scene by a scene of the same instances with new transforms."""
+    def update_scene(self, scene: LocalScene) -> None:
+        """Replace the scene with a scene that has the same instances but new transforms."""
         super().update_scene(scene)
         frame = scene.frame
         base = self._base
@@ -112,36 +117,32 @@ class TileBackend(Backend):
             base["top"] = self._top.ctypes.data
             self._records["matrix"] = scene.matrices
 
-    def closest(self, rays: Rays) -> ClosestHits:
+    def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
         cast = self._ray_cast(rays)
-        cast.record["index"] = 0  # hits get the row of the corners, which `weigh` needs
-        ray, distance, row, instance = self._cast(cast, 0, len(rays), consecutive(1))
+        cast.record["index"] = 0  # Return rows of the corners, for `barycentric_weights`.
+        ray, distance, row, instance = self._cast(cast, 0, len(rays), plan_consecutive(1))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
         self._weigh(cast.record, origins, directions, row, instance, u=u, v=v)
-        t = distance * self._scene.frame.scale  # local; exact, since the scale is a power of two
+        t = distance * self._scene.frame.scale  # exact, because the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
-    def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast pairs of a ray and a body on this scene, the shape that the bodies share.
-
-        Hits nearer than those in `nearest` replace these.
-        """
+    def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
+        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
         record = self._base.copy()
         scale = self._scene.frame.scale
-        record["t_min"], record["t_max"] = self._reach(crossing.limits, scale)
-        record["tile"] = self._tile(_BODY_RAYS)
-        self._loops.cast_crossing(record, crossing.contiguous(), nearest)
+        record["t_min"], record["t_max"] = self._local_limits(pairs.limits, scale)
+        record["tile"] = self._tile_address(_BODY_RAYS)
+        self._loops.cast_pairs(record, pairs.contiguous(), nearest)
 
-    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
-        """Yield ranges of rays of a scan, and the hits of each range.
+    def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
+        """Yield consecutive parts of a scan, each as first ray, end, and hits.
 
-        Yields start and stop of the range, and a `Part`: hits in ray order, whose rays are numbered
-        from start.
+        The ray indices of the hits start at 0 in each part.
         """
         cast = self._scan_cast(scan)
         plan = self._plan(scan)
@@ -149,8 +150,8 @@ class TileBackend(Backend):
             yield start, stop, self._cast(cast, start, stop, plan)
 
     def _plan(self, scan: Scan) -> TilePlan:
-        """Return the tiles that scans of the same beams share, or new ones if none exist."""
-        beams = np.asarray(scan.pattern.directions.base)  # shared by copies of a pattern
+        """Return the tile plan of a scan, which is cached for scans with the same beams."""
+        beams = np.asarray(scan.pattern.directions.base)  # Copies of a pattern share this array.
         key = id(beams), scan.pattern.subrays_per_beam, len(scan)
         known = self._plans.get(key)
         if known is not None and known[0]() is beams:
@@ -161,61 +162,64 @@ class TileBackend(Backend):
         self._plans[key] = ref(beams), plan
         return plan
 
-    def _tile(self, rays: int) -> int:
-        """Return the address of this thread's memory for tiles of a number of rays."""
+    def _tile_address(self, rays: int) -> int:
+        """Return the address of this thread's tile memory for a number of rays."""
         nested = self._scene.nested
-        waiting = self._waiting + (self._top_stack if nested else 0)
-        return self._tiles.address(rays, waiting, len(self._scene.mesh) if nested else 0)
+        pending = self._pending_nodes + (self._top_stack if nested else 0)
+        return self._tiles.address(rays, pending, len(self._scene.mesh) if nested else 0)
 
     @staticmethod
-    def _reach(limits: tuple[float, float], scale: float) -> tuple[float, float]:
-        """Return the limits of distances, local.
+    def _local_limits(limits: tuple[float, float], scale: float) -> tuple[float, float]:
+        """Convert distance limits from meters to local coordinates.
 
-        The farthest is finite, since infinity means that nothing was hit.
+        The maximum distance is made finite, because infinity stands for no hit.
         """
         t_min, t_max = limits
         return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
 
-    def _ray_cast(self, rays: Rays) -> Cast:
-        """Return the `Cast` of rays that are not of a pattern.
+    def _ray_cast(self, rays: Rays) -> CastRecord:
+        """Return the `CastRecord` of rays that do not belong to a pattern.
 
-        Each ray becomes a beam, seen from a single pose.
+        Each ray becomes a beam, and all beams are cast from a single pose.
         """
         origins: Floats | None = rays.origins
         position = np.zeros((1, 3))
         if len(rays.origins) == 1:
             position = rays.origins
             origins = None
-        cast = self._memory.Cast(self._base)
+        cast = self._memory.CastRecord(self._base)
         poses = Poses(position, None, max(len(rays), 1))
         cast.set_beams(rays.directions, origins, poses, 0)
         self._set_limits(cast, (rays.t_min, rays.t_max))
         return cast
 
-    def _scan_cast(self, scan: Scan) -> Cast:
-        """Return the `Cast` of a scan, whose loops also write the rays to `scan.room`, if any."""
-        cast = self._memory.Cast(self._base)
+    def _scan_cast(self, scan: Scan) -> CastRecord:
+        """Return the `CastRecord` of a scan.
+
+        If the scan has an output array, the compiled loops also write the rays to it.
+        """
+        cast = self._memory.CastRecord(self._base)
         cast.set_pattern(scan.pattern, scan.poses, scan.first)
-        if scan.room is not None:
-            cast.record["directions_out"] = scan.room[-3:].ctypes.data
+        if scan.out is not None:
+            cast.record["directions_out"] = scan.out[-3:].ctypes.data
             cast.record["ray_count"] = len(scan)
-            if len(scan.room) > 3:
-                cast.record["origins_out"] = scan.room.ctypes.data
+            if len(scan.out) > 3:
+                cast.record["origins_out"] = scan.out.ctypes.data
                 if cast.record["shares_origin"]:
-                    scan.room[:3] = scan.poses.positions.T
+                    scan.out[:3] = scan.poses.positions.T
         self._set_limits(cast, (scan.t_min, scan.t_max))
         return cast
 
-    def _set_limits(self, cast: Cast, limits: tuple[float, float]) -> None:
-        """Write the limits of distances, meters, to a cast."""
+    def _set_limits(self, cast: CastRecord, limits: tuple[float, float]) -> None:
+        """Set the minimum and maximum distance of a cast, given in meters."""
         record = cast.record
-        record["t_min"], record["t_max"] = self._reach(limits, self._scene.frame.scale)
+        record["t_min"], record["t_max"] = self._local_limits(limits, self._scene.frame.scale)
 
-    def _cast(self, cast: Cast, start: int, stop: int, plan: TilePlan) -> Part:
-        """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
+    def _cast(self, cast: CastRecord, start: int, stop: int, plan: TilePlan) -> HitColumns:
+        """Return the hits of rays `start` to `stop` in ray order, with ray indices that start at 0.
 
-        Distances are in meters; `triangle` is the row in the caller's faces, or the row of the
-        corners if `index` of the record is 0.
+        Distances are in meters. `triangle` is the index in the caller's faces, or the row of the
+        corners if the field `index` of the record is 0.
         """
         n = stop - start
         ray = np.empty(n, np.uint32)
@@ -223,13 +227,13 @@ class TileBackend(Backend):
         triangle = np.empty(n, np.int32)
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
-        def cast_share(begin: int) -> Part:
-            """Return the hits of `share` rays from `begin`, as views of the memory of all rays."""
+        def cast_share(begin: int) -> HitColumns:
+            """Return the hits of `share` rays, starting at `begin`, as views of the outputs."""
             record = cast.record.copy()
             row = begin - start
             hits = np.empty(2 * (min(share, stop - begin) + 1))
             record["hits"] = hits.ctypes.data
-            record["tile"] = self._tile(plan.rays)
+            record["tile"] = self._tile_address(plan.rays)
             record["tile_rays"] = plan.rays
             record["lanes"] = plan.lanes.ctypes.data
             record["shifts"] = plan.shifts.ctypes.data
@@ -241,7 +245,7 @@ class TileBackend(Backend):
             record["distance"] = distance[row:].ctypes.data
             record["triangle"] = triangle[row:].ctypes.data
             record["instance"] = instance[row:].ctypes.data
-            count = self._loops.trace(record, begin, min(begin + share, stop))
+            count = self._loops.cast_rays(record, begin, min(begin + share, stop))
             part = slice(row, row + count)
             return ray[part], distance[part], triangle[part], instance[part]
 
@@ -250,7 +254,8 @@ class TileBackend(Backend):
         if self._count == 1 or n <= share:
             share = n
             return cast_share(start)
-        if self._process != os.getpid():  # a fork, which has no threads of its parent
+        # A forked process does not have the threads of its parent.
+        if self._process != os.getpid():
             self._threads = ThreadPoolExecutor(self._count, "tiles")
             self._process = os.getpid()
         return join_hits(list(self._threads.map(cast_share, range(start, stop, share))))

@@ -1,7 +1,7 @@
-"""The loops that cast scans, and rays at moving bodies, tile by tile, with hits in ray order.
+"""Compiled loops that cast scans, and rays at moving bodies, tile by tile.
 
-tile_plan.py says which rays form tiles. The hits of a call go to memory by their numbers; then they
-are written in the order of rays.
+tile_plan.py determines which rays form a tile. The hits of a call are first stored by ray index and
+then written to the output in ray order.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from . import cast_memory as memory
-from .cast_memory import (
+from . import cast_record as memory
+from .cast_record import (
     FIRST_ROW_FIELD,
     INSTANCE_BYTES,
     KEYS_PER_INSTANCE,
@@ -18,35 +18,36 @@ from .cast_memory import (
     int32s,
     int64s,
 )
-from .compiled import compiled, inlined, stage
+from .compiled import compiled, inlined, noinline
 from .moving_loops import (
-    CROSSING,
-    NEAREST,
+    NEAREST_HITS,
     PADS_M,
+    PAIRS,
     box_corners,
-    passes_box,
+    intersects_box,
     pose_rotation,
     to_body_axes,
 )
-from .ray_loops import make_rays, share_origin
+from .ray_loops import make_rays, write_shared_origin
 from .rays import UNIT_SLACK
 from .tile_loops import cast_tile
-from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, at, row_at
+from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, T, field_index, row_index
+from .tile_sizes import SUBTILES
 
-_T_MIN = at("t_min")
-_TILE_RAYS = 8 * SUBTILES  # rays per tile of rays at bodies
+_T_MIN = field_index("t_min")
+_TILE_RAYS = 8 * SUBTILES  # rays per tile if rays are cast at bodies
 
 
-@stage
+@noinline
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
-    """Write the numbers of a tile's rays, and return whether it has one of the `count` rays.
+    """Write the ray indices of a tile, and return whether any of them belongs to the call.
 
-    `first` is added to the numbers at the address `lanes`. A number below 0 or from `count` on
-    belongs to a ray that is cast with the tile, for nothing.
+    The indices are `first` plus the numbers at the address `lanes`. An index below 0, or not below
+    `count`, belongs to a ray that is cast with the tile but ignored.
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)
-    row = row_at(NUMBER, rays)
+    row = row_index(NUMBER, rays)
     exists = np.int64(0)
     for lane in range(rays):
         number = first + lane_numbers[lane]
@@ -55,15 +56,18 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
     return exists != 0
 
 
-@stage
-def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
-    """Write reaches and no hits to the rays of a tile, with reach -1 for rays outside the call."""
+@noinline
+def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
+    """Clear the hits of a tile, and set the maximum distance of each ray.
+
+    The maximum distance is -1 for rays that do not belong to the call.
+    """
     floats = float64s(tile)
     numbers = int64s(tile)
-    t_at = row_at(T, rays)
-    key_at = row_at(KEY, rays)
-    length_at = row_at(LENGTH, rays)
-    number_at = row_at(NUMBER, rays)
+    t_at = row_index(T, rays)
+    key_at = row_index(KEY, rays)
+    length_at = row_index(LENGTH, rays)
+    number_at = row_index(NUMBER, rays)
     for k in range(rays):
         number = numbers[number_at + k]
         floats[t_at + k] = t_max if (number >= 0) & (number < count) else -1.0
@@ -71,16 +75,19 @@ def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
         numbers[key_at + k] = -1
 
 
-@stage
-def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
-    """Write the hits of a tile to the memory of the call's `count` rays, others to its last row."""
+@noinline
+def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
+    """Store the hits of a tile in the scratch memory of a call with `count` rays.
+
+    Hits of rays that do not belong to the call go to an additional last row.
+    """
     floats = float64s(tile)
     numbers = int64s(tile)
     distances = float64s(hits)
     keys = int64s(hits + 8 * (count + 1))
-    t_at = row_at(T, rays)
-    key_at = row_at(KEY, rays)
-    number_at = row_at(NUMBER, rays)
+    t_at = row_index(T, rays)
+    key_at = row_index(KEY, rays)
+    number_at = row_index(NUMBER, rays)
     for lane in range(rays):
         number = numbers[number_at + lane]
         ray = number if (number >= 0) & (number < count) else count
@@ -89,8 +96,11 @@ def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
-def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Cast rays `start` to `stop` of a `CAST`, write hits in ray order, return their number."""
+def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Cast rays `start` to `stop` of a `CAST`, and return the number of hits.
+
+    The hits are written to the outputs of the `CAST` in ray order.
+    """
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -110,8 +120,8 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
     triangle_out = int32s(cast.triangle)
     instance_out = int32s(cast.instance)
     if cast.shares_origin != 0:
-        share_origin(cast, tile, rays)
-    lead = (cast.first + start) % firing  # the call may start within a firing
+        write_shared_origin(cast, tile, rays)
+    lead = (cast.first + start) % firing  # rays of the first firing that precede the call
     firing_count = -(-(count + lead) // firing)
     max_shift = np.int64(0)
     for group in range(cast.groups):
@@ -121,9 +131,9 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
             number = (column * cast.firings - shifts[group]) * firing - lead
             if _number_rays(tile, rays, cast.lanes + 8 * rays * group, number, count):
                 make_rays(address, start, rays, count)
-                _reset(tile, rays, cast.t_max, count)
+                _clear_hits(tile, rays, cast.t_max, count)
                 cast_tile(tile, rays, cast.mesh, instances, cast.top, rays)
-                _keep_hits(tile, rays, cast.hits, count)
+                _store_hits(tile, rays, cast.hits, count)
     hit_count = 0
     for k in range(count):
         key = keys[k]
@@ -144,10 +154,10 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
 
 @inlined
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
-    """Write a ray to a lane of a tile, in local coordinates, and return its direction's length.
+    """Write a ray to a lane of a tile in local coordinates, and return the length of its direction.
 
-    `origin`, meters, and `direction` are in the axes of the body. The length is 1 but for a sensor
-    that turns during a pose.
+    `origin`, in meters, and `direction` are in the frame of the body. The length differs from 1
+    only if the sensor rotates while the rays of a pose are fired.
     """
     scale = cast.scale
     center = cast.center
@@ -163,7 +173,7 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
         u = u / norm
         v = v / norm
         w = w / norm
-    k = row_at(OX, _TILE_RAYS) + lane
+    k = row_index(OX, _TILE_RAYS) + lane
     floats[k] = (origin[0] - center[0]) * scale
     floats[k + _TILE_RAYS] = (origin[1] - center[1]) * scale
     floats[k + 2 * _TILE_RAYS] = (origin[2] - center[2]) * scale
@@ -174,41 +184,42 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 
 @inlined
-def _fill_up(tile, filled):  # type: ignore[no-untyped-def]
-    """Write copies of the first ray to the lanes after `filled`, the number of a tile's rays.
+def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
+    """Fill the lanes of a tile after the first `filled` rays with copies of the first ray.
 
-    Their reach is -1. All rays have no hits.
+    The maximum distance of the copies is -1, so that they are not cast. The hits of all rays are
+    cleared.
     """
     floats = float64s(tile)
     numbers = int64s(tile)
     for lane in range(_TILE_RAYS):
-        numbers[row_at(KEY, _TILE_RAYS) + lane] = -1
-        floats[row_at(LENGTH, _TILE_RAYS) + lane] = 1.0
+        numbers[row_index(KEY, _TILE_RAYS) + lane] = -1
+        floats[row_index(LENGTH, _TILE_RAYS) + lane] = 1.0
     for lane in range(filled, _TILE_RAYS):
-        floats[row_at(T, _TILE_RAYS) + lane] = -1.0
+        floats[row_index(T, _TILE_RAYS) + lane] = -1.0
     for field in range(6):
-        k = row_at(OX + field, _TILE_RAYS)
+        k = row_index(OX + field, _TILE_RAYS)
         for lane in range(filled, _TILE_RAYS):
             floats[k + lane] = floats[k]
 
 
 @inlined
-def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the hits of a tile's first `filled` rays to a `Nearest`, where they are nearer."""
+def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Record the hits of a tile's first `filled` rays in a `NearestHits`, where they are closer."""
     numbers = int64s(cast.tile)
     floats = float64s(cast.tile)
     index = int32s(cast.index)
     meter = 1.0 / cast.scale
     distance, bodies, instance, triangle = nearest
-    t_at = row_at(T, _TILE_RAYS)
-    key_at = row_at(KEY, _TILE_RAYS)
-    pair_at = row_at(NUMBER, _TILE_RAYS)
-    norm_at = row_at(NORM, _TILE_RAYS)
+    t_at = row_index(T, _TILE_RAYS)
+    key_at = row_index(KEY, _TILE_RAYS)
+    pair_at = row_index(NUMBER, _TILE_RAYS)
+    norm_at = row_index(NORM, _TILE_RAYS)
     for lane in range(filled):
         key = numbers[key_at + lane]
         pair = numbers[pair_at + lane]
-        ray = crossing.row[pair]
-        body = crossing.body[pair]
+        ray = pairs.row[pair]
+        body = pairs.body[pair]
         meters = floats[t_at + lane] * meter / floats[norm_at + lane]
         nearer = meters < distance[ray] or (meters == distance[ray] and body < bodies[ray])
         if key < 0 or not nearer:
@@ -224,39 +235,40 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
         triangle[ray] = index[row]
 
 
-@compiled(types.void(memory.CASTS, CROSSING, NEAREST))
-def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Cast the pairs of a `Crossing` with a `CAST`, and write nearer hits to a `Nearest`.
+@compiled(types.void(memory.CASTS, PAIRS, NEAREST_HITS))
+def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Cast pairs of rays and bodies with a `CAST`, and record closer hits in a `NearestHits`.
 
-    A pair whose ray misses the body's box, or ends before the box, takes no lane of a tile.
+    If a ray misses the bounding box of the body, or ends in front of it, the pair does not occupy a
+    lane of a tile.
     """
     cast = casts[0]
     tile = cast.tile
     numbers = int64s(tile)
     floats = float64s(tile)
-    rays = crossing.rays
-    poses = crossing.poses
-    row = crossing.row
-    bodies = crossing.body
+    rays = pairs.rays
+    poses = pairs.poses
+    row = pairs.row
+    bodies = pairs.body
     floats[_T_MIN] = cast.t_min
-    corners = box_corners(float64s(crossing.box.ctypes.data))
-    pair_at = row_at(NUMBER, _TILE_RAYS)
-    norm_at = row_at(NORM, _TILE_RAYS)
-    t_at = row_at(T, _TILE_RAYS)
+    corners = box_corners(float64s(pairs.box.ctypes.data))
+    pair_at = row_index(NUMBER, _TILE_RAYS)
+    norm_at = row_index(NORM, _TILE_RAYS)
+    t_at = row_index(T, _TILE_RAYS)
     pair = 0
     while pair < len(row):
         filled = 0
         body = bodies[pair]
         while filled < _TILE_RAYS and pair < len(row) and bodies[pair] == body:
             k = row[pair]
-            p = crossing.pose[pair]
+            p = pairs.pose[pair]
             rotation = pose_rotation(poses, p)
             x = rays[0, k] - poses[0, p]
             y = rays[1, k] - poses[1, p]
             z = rays[2, k] - poses[2, p]
             origin = to_body_axes(rotation, x, y, z)
             direction = to_body_axes(rotation, rays[3, k], rays[4, k], rays[5, k])
-            if passes_box(corners, PADS_M, nearest.distance[k], origin, direction):
+            if intersects_box(corners, PADS_M, nearest.distance[k], origin, direction):
                 norm = _write_ray(cast, floats, filled, origin, direction)
                 floats[norm_at + filled] = norm
                 reach = nearest.distance[k] * norm * cast.scale * (1 + 2.0**-40)
@@ -265,10 +277,10 @@ def cast_crossing(casts, crossing, nearest):  # type: ignore[no-untyped-def]  # 
                 filled += 1
             pair += 1
         if filled != 0:
-            _fill_up(tile, filled)
+            _fill_lanes(tile, filled)
             cast_tile(tile, _TILE_RAYS, cast.mesh, cast.instances, cast.top, filled)
-            _write_hits(cast, crossing, nearest, filled)
+            _write_hits(cast, pairs, nearest, filled)
 
 
-# Whether this process compiled the loops; otherwise numba loaded the code of an earlier process.
-COMPILED = bool(trace.stats.cache_misses)
+# Whether this process compiled the loops. Otherwise, numba loaded them from its cache.
+COMPILED = bool(cast_rays.stats.cache_misses)

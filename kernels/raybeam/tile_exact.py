@@ -1,4 +1,4 @@
-"""The test of triangle.py for rays of a tile, one or four at a time, in float64."""
+"""The intersection test of triangle.py in float64, for one or four rays of a tile."""
 
 from __future__ import annotations
 
@@ -6,42 +6,43 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import LEAF_CORNERS, MASK_HEIGHT, ORDER, float64s, int32s, int64s
-from .compiled import WHOLE, inlined, part, stage
+from .cast_record import LEAF_CORNERS, MASK_HEIGHT, ORDER, float64s, int32s, int64s
+from .compiled import INT64, called_by_address, inlined, noinline
 from .mesh_loops import is_opaque
-from .tile_memory import AXIS, KEY, LENGTH, SX, T, U, at, row_at
-from .triangle_loops import PlaneHit, shear
+from .tile_memory import AXIS, KEY, LENGTH, SX, T, U, field_index, row_index
+from .triangle_loops import PlaneHit, shear_ray
 from .vectors import (
     absolute,
-    at_least,
-    higher_of,
+    greater_equal,
     load,
-    lower_of,
     lowest_bit,
+    maximum,
+    minimum,
     splat,
     splat_bits,
     store,
-    write_where,
+    store_masked,
 )
 
-_T_MIN = at("t_min")
-_NESTED = at("nested")
+_T_MIN = field_index("t_min")
+_NESTED = field_index("nested")
 
 
-@part(types.void(*3 * WHOLE))
+@called_by_address(types.void(*3 * INT64))
 def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the shear of rays, and the common longest axis of each eight rays, -1 if they differ.
+    """Write the shear of all rays of a tile.
 
-    `first_row` is the first of six rows with origins and directions.
+    Also write the longest axis that each group of eight rays has in common, or -1 if their longest
+    axes differ. `first_row` is the first of six rows with origins and directions.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
-    axis_at = row_at(AXIS, rays)
-    o = row_at(first_row, rays)
-    d = row_at(first_row + 3, rays)
-    u_at = row_at(U, rays)
-    s_at = row_at(SX, rays)
-    eight_at = row_at(memory.AXIS_OF_EIGHT, rays)
+    axis_at = row_index(AXIS, rays)
+    o = row_index(first_row, rays)
+    d = row_index(first_row + 3, rays)
+    u_at = row_index(U, rays)
+    s_at = row_index(SX, rays)
+    eight_at = row_index(memory.AXIS_OF_EIGHT, rays)
     one = splat(1.0)
     for start in range(0, rays, 8):
         common = np.int64(-2)
@@ -49,8 +50,8 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
             x = absolute(load(floats, d + k))
             y = absolute(load(floats, d + rays + k))
             z = absolute(load(floats, d + 2 * rays + k))
-            along_x = at_least(x, y) & at_least(x, z)
-            along_y = at_least(y, z) & (15 ^ along_x)
+            along_x = greater_equal(x, y) & greater_equal(x, z)
+            along_y = greater_equal(y, z) & (15 ^ along_x)
             axis = np.int64(-1)
             if along_x == 15:
                 axis = np.int64(0)
@@ -61,7 +62,7 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
             if axis < 0:
                 common = np.int64(-1)
                 for i in range(k, k + 4):
-                    longest, p, q, r, sx, sy, sz = shear(
+                    longest, p, q, r, sx, sy, sz = shear_ray(
                         floats[o + i],
                         floats[o + rays + i],
                         floats[o + 2 * rays + i],
@@ -94,8 +95,8 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
 
 @inlined
 def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
-    """Return the shear of a ray without the axis: 6 numbers."""
-    k = row_at(U, rays) + ray
+    """Return the sheared coordinates of a ray as six numbers, without the axis."""
+    k = row_index(U, rays) + ray
     return (
         floats[k],
         floats[k + rays],
@@ -106,19 +107,19 @@ def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
     )
 
 
-@stage
-def decide_one(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test a ray and a triangle in float64, keep a closer hit, and return whether it is kept.
+@noinline
+def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Test a ray against a triangle in float64, and return whether it is a closer hit.
 
-    `instance` is the instance's number times `KEYS_PER_INSTANCE`, `position` of the triangle in
-    leaf order.
+    A closer hit is recorded in the tile. `instance` is the index of the instance times
+    `KEYS_PER_INSTANCE`, and `position` is the position of the triangle in leaf order.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
     record = int64s(mesh)
     corners = float64s(record[LEAF_CORNERS])
     order = int32s(record[ORDER])
-    axis = numbers[row_at(AXIS, rays) + ray]
+    axis = numbers[row_index(AXIS, rays) + ray]
     u, v, w, sx, sy, sz = _ray_shear(floats, rays, ray)
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0
@@ -137,33 +138,34 @@ def decide_one(tile, rays, ray, mesh, instance, position):  # type: ignore[no-un
     c = x1 * y0 - y1 * x0
     det = (a + b) + c
     t = (((a * z0 + b * z1) + c * z2) / det) * sz
-    t = t / floats[row_at(LENGTH, rays) + ray]
+    t = t / floats[row_index(LENGTH, rays) + ray]
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
-    nearest = floats[row_at(T, rays) + ray]
+    nearest = floats[row_index(T, rays) + ray]
     if not (inside & (det != 0) & (t >= floats[_T_MIN]) & (t <= nearest)):
         return False
     row = np.int64(order[position])
     key = instance + row
-    known = numbers[row_at(KEY, rays) + ray]
+    known = numbers[row_index(KEY, rays) + ray]
     if t == nearest and 0 <= known <= key:
         return False
     if record[MASK_HEIGHT] != 0 and not is_opaque(record, row, PlaneHit(a, b, c, det, t)):
         return False
-    floats[row_at(T, rays) + ray] = t
-    numbers[row_at(KEY, rays) + ray] = key
+    floats[row_index(T, rays) + ray] = t
+    numbers[row_index(KEY, rays) + ray] = key
     return True
 
 
 @inlined
-def decide_four(tile, rays, ray, axis, corners, position, key):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test four rays from a number on as `decide_one`, and return the mask of rays that hit.
+def intersect_four_rays(tile, rays, ray, axis, corners, position, key):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Test four consecutive rays against a triangle, and return the mask of rays with closer hits.
 
-    The rays have the longest axis `axis`, and the mesh has no mask. `corners` points to the corners
-    of the mesh in leaf order, `key` is of the triangle.
+    The rays must have the same longest axis `axis`, and the mesh must not have a mask. `corners`
+    points to the corners of the mesh in leaf order, and `key` is the key of the triangle. Hits are
+    recorded as in `intersect_ray`.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
-    i = row_at(U, rays) + ray
+    i = row_index(U, rays) + ray
     u = load(floats, i)
     v = load(floats, i + rays)
     w = load(floats, i + 2 * rays)
@@ -188,23 +190,23 @@ def decide_four(tile, rays, ray, axis, corners, position, key):  # type: ignore[
     det = (a + b) + c
     t = (((a * z0 + b * z1) + c * z2) / det) * sz
     if numbers[_NESTED] != 0:
-        t = t / load(floats, row_at(LENGTH, rays) + ray)
+        t = t / load(floats, row_index(LENGTH, rays) + ray)
     zero = splat(0.0)
-    t_at = row_at(T, rays) + ray
+    t_at = row_index(T, rays) + ray
     nearest = load(floats, t_at)
-    # Where det is 0, all areas are 0, so t is NaN and not at least t_min.
-    hit = at_least(lower_of(lower_of(a, b), c), zero) | at_least(
-        zero, higher_of(higher_of(a, b), c)
+    # If all areas have the same sign and det is 0, all areas are 0, so t is NaN and fails the test.
+    hit = greater_equal(minimum(minimum(a, b), c), zero) | greater_equal(
+        zero, maximum(maximum(a, b), c)
     )
-    hit &= at_least(t, splat(float64s(tile)[_T_MIN])) & at_least(nearest, t)
-    key_at = row_at(KEY, rays) + ray
-    tie = hit & at_least(t, nearest)
+    hit &= greater_equal(t, splat(float64s(tile)[_T_MIN])) & greater_equal(nearest, t)
+    key_at = row_index(KEY, rays) + ray
+    tie = hit & greater_equal(t, nearest)
     while tie != 0:
         lane = lowest_bit(tie)
         tie &= tie - 1
         known = numbers[key_at + lane]
         if 0 <= known <= key:
             hit &= ~(np.int64(1) << lane)
-    write_where(hit, floats, t_at, t)
-    write_where(hit, floats, key_at, splat_bits(key))
+    store_masked(hit, floats, t_at, t)
+    store_masked(hit, floats, key_at, splat_bits(key))
     return hit

@@ -1,8 +1,8 @@
-"""A tile's axes, and its rays, sides and depths in them.
+"""The coordinate system of a tile, and its rays, sides and depths in this system.
 
-A ray becomes a point (su, sv) of a plane across the tile's mean direction m: its direction is (su,
-sv, 1) in the axes (u, v, m), divided by the component along m. tile_loops.py describes the margins
-and the parameters.
+A ray becomes a point (su, sv) on a plane perpendicular to the tile's mean direction m. In the axes
+(u, v, m), the direction of the ray is (su, sv, 1), scaled so that its component along m is 1.
+tile_loops.py describes the margins and the parameters.
 """
 
 from __future__ import annotations
@@ -11,33 +11,34 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import float32s, float64s, int64s
-from .compiled import WHOLE, inlined, part, stage
-from .tile_memory import LENGTH, SUBTILES, T, at, row_at
+from .cast_record import float32s, float64s, int64s
+from .compiled import INT64, called_by_address, inlined, noinline
+from .tile_memory import LENGTH, T, field_index, row_index
+from .tile_sizes import SUBTILES
 from .vectors import (
     absolute,
-    higher_of,
-    highest,
     load,
-    lower_of,
-    lowest,
+    max_lane,
+    maximum,
+    min_lane,
+    minimum,
     multiply_add,
-    narrow,
     splat,
     store,
+    to_float32,
 )
 
-_AXES = at("axes")
-_PADDING = at("padding")
-_OFFSET = at("offset")
-_SPREAD = at("spread")
-_BOUNDS = at("bounds")
-_TILE_BOUNDS = at("tile_bounds")
-_REACH = at("reach")
-_PLANES = at("planes")
-_TILE_PLANES = at("tile_planes")
-_SIDES = at("sides")
-_SUMS = at("sums")
+_AXES = field_index("axes")
+_PADDING = field_index("padding")
+_OFFSET = field_index("offset")
+_SPREAD = field_index("spread")
+_BOUNDS = field_index("bounds")
+_TILE_BOUNDS = field_index("tile_bounds")
+_REACH = field_index("reach")
+_PLANES = field_index("planes")
+_TILE_PLANES = field_index("tile_planes")
+_SIDES = field_index("sides")
+_SUMS = field_index("sums")
 ZERO = np.float32(0)
 ONE = np.float32(1)
 FAR = np.float32(1e30)
@@ -45,19 +46,19 @@ _UNIT = 2.0**-24
 _SIDE = np.float32(64 * _UNIT)
 _REACH_FACTOR = np.float32(1 + 2.0**-19)
 _REACH_MARGIN = np.float32(2.0**-19)
-_NARROW = np.float32(0.6)  # least cosine between m and a ray of a tile
-_MAX_START = 64.0  # local: rays that start farther away are cast one by one, from the scene's box
+_NARROW = np.float32(0.6)  # minimum cosine of the angle between m and the rays of a tile
+_MAX_START = 64.0  # Rays that start farther away, in local units, are cast one by one.
 
 
 @inlined
 def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Return the scalar products of vectors, by components."""
+    """Return the dot products of vectors, given by their components."""
     return multiply_add(ax, bx, multiply_add(ay, by, az * bz))
 
 
 @inlined
 def cross(a, b):  # type: ignore[no-untyped-def]
-    """Return the cross products of vectors, by components."""
+    """Return the cross products of vectors, given by their components."""
     ax, ay, az = a
     bx, by, bz = b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -65,7 +66,7 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 
 @inlined
 def tile_axes(singles):  # type: ignore[no-untyped-def]
-    """Return the tile's axes u, v, m as vectors of equal numbers: three components each."""
+    """Return the axes u, v, m of the tile, each as three vectors of equal numbers."""
     k = _AXES
     u = splat(singles[k]), splat(singles[k + 1]), splat(singles[k + 2])
     v = splat(singles[k + 3]), splat(singles[k + 4]), splat(singles[k + 5])
@@ -74,7 +75,7 @@ def tile_axes(singles):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def turned(axes, x, y, z):  # type: ignore[no-untyped-def]
+def to_tile_axes(axes, x, y, z):  # type: ignore[no-untyped-def]
     """Return the components of vectors along the axes of the tile."""
     u, v, m = axes
     return (
@@ -85,20 +86,20 @@ def turned(axes, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _narrowed(floats, k):  # type: ignore[no-untyped-def]
-    """Return eight float64 as float32."""
-    return narrow(load(floats, k), load(floats, k + 4))
+def _load_eight(floats, k):  # type: ignore[no-untyped-def]
+    """Return eight float64 numbers, starting at index `k`, as float32."""
+    return to_float32(load(floats, k), load(floats, k + 4))
 
 
-@stage
-def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
-    """Write the axes of a tile and their starting point, and return its largest coordinate.
+@noinline
+def _write_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
+    """Write the axes of a tile and its point, and return the largest coordinate of the point.
 
     `first_row` is the first of six rows with origins and directions.
     """
     singles = float32s(tile)
     floats = float64s(tile)
-    direction = row_at(first_row + 3, rays)
+    direction = row_index(first_row + 3, rays)
     for axis in range(3):
         total = splat(0.0)
         for k in range(0, rays, 4):
@@ -110,9 +111,10 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
     x = np.float64(singles[_AXES + 6])
     y = np.float64(singles[_AXES + 7])
     z = np.float64(singles[_AXES + 8])
-    start = _set_frame(singles, x, y, z)
+    _set_frame(singles, x, y, z)
+    start = 0.0
     for axis in range(3):
-        origin = row_at(first_row + axis, rays)
+        origin = row_index(first_row + axis, rays)
         o = 0.5 * floats[origin] + 0.5 * floats[origin + rays - 1]
         singles[_AXES + 9 + axis] = np.float32(o)
         start = max(start, abs(o))
@@ -121,7 +123,7 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
-    """Write the three axes about a direction of any length but zero, and return 0."""
+    """Write three orthonormal axes, of which the last one has a given direction."""
     norm = 1 / np.sqrt((x * x + y * y) + z * z)
     x *= norm
     y *= norm
@@ -142,25 +144,26 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
     singles[_AXES + 6] = np.float32(x)
     singles[_AXES + 7] = np.float32(y)
     singles[_AXES + 8] = np.float32(z)
-    return 0.0
 
 
-@stage
-def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write su, sv and the depths of a tile's rays, with bounds, and return the least cosine to m.
+@noinline
+def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Write su, sv and the depths of a tile's rays, with their bounds.
 
-    `offset` becomes the maximum, over all rays, of the distance across m between the ray and the
-    ray with the same (su, sv) from the tile's point, and of the distance along m.
+    Return the smallest cosine of the angle between a ray and the axis m. The field `offset` is also
+    written. To compute it, each ray is compared with the ray that has the same (su, sv) but starts
+    at the tile's point. The offset is the maximum, over all rays, of the distance between these two
+    rays across m plus the distance between their origins along m.
     """
     singles = float32s(tile)
     floats = float64s(tile)
     axes = tile_axes(singles)
-    origin = row_at(first_row, rays)
-    direction = row_at(first_row + 3, rays)
-    su_at = 2 * row_at(memory.SU, rays)
-    sv_at = 2 * row_at(memory.SV, rays)
-    dm_at = 2 * row_at(memory.DM, rays)
-    wm_at = 2 * row_at(memory.WM, rays)
+    origin = row_index(first_row, rays)
+    direction = row_index(first_row + 3, rays)
+    su_at = 2 * row_index(memory.SU, rays)
+    sv_at = 2 * row_index(memory.SV, rays)
+    dm_at = 2 * row_index(memory.DM, rays)
+    wm_at = 2 * row_index(memory.WM, rays)
     px = splat(np.float64(singles[_AXES + 9]))
     py = splat(np.float64(singles[_AXES + 10]))
     pz = splat(np.float64(singles[_AXES + 11]))
@@ -175,48 +178,48 @@ def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PL
         high_v = splat(-FAR)
         for k in range(subtile * each, (subtile + 1) * each, 8):
             i = direction + k
-            du, dv, dm = turned(
+            du, dv, dm = to_tile_axes(
                 axes,
-                _narrowed(floats, i),
-                _narrowed(floats, i + rays),
-                _narrowed(floats, i + 2 * rays),
+                _load_eight(floats, i),
+                _load_eight(floats, i + rays),
+                _load_eight(floats, i + 2 * rays),
             )
-            cosine = lower_of(cosine, dm)
+            cosine = minimum(cosine, dm)
             inverse = one / dm
             su = du * inverse
             sv = dv * inverse
             store(singles, su_at + k, su)
             store(singles, sv_at + k, sv)
             store(singles, dm_at + k, dm)
-            low_u = lower_of(low_u, su)
-            high_u = higher_of(high_u, su)
-            low_v = lower_of(low_v, sv)
-            high_v = higher_of(high_v, sv)
+            low_u = minimum(low_u, su)
+            high_u = maximum(high_u, su)
+            low_v = minimum(low_v, sv)
+            high_v = maximum(high_v, sv)
             i = origin + k
-            wu, wv, wm = turned(
+            wu, wv, wm = to_tile_axes(
                 axes,
-                narrow(load(floats, i) - px, load(floats, i + 4) - px),
-                narrow(load(floats, i + rays) - py, load(floats, i + rays + 4) - py),
-                narrow(load(floats, i + 2 * rays) - pz, load(floats, i + 2 * rays + 4) - pz),
+                to_float32(load(floats, i) - px, load(floats, i + 4) - px),
+                to_float32(load(floats, i + rays) - py, load(floats, i + rays + 4) - py),
+                to_float32(load(floats, i + 2 * rays) - pz, load(floats, i + 2 * rays + 4) - pz),
             )
             store(singles, wm_at + k, wm)
             across = absolute(wu - wm * su) + absolute(wv - wm * sv)
-            offset = higher_of(offset, across + absolute(wm))
-        singles[_BOUNDS + subtile] = lowest(low_u)
-        singles[_BOUNDS + SUBTILES + subtile] = highest(high_u)
-        singles[_BOUNDS + 2 * SUBTILES + subtile] = lowest(low_v)
-        singles[_BOUNDS + 3 * SUBTILES + subtile] = highest(high_v)
-    singles[_TILE_BOUNDS] = lowest(load(singles, _BOUNDS))
-    singles[_TILE_BOUNDS + 1] = highest(load(singles, _BOUNDS + SUBTILES))
-    singles[_TILE_BOUNDS + 2] = lowest(load(singles, _BOUNDS + 2 * SUBTILES))
-    singles[_TILE_BOUNDS + 3] = highest(load(singles, _BOUNDS + 3 * SUBTILES))
-    singles[_OFFSET] = highest(offset)
-    return lowest(cosine)
+            offset = maximum(offset, across + absolute(wm))
+        singles[_BOUNDS + subtile] = min_lane(low_u)
+        singles[_BOUNDS + SUBTILES + subtile] = max_lane(high_u)
+        singles[_BOUNDS + 2 * SUBTILES + subtile] = min_lane(low_v)
+        singles[_BOUNDS + 3 * SUBTILES + subtile] = max_lane(high_v)
+    singles[_TILE_BOUNDS] = min_lane(load(singles, _BOUNDS))
+    singles[_TILE_BOUNDS + 1] = max_lane(load(singles, _BOUNDS + SUBTILES))
+    singles[_TILE_BOUNDS + 2] = min_lane(load(singles, _BOUNDS + 2 * SUBTILES))
+    singles[_TILE_BOUNDS + 3] = max_lane(load(singles, _BOUNDS + 3 * SUBTILES))
+    singles[_OFFSET] = max_lane(offset)
+    return min_lane(cosine)
 
 
-@stage
+@noinline
 def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the sides of the tile and of its subtiles, with margins, and the padding of depths."""
+    """Write the sides of the tile and of its subtiles, with margins, and the margin of depths."""
     singles = float32s(tile)
     numbers = int64s(tile)
     u, v, m = tile_axes(singles)
@@ -247,12 +250,12 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
             ny = (y - bound * m[1]) * sign
             nz = (z - bound * m[2]) * sign
             k = _PLANES + 7 * SUBTILES * plane
-            store(singles, k, higher_of(nx, zero))
-            store(singles, k + 8, higher_of(ny, zero))
-            store(singles, k + 16, higher_of(nz, zero))
-            store(singles, k + 24, lower_of(nx, zero))
-            store(singles, k + 32, lower_of(ny, zero))
-            store(singles, k + 40, lower_of(nz, zero))
+            store(singles, k, maximum(nx, zero))
+            store(singles, k + 8, maximum(ny, zero))
+            store(singles, k + 16, maximum(nz, zero))
+            store(singles, k + 24, minimum(nx, zero))
+            store(singles, k + 32, minimum(ny, zero))
+            store(singles, k + 40, minimum(nz, zero))
             store(singles, k + 48, slack - dot(nx, ny, nz, ox, oy, oz))
             bound = splat(singles[_TILE_BOUNDS + plane])
             nx = (x - bound * m[0]) * sign
@@ -260,33 +263,33 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
             nz = (z - bound * m[2]) * sign
             constant = slack
         constant = constant - dot(nx, ny, nz, ox, oy, oz)
-        x1 = lowest(nx)
-        y1 = lowest(ny)
-        z1 = lowest(nz)
+        x1 = min_lane(nx)
+        y1 = min_lane(ny)
+        z1 = min_lane(nz)
         k = _TILE_PLANES + 4 * plane
         singles[k] = x1
         singles[k + 1] = y1
         singles[k + 2] = z1
-        singles[k + 3] = lowest(constant)
-        far = plane < 4  # the farthest corner of a box counts for a side, the nearest for the depth
+        singles[k + 3] = min_lane(constant)
+        far = plane < 4  # A side needs the farthest corner of a box, and the depth the nearest.
         numbers[_SIDES + 3 * plane] = 24 if (x1 >= 0) == far else 0
         numbers[_SIDES + 3 * plane + 1] = 32 if (y1 >= 0) == far else 8
         numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
 
 
-@part(types.float32(*3 * WHOLE))
-def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the greatest depth, rounded up, of the rays of subtiles (a mask), and of each subtile.
+@called_by_address(types.float32(*3 * INT64))
+def update_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Update the maximum depths of subtiles, and return the maximum depth of the tile.
 
-    Returns the greatest depth of all subtiles.
+    `subtiles` is the mask of the subtiles to update. Depths are rounded up.
     """
     singles = float32s(tile)
     floats = float64s(tile)
-    t_at = row_at(T, rays)
-    length_at = row_at(LENGTH, rays)
-    dm_at = 2 * row_at(memory.DM, rays)
-    wm_at = 2 * row_at(memory.WM, rays)
-    depth_at = 2 * row_at(memory.DEPTH, rays)
+    t_at = row_index(T, rays)
+    length_at = row_index(LENGTH, rays)
+    dm_at = 2 * row_index(memory.DM, rays)
+    wm_at = 2 * row_index(memory.WM, rays)
+    depth_at = 2 * row_index(memory.DEPTH, rays)
     far = splat(1e30)
     factor = splat(_REACH_FACTOR)
     margin = splat(_REACH_MARGIN + np.float32(2) * singles[_PADDING])
@@ -296,29 +299,30 @@ def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa:
             continue
         greatest = splat(-FAR)
         for k in range(subtile * each, (subtile + 1) * each, 8):
-            first = lower_of(load(floats, t_at + k) * load(floats, length_at + k), far)
-            second = lower_of(load(floats, t_at + k + 4) * load(floats, length_at + k + 4), far)
-            along = narrow(first, second) * load(singles, dm_at + k)
+            first = minimum(load(floats, t_at + k) * load(floats, length_at + k), far)
+            second = minimum(load(floats, t_at + k + 4) * load(floats, length_at + k + 4), far)
+            along = to_float32(first, second) * load(singles, dm_at + k)
             depth = multiply_add(along, factor, load(singles, wm_at + k) + margin)
             store(singles, depth_at + k, depth)
-            greatest = higher_of(greatest, depth)
-        singles[_REACH + subtile] = highest(greatest)
-    return highest(load(singles, _REACH))
+            greatest = maximum(greatest, depth)
+        singles[_REACH + subtile] = max_lane(greatest)
+    return max_lane(load(singles, _REACH))
 
 
-@part(types.int64(*4 * WHOLE))
-def aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
-    """Prepare a tile for a traversal in its rays' coordinates, and return whether it is narrow.
+@called_by_address(types.int64(*4 * INT64))
+def prepare_tile(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
+    """Compute the coordinate system of a tile and its rays in it, and return whether it is usable.
 
-    `first_row` is the first of six rows with origins and directions, `mask` of subtiles to cast.
+    A tile is not usable if its rays diverge too much or start too far away. `first_row` is the
+    first of six rows with origins and directions, and `mask` contains the subtiles to cast.
     """
     singles = float32s(tile)
-    if _set_axes(tile, rays, first_row) > _MAX_START:
+    if _write_axes(tile, rays, first_row) > _MAX_START:
         return False
-    if not _flatten(tile, rays, first_row) > _NARROW:
+    if not _project_rays(tile, rays, first_row) > _NARROW:
         return False
     _set_planes(tile)
     for subtile in range(SUBTILES):
         singles[_REACH + subtile] = -FAR
-    limit_depths(tile, rays, mask)
+    update_depths(tile, rays, mask)
     return True

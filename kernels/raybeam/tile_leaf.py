@@ -1,8 +1,10 @@
-"""Which triangles of a leaf a tile's rays may hit, in float32, and which they do hit.
+"""Intersection of a tile's rays with the triangles of a leaf.
 
-A triangle is three linear functions of (su, sv), prepared for eight triangles of a leaf at a time.
-The maximum of each over a range of (su, sv) discards the triangle for a tile or a subtile, and a
-test of eight rays is six multiply-adds and a comparison with the depth so far.
+In the coordinates of a tile, a triangle consists of three linear functions of (su, sv), which are
+computed for the eight triangles of a leaf at a time. If the maximum of one of these functions over
+a range of (su, sv) is negative, the triangle is discarded for a tile or a subtile. The float32 test
+for eight rays takes six multiply-adds and a comparison with the depth so far. The remaining
+candidates are tested in float64.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import numpy as np
 from numba import types
 
 from . import tile_memory as memory
-from .cast_memory import (
+from .cast_record import (
     BLOCKS,
     LEAF_CORNERS,
     MASK_HEIGHT,
@@ -22,38 +24,39 @@ from .cast_memory import (
     int64s,
     uint8s,
 )
-from .compiled import WHOLE, inlined, part
-from .tile_exact import decide_four, decide_one
-from .tile_frame import ONE, ZERO, cross, dot, tile_axes, turned
-from .tile_memory import SUBTILES, at, row_at
+from .compiled import INT64, called_by_address, inlined
+from .tile_exact import intersect_four_rays, intersect_ray
+from .tile_frame import ONE, ZERO, cross, dot, tile_axes, to_tile_axes
+from .tile_memory import field_index, row_index
+from .tile_sizes import SUBTILES
 from .tile_tree import BLOCK
 from .tree import LEAF_BITS
 from .vectors import (
     absolute,
-    at_least,
     bit_count,
     copy_sign,
-    higher_of,
+    greater_equal,
     load,
-    lower_of,
     lowest_bit,
+    maximum,
+    minimum,
     multiply_add,
     prefetch,
     splat,
     store,
-    write_word,
+    store_int64,
 )
 
-_AXES = at("axes")
-_PADDING = at("padding")
-_OFFSET = at("offset")
-_SPREAD = at("spread")
-_BOUNDS = at("bounds")
-_TILE_BOUNDS = at("tile_bounds")
-_REACH = at("reach")
-_EDGES = at("edges")
-_PAIRS = at("pairs")
-_BITS = at("bits")
+_AXES = field_index("axes")
+_PADDING = field_index("padding")
+_OFFSET = field_index("offset")
+_SPREAD = field_index("spread")
+_BOUNDS = field_index("bounds")
+_TILE_BOUNDS = field_index("tile_bounds")
+_REACH = field_index("reach")
+_EDGES = field_index("edges")
+_PAIRS = field_index("pairs")
+_BITS = field_index("bits")
 EDGE = np.float32(48 * 2.0**-24)
 FLOOR = np.float32(1e-35)
 LEAF_MASK = (1 << LEAF_BITS) - 1
@@ -61,29 +64,36 @@ LEAF_MASK = (1 << LEAF_BITS) - 1
 
 @inlined
 def _leaf_edges(singles, blocks, block):  # type: ignore[no-untyped-def]
-    """Return the first corners of a leaf, from the tile's point, and edges: in the tile's axes."""
+    """Return the first vertices of a leaf's triangles, relative to the tile's point, and two edges.
+
+    All vectors are in the axes of the tile.
+    """
     axes = tile_axes(singles)
     x = load(blocks, block) - splat(singles[_AXES + 9])
     y = load(blocks, block + 8) - splat(singles[_AXES + 10])
     z = load(blocks, block + 16) - splat(singles[_AXES + 11])
-    a = turned(axes, x, y, z)
-    e = turned(axes, load(blocks, block + 24), load(blocks, block + 32), load(blocks, block + 40))
-    f = turned(axes, load(blocks, block + 48), load(blocks, block + 56), load(blocks, block + 64))
+    a = to_tile_axes(axes, x, y, z)
+    e = to_tile_axes(
+        axes, load(blocks, block + 24), load(blocks, block + 32), load(blocks, block + 40)
+    )
+    f = to_tile_axes(
+        axes, load(blocks, block + 48), load(blocks, block + 56), load(blocks, block + 64)
+    )
     return a, e, f
 
 
 @inlined
-def norm(a):  # type: ignore[no-untyped-def]
-    """Return the sums of the sizes of the components of vectors."""
+def l1_norm(a):  # type: ignore[no-untyped-def]
+    """Return the sum of the absolute values of the components of vectors."""
     return (absolute(a[0]) + absolute(a[1])) + absolute(a[2])
 
 
 @inlined
-def _maximum(normal, bounds):  # type: ignore[no-untyped-def]
+def _max_over_bounds(normal, bounds):  # type: ignore[no-untyped-def]
     """Return the maximum of a linear function over ranges of (su, sv)."""
     nu, nv, nm = normal
     low_u, high_u, low_v, high_v = bounds
-    return (nm + higher_of(nu * low_u, nu * high_u)) + higher_of(nv * low_v, nv * high_v)
+    return (nm + maximum(nu * low_u, nu * high_u)) + maximum(nv * low_v, nv * high_v)
 
 
 @inlined
@@ -91,12 +101,13 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
     return splat(singles[k]), splat(singles[k + 8]), splat(singles[k + 16])
 
 
-@part(types.int64(*6 * WHOLE, types.float32))
+@called_by_address(types.int64(*6 * INT64, types.float32))
 def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test the triangles of a leaf and the rays of a mask of subtiles, return subtiles with hits.
+    """Test the rays of a mask of subtiles against the triangles of a leaf.
 
-    `code` is of the leaf, `deepest` the greatest depth that a ray reaches, `instance` the number
-    of the instance times `KEYS_PER_INSTANCE`.
+    Return the mask of subtiles with closer hits. `code` is the code of the leaf, `deepest` is the
+    maximum depth that a ray reaches, and `instance` is the index of the instance times
+    `KEYS_PER_INSTANCE`.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
@@ -110,19 +121,19 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
     n = cross(e, f)
     zero = splat(ZERO)
     volume = dot(n[0], n[1], n[2], a[0], a[1], a[2])
-    size = norm(e) + norm(f)
+    size = l1_norm(e) + l1_norm(f)
     floor = splat(FLOOR)
-    rounding = multiply_add(splat(EDGE * singles[_SPREAD]) * (splat(ONE) + norm(a)), size, floor)
+    rounding = multiply_add(splat(EDGE * singles[_SPREAD]) * (splat(ONE) + l1_norm(a)), size, floor)
     offset = splat(singles[_OFFSET] * singles[_SPREAD])
     margin = multiply_add(offset, size, rounding)
-    volume_margin = multiply_add(rounding, size, multiply_add(offset, norm(n), floor))
-    undecided = at_least(volume_margin, absolute(volume))
-    sign = copy_sign(splat(ONE), volume)  # so that rays ahead see positive areas
+    volume_margin = multiply_add(rounding, size, multiply_add(offset, l1_norm(n), floor))
+    undecided = greater_equal(volume_margin, absolute(volume))
+    sign = copy_sign(splat(ONE), volume)  # so that areas are positive for rays in front
     n1 = n1[0] * sign, n1[1] * sign, n1[2] * sign
     n2 = n2[0] * sign, n2[1] * sign, n2[2] * sign
     n = n[0] * sign, n[1] * sign, n[2] * sign
     n0 = n[0] - n1[0] - n2[0], n[1] - n1[1] - n2[1], n[2] - n1[2] - n2[2]
-    depth = lower_of(lower_of(a[2], a[2] + e[2]), a[2] + f[2])
+    depth = minimum(minimum(a[2], a[2] + e[2]), a[2] + f[2])
     depth = depth - splat(singles[_PADDING] + np.float32(2) * singles[_OFFSET])
     k = _TILE_BOUNDS
     bounds = (
@@ -131,9 +142,12 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         splat(singles[k + 2]),
         splat(singles[k + 3]),
     )
-    least = lower_of(lower_of(_maximum(n0, bounds), _maximum(n1, bounds)), _maximum(n2, bounds))
-    hit = at_least(least + margin, zero) | undecided
-    hit &= at_least(splat(deepest), depth) & ((2 << (code & LEAF_MASK)) - 1)
+    least = minimum(
+        minimum(_max_over_bounds(n0, bounds), _max_over_bounds(n1, bounds)),
+        _max_over_bounds(n2, bounds),
+    )
+    hit = greater_equal(least + margin, zero) | undecided
+    hit &= greater_equal(splat(deepest), depth) & ((2 << (code & LEAF_MASK)) - 1)
     if hit == 0:
         return np.int64(0)
     k = _EDGES
@@ -148,8 +162,9 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
     store(singles, k + 24, rounding * splat(np.float32(4)))
     first = np.int64(int32s(record[BLOCKS])[block + 72])
     corners = float64s(record[LEAF_CORNERS])
-    # Three loops over lists, not one nest with branches: a branch that is mispredicted costs as
-    # much as the test of 24 rays. First, pairs of a triangle and a subtile.
+    # Three loops over lists are faster than nested loops with branches, because a mispredicted
+    # branch costs as much as the test of 24 rays. The first loop lists pairs of a triangle and a
+    # subtile.
     bounds = (
         load(singles, _BOUNDS),
         load(singles, _BOUNDS + SUBTILES),
@@ -162,26 +177,26 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         lane = lowest_bit(hit)
         hit &= hit - 1
         k = _EDGES + lane
-        least = lower_of(
-            lower_of(
-                _maximum(_splat_three(singles, k), bounds),
-                _maximum(_splat_three(singles, k + 24), bounds),
+        least = minimum(
+            minimum(
+                _max_over_bounds(_splat_three(singles, k), bounds),
+                _max_over_bounds(_splat_three(singles, k + 24), bounds),
             ),
-            _maximum(_splat_three(singles, k + 48), bounds),
+            _max_over_bounds(_splat_three(singles, k + 48), bounds),
         )
-        chosen = at_least(least + splat(singles[k + 72]), zero) | -((undecided >> lane) & 1)
-        chosen &= mask & at_least(reach, splat(singles[k + 88]))
-        write_word(
+        chosen = greater_equal(least + splat(singles[k + 72]), zero) | -((undecided >> lane) & 1)
+        chosen &= mask & greater_equal(reach, splat(singles[k + 88]))
+        store_int64(
             pairs, _PAIRS + pair_count, numbers[_BITS + chosen] | (0x0808080808080808 * lane)
         )
         pair_count += bit_count(chosen)
         prefetch(corners, 9 * (first + lane))
         prefetch(corners, 9 * (first + lane) + 8)
-    # Then halves of vectors whose rays may hit the triangle.
-    su_at = 2 * row_at(memory.SU, rays)
-    sv_at = 2 * row_at(memory.SV, rays)
-    depth_at = 2 * row_at(memory.DEPTH, rays)
-    survivors = row_at(memory.SURVIVORS, rays)
+    # The second loop lists groups of four rays that may hit a triangle.
+    su_at = 2 * row_index(memory.SU, rays)
+    sv_at = 2 * row_index(memory.SV, rays)
+    depth_at = 2 * row_index(memory.DEPTH, rays)
+    survivors = row_index(memory.SURVIVORS, rays)
     each = rays // SUBTILES
     survivor_count = np.int64(0)
     for number in range(pair_count):
@@ -203,14 +218,14 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
             e2 = multiply_add(su, n2[0], multiply_add(sv, n2[1], n2[2]))
             e0 = multiply_add(su, n0[0], multiply_add(sv, n0[1], n0[2]))
             before = multiply_add(load(singles, depth_at + i), (e0 + e1) + (e2 + rounding), bias)
-            passing = at_least(lower_of(lower_of(lower_of(e0, e1), e2) + limit, before), zero)
+            passing = greater_equal(minimum(minimum(minimum(e0, e1), e2) + limit, before), zero)
             passing |= every
             numbers[survivors + survivor_count] = i << 8 | triangle << 4 | (passing & 15)
             survivor_count += np.int64((passing & 15) != 0)
             numbers[survivors + survivor_count] = (i + 4) << 8 | triangle << 4 | passing >> 4
             survivor_count += np.int64(passing > 15)
-    # Last, the test in float64 of these.
-    eight_at = row_at(memory.AXIS_OF_EIGHT, rays)
+    # The third loop tests these rays in float64.
+    eight_at = row_index(memory.AXIS_OF_EIGHT, rays)
     order = int32s(record[ORDER])
     opaque = record[MASK_HEIGHT] == 0
     changed = np.int64(0)
@@ -221,7 +236,7 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         axis = numbers[eight_at + (ray >> 3)]
         if axis >= 0 and opaque:
             key = instance + np.int64(order[position])
-            hits = decide_four(
+            hits = intersect_four_rays(
                 tile, rays, ray, axis=axis, corners=corners, position=position, key=key
             )
         else:
@@ -230,7 +245,7 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
             while left != 0:
                 lane = lowest_bit(left)
                 left &= left - 1
-                if decide_one(tile, rays, ray + lane, mesh, instance, position):
+                if intersect_ray(tile, rays, ray + lane, mesh, instance, position):
                     hits = np.int64(1)
         changed |= np.int64(hits != 0) << (ray // each)
     return changed

@@ -1,8 +1,9 @@
-"""Which rays of a scan form tiles: neighbors, whatever their order within a firing.
+"""Division of a scan's rays into tiles of neighboring rays.
 
-A pattern's rays are numbered firing after firing. Rings of a firing need not follow each other by
-elevation, and their beams may point in other azimuths, by whole degrees. So rings are sorted by
-elevation, and a tile takes each ring from the firings that pass the same azimuth.
+The rays of a pattern are stored firing by firing. The rings of a firing are not necessarily sorted
+by elevation, and their beams may point at different azimuths, several degrees apart. Therefore,
+rings are sorted by elevation, and a tile takes the rays of each ring from the firings that pass the
+same azimuth. The division affects only the speed and not the results.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import Floats, Ints
-from .pattern_rays import checked_rays
+from .pattern_rays import compute_rays
 from .scan import Scan
+from .tile_sizes import SUBTILES, VECTOR_RAYS, lanes_per_beam
 
-SUBTILES = 8  # subtiles per tile
-_VECTOR = 8  # rays of a vector
-_MAX_LANES = 1 << 20  # limit for all tiles of a column: a longer firing counts as consecutive rays
-_FEW_FIRINGS = 4  # times the shift of a ring: shorter scans would have too many incomplete tiles
+# Limit for all tiles of a column; longer firings are divided into consecutive rays.
+_MAX_LANES = 1 << 20
+# Rings are not shifted in scans with fewer firings than this multiple of the largest shift, because
+# too many tiles would be incomplete.
+_FEW_FIRINGS = 4
 
 
 class TilePlan(NamedTuple):
@@ -27,14 +30,15 @@ class TilePlan(NamedTuple):
     Attributes
     ----------
     firing
-        Rays of a firing, with all sub-rays.
+        Rays per firing, including all sub-rays.
     firings
-        Of a tile; a column of tiles starts at each multiple.
+        Firings per tile. A new column of tiles starts after this number of firings.
     lanes
-        int64 (groups, rays): number of each ray of a tile, from the first ray of the tile's first
-        firing on. Each group of rings has separate tiles.
+        int64 (groups, rays): index of each ray of a tile relative to the first ray of the tile's
+        first firing. Each group of rings has separate tiles.
     shifts
-        int64 (groups,): by how many firings a group's first tile starts before the first firing.
+        int64 (groups,): number of firings by which the first tile of a group starts before the
+        first firing.
     """
 
     firing: int
@@ -44,57 +48,62 @@ class TilePlan(NamedTuple):
 
     @property
     def rays(self) -> int:
-        """Number of rays of a tile."""
+        """Number of rays per tile."""
         return self.lanes.shape[1]
 
 
-def consecutive(subrays: int) -> TilePlan:
-    """Return tiles of consecutive beams with a number of sub-rays each."""
-    beams = np.arange(SUBTILES * _VECTOR)
-    return TilePlan(subrays, len(beams), _sub_rays(beams, subrays)[None], np.zeros(1, np.int64))
+def plan_consecutive(subrays: int) -> TilePlan:
+    """Return a plan whose tiles consist of consecutive beams with a number of sub-rays each."""
+    beams = np.arange(SUBTILES * VECTOR_RAYS)
+    return TilePlan(
+        subrays, len(beams), _sub_ray_lanes(beams, subrays)[None], np.zeros(1, np.int64)
+    )
 
 
-def _sub_rays(beams: Ints, subrays: int) -> Ints:
-    """Return the numbers of the sub-rays of beams (..., n).
+def _sub_ray_lanes(beams: Ints, subrays: int) -> Ints:
+    """Return the indices of the sub-rays of beams (..., n).
 
-    The sub-rays of a beam fill whole vectors.
+    The sub-rays of each beam are padded to whole vectors.
     """
     if subrays == 1:
         return beams
-    lanes = -(-subrays // _VECTOR) * _VECTOR
-    sub_ray = np.minimum(np.arange(lanes), subrays - 1)  # copies of the last one
+    # Padded with copies of the last sub-ray.
+    sub_ray = np.minimum(np.arange(lanes_per_beam(subrays)), subrays - 1)
     return (beams[..., None] * subrays + sub_ray).reshape(*beams.shape[:-1], -1)
 
 
 def plan_tiles(scan: Scan) -> TilePlan:
-    """Return the tiles of a scan, by the rays of two of its firings."""
+    """Return the tile plan of a scan, which is derived from the directions of two firings."""
     subrays = scan.pattern.subrays_per_beam
     step = scan.pattern.step
     firing = step * subrays
-    start = -scan.first % firing  # first ray of the first whole firing
+    start = -scan.first % firing  # first ray of the first complete firing
     whole_firings = (len(scan) - start) // firing
-    if step == 1 or whole_firings < 2 or firing * SUBTILES * _VECTOR > _MAX_LANES:
-        return consecutive(subrays)
+    if step == 1 or whole_firings < 2 or firing * SUBTILES * VECTOR_RAYS > _MAX_LANES:
+        return plan_consecutive(subrays)
     start += (whole_firings - 2) // 2 * firing
     beams = start + subrays * np.arange(step)
-    _, directions = checked_rays(scan.pattern, scan.first, np.r_[beams, beams + firing], scan.poses)
-    rings, shifts, spacings = _sorted_rings(directions[:step], directions[step:])
+    _, directions = compute_rays(scan.pattern, scan.first, np.r_[beams, beams + firing], scan.poses)
+    rings, shifts, spacings = _sort_rings(directions[:step], directions[step:])
     if whole_firings < _FEW_FIRINGS * np.ptp(shifts):
         shifts[:] = 0
-    return _laid_out(rings, shifts, spacings, subrays)
+    return _plan_from_rings(rings, shifts, spacings, subrays)
 
 
-def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
-    """Return how the rings of two successive firings (n, 3) neighbor each other.
+def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
+    """Determine how rings neighbor each other, from the directions (n, 3) of two firings.
+
+    The firings must be consecutive.
 
     Returns
     -------
     rings
-        (n,): numbers of the rings in the order of their elevation above the plane of rotation.
+        (n,): indices of the rings, sorted by their elevation above the plane of rotation.
     shifts
-        (n,): the firing, relative to the first ring's, at which each of these passes its azimuth.
+        (n,): number of firings after which each of these rings passes the azimuth of the first
+        ring.
     spacings
-        Angle between firings, and between rings, radians.
+        Angle between firings and angle between rings, in radians.
     """
     axis = np.cross(first, second).sum(axis=0)
     rings = np.argsort((first * axis).sum(axis=1), kind="stable")
@@ -109,17 +118,19 @@ def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[floa
     return rings, shifts, (float(np.sqrt(np.median(squared))), max(ring_spacing, 1e-12))
 
 
-def _laid_out(rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int) -> TilePlan:
-    """Return tiles whose rays lie in squares, as far as their numbers allow."""
+def _plan_from_rings(
+    rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
+) -> TilePlan:
+    """Return a plan whose tiles cover nearly square ranges of angles."""
     step = len(rings)
     firing = step * subrays
-    each = 1 if subrays > 1 else 2  # vectors of beams in a subtile
-    beams = SUBTILES * _VECTOR * each
+    each = 1 if subrays > 1 else 2  # vectors per subtile, without sub-rays
+    beams = SUBTILES * VECTOR_RAYS * each
     most_rings = 1 << (step.bit_length() - 1)
-    tile = _square(beams, spacings, most_rings, beams)
-    subtile = _square(_VECTOR * each, spacings, *tile)
-    vector = _square(_VECTOR, spacings, *subtile)
-    # Of the tile, subtile and vector: numbers of rings and firings.
+    tile = _squarest_grid(beams, spacings, most_rings, beams)
+    subtile = _squarest_grid(VECTOR_RAYS * each, spacings, *tile)
+    vector = _squarest_grid(VECTOR_RAYS, spacings, *subtile)
+    # Numbers of rings and firings: subtiles per tile, vectors per subtile, and rays per vector.
     grids = [
         (tile[0] // subtile[0], tile[1] // subtile[1]),
         (subtile[0] // vector[0], subtile[1] // vector[1]),
@@ -143,13 +154,16 @@ def _laid_out(rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays:
     shift = shifts[chosen]
     shift = shift - shift.min(axis=1, keepdims=True)
     beam = (later + shift) * step + rings[chosen]
-    return TilePlan(firing, tile[1], _sub_rays(beam, subrays), shift.max(axis=1))
+    return TilePlan(firing, tile[1], _sub_ray_lanes(beam, subrays), shift.max(axis=1))
 
 
-def _square(
+def _squarest_grid(
     beams: int, spacings: tuple[float, float], most_rings: int, most_firings: int
 ) -> tuple[int, int]:
-    """Return numbers of rings and firings whose product is `beams`, nearest to a square."""
+    """Return the numbers of rings and firings that cover the most square angle.
+
+    Their product is `beams`.
+    """
     firing_spacing, ring_spacing = spacings
     best = (1, beams)
     least = np.inf

@@ -1,4 +1,7 @@
-"""The tree that tiles of rays descend: nodes of eight children, leaves of up to eight triangles."""
+"""The tree that tiles of rays traverse.
+
+Nodes have eight children, and leaves contain up to eight triangles.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +11,44 @@ import numpy as np
 
 from .arrays import Floats, Floats32, Ints32
 from .compiled import compiled
-from .layout import stack_need
-from .tree import LEAF_BITS, WideTree, build_top, build_tree
+from .cuda_tables import max_stack_depth
+from .tree import LEAF_BITS, WideTree, build_instance_tree, build_tree
 
 WIDTH = 8
-NODE = 64  # numbers of a node: lower x, y, z, upper x, y, z and the child, of eight children each
-BLOCK = (
-    80  # numbers of a leaf: corner, two edges, x, y, z of eight triangles; position of the first
-)
+# Numbers per node: lower x, y, z, upper x, y, z and code of each of the eight children, and
+# padding.
+NODE = 64
+# Numbers per leaf: x, y, z of the first vertex and of two edges of eight triangles each, the
+# position of the first triangle, and padding.
+BLOCK = 80
 _LEAF_SIZE = 8
-# Cost of a further triangle in a leaf, as a share of the cost of a node: eight are tested at once.
+# Cost of each triangle in a leaf relative to the cost of a leaf. It is low because eight triangles
+# are tested at once.
 _TRIANGLE_COST = 0.05
-# Corner of the box of an empty slot, which no ray meets. Not infinite: zero times it is zero.
-_NOWHERE = np.float32(1e37)
+# Corner of the inverted box of an empty slot, which no ray intersects. It is finite, because zero
+# times infinity would be NaN.
+_EMPTY = np.float32(1e37)
 
 
 @dataclass(frozen=True)
 class TileTree:
-    """A tree of a mesh.
+    """The tree of a mesh.
 
     Attributes
     ----------
     nodes
-        float32 (m, `NODE`): the root first. A child is the number of a node, 0 in an empty slot; or
-        the bitwise complement of ``leaf << LEAF_BITS | count - 1``.
+        float32 (m, `NODE`): the nodes, starting with the root. The code of a child is the index of
+        a node, 0 for an empty slot, or the bitwise complement of ``leaf << LEAF_BITS | count - 1``.
     blocks
-        float32 (leaves, `BLOCK`): edges lead from the first corner to the second and to the third.
-        Lanes after the last triangle repeat it.
+        float32 (leaves, `BLOCK`): the triangles of the leaves. The two edges lead from the first
+        vertex to the second and third. The last triangle of a leaf is repeated up to eight
+        triangles.
     corners
-        float64 (k, 9): corners of the triangles in the order of the leaves.
+        float64 (k, 9): vertices of the triangles in leaf order.
     order
         int32 (k,): row of each of these triangles in the corners of the mesh.
     stack
-        Maximum nodes that wait during a traversal.
+        Maximum number of pending nodes during a traversal.
     """
 
     nodes: Floats32
@@ -50,8 +58,8 @@ class TileTree:
     stack: int
 
 
-def tile_tree(corners: Floats) -> TileTree:
-    """Build the tree of triangles (k, 3, 3), local."""
+def build_tile_tree(corners: Floats) -> TileTree:
+    """Build the tree of triangles (k, 3, 3) in local coordinates."""
     tree = build_tree(corners, WIDTH, _LEAF_SIZE, _TRIANGLE_COST)
     is_leaf = tree.child < 0
     codes = ~tree.child[is_leaf]
@@ -67,32 +75,32 @@ def tile_tree(corners: Floats) -> TileTree:
     return TileTree(_nodes(tree, child), blocks, ordered, tree.order, _stack(tree))
 
 
-def top_nodes(boxes: Floats) -> tuple[Floats32, int]:
-    """Return the nodes of a tree over boxes (n, 2, 3), and the maximum of nodes that wait.
+def build_instance_nodes(boxes: Floats) -> tuple[Floats32, int]:
+    """Build the nodes of a tree over boxes (n, 2, 3), whose leaves contain the index of one box.
 
-    Its leaves have the number of a box.
+    Also return the maximum number of pending nodes.
     """
-    tree = build_top(boxes, WIDTH)
+    tree = build_instance_tree(boxes, WIDTH)
     return _nodes(tree, tree.child), _stack(tree)
 
 
 def _stack(tree: WideTree) -> int:
-    """Return the maximum of nodes that wait during a traversal, with a node's children."""
-    return stack_need(tree) + 2 * WIDTH
+    """Return the maximum number of pending nodes, including the children of the current node."""
+    return max_stack_depth(tree) + 2 * WIDTH
 
 
 def _nodes(tree: WideTree, child: Ints32) -> Floats32:
     nodes = _aligned(len(child), NODE)
     used = tree.lower[:, :1] <= tree.upper[:, :1]
     count = len(child)
-    nodes[:, :24] = np.where(used, tree.lower, _NOWHERE).reshape(count, -1)
-    nodes[:, 24:48] = np.where(used, tree.upper, -_NOWHERE).reshape(count, -1)
+    nodes[:, :24] = np.where(used, tree.lower, _EMPTY).reshape(count, -1)
+    nodes[:, 24:48] = np.where(used, tree.upper, -_EMPTY).reshape(count, -1)
     nodes[:, 48:56].view(np.int32)[:] = child
     return nodes
 
 
 def _aligned(row_count: int, columns: int) -> Floats32:
-    """Return float32 zeros (rows, columns) that start at a line of the cache."""
+    """Return a float32 array of zeros that starts at a cache line of 64 bytes."""
     memory = np.zeros(row_count * columns + 16, np.float32)
     start = -memory.ctypes.data % 64 // 4
     return memory[start : start + row_count * columns].reshape(row_count, columns)
@@ -100,7 +108,10 @@ def _aligned(row_count: int, columns: int) -> Floats32:
 
 @compiled()
 def _fill_blocks(corners, first, count, blocks):  # type: ignore[no-untyped-def]
-    """Write the triangles of leaves: edges are rounded from float64, so tiny ones stay exact."""
+    """Write the triangles of leaves.
+
+    Edges are computed in float64 and then rounded, so that short edges are accurate.
+    """
     for leaf in range(len(first)):
         for lane in range(8):
             row = first[leaf] + min(lane, count[leaf] - 1)

@@ -1,6 +1,8 @@
-"""A tile's way down a tree: eight children of a node, then eight subtiles, at a time.
+"""Traversal of a tree by a tile of rays.
 
-A box is outside the tile if it is outside one of its four sides, and outside a subtile likewise.
+For each node, the boxes of its eight children are tested against the tile, and those that remain
+are tested against the eight subtiles at once. A box is outside the tile or a subtile if it is
+outside one of its four sides.
 """
 
 from __future__ import annotations
@@ -8,38 +10,39 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from .cast_memory import BLOCKS, NODES, float32s, int32s, int64s, uint8s
-from .compiled import WHOLE, inlined, part, stage
-from .tile_frame import FAR, ZERO, limit_depths
+from .cast_record import BLOCKS, NODES, float32s, int32s, int64s, uint8s
+from .compiled import INT64, called_by_address, inlined, noinline
+from .tile_frame import FAR, ZERO, update_depths
 from .tile_leaf import test_leaf
-from .tile_memory import ENTRY, SUBTILES, at
+from .tile_memory import ENTRY, field_index
+from .tile_sizes import SUBTILES
 from .tile_tree import BLOCK, NODE
 from .tree import LEAF_BITS
 from .vectors import (
-    at_least,
     bit_count,
-    highest,
+    greater_equal,
     load,
-    lower_of,
     lowest_bit,
+    max_lane,
+    minimum,
     multiply_add,
     prefetch,
     splat,
     store,
 )
 
-_REACH = at("reach")
-_PLANES = at("planes")
-_TILE_PLANES = at("tile_planes")
-_NEAR = at("near")
-_SIDES = at("sides")
-_STACK = at("stack")
-_MET = at("met")
+_REACH = field_index("reach")
+_PLANES = field_index("planes")
+_TILE_PLANES = field_index("tile_planes")
+_NEAR = field_index("near")
+_SIDES = field_index("sides")
+_STACK = field_index("stack")
+_MET = field_index("met")
 
 
 @inlined
-def put(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
-    """Write entry k of a list: depth, code and mask of subtiles."""
+def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
+    """Write entry `k` of a list: the depth, the code, and the mask of subtiles."""
     stack[ENTRY * k] = near
     codes[ENTRY * k + 1] = np.int32(code)
     codes[ENTRY * k + 2] = np.int32(mask)
@@ -47,7 +50,10 @@ def put(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
 
 @inlined
 def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
-    """Sort entries `start` to `stop` of a list at an address, the nearest last."""
+    """Sort entries `start` to `stop` of a list so that the closest entry is last.
+
+    `address` is the address of the list.
+    """
     stack = float32s(address)
     codes = int32s(address)
     for k in range(start + 1, stop):
@@ -56,16 +62,18 @@ def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
         mask = codes[ENTRY * k + 2]
         j = k
         while j > start and stack[ENTRY * (j - 1)] < near:
-            put(stack, codes, j, stack[ENTRY * (j - 1)], codes[ENTRY * j - 3], codes[ENTRY * j - 2])
+            write_entry(
+                stack, codes, j, stack[ENTRY * (j - 1)], codes[ENTRY * j - 3], codes[ENTRY * j - 2]
+            )
             j -= 1
-        put(stack, codes, j, near, code, mask)
+        write_entry(stack, codes, j, near, code, mask)
 
 
 @inlined
-def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Add the children of a node that the tile meets to the waiting ones, nearest last.
+def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
+    """Push the children of a node that the tile may intersect, the closest last.
 
-    There were `count` of them; returns how many there are. `nodes` and `blocks` are addresses.
+    The stack has `count` entries. Return its new size. `nodes` and `blocks` are addresses.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
@@ -84,7 +92,7 @@ def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore
         )
         side = multiply_add(splat(singles[k + 1]), load(boxes, base + numbers[s + 1]), side)
         side = multiply_add(splat(singles[k + 2]), load(boxes, base + numbers[s + 2]), side)
-        inside = lower_of(side, inside)
+        inside = minimum(side, inside)
     k = _TILE_PLANES + 16
     depth = multiply_add(
         splat(singles[k]), load(boxes, base + numbers[_SIDES + 12]), splat(singles[k + 3])
@@ -92,7 +100,7 @@ def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore
     depth = multiply_add(splat(singles[k + 1]), load(boxes, base + numbers[_SIDES + 13]), depth)
     depth = multiply_add(splat(singles[k + 2]), load(boxes, base + numbers[_SIDES + 14]), depth)
     zero = splat(ZERO)
-    hit = at_least(inside, zero) & at_least(splat(deepest), depth)
+    hit = greater_equal(inside, zero) & greater_equal(splat(deepest), depth)
     store(singles, _NEAR, depth)
     reach = load(singles, _REACH)
     start = count
@@ -115,12 +123,12 @@ def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore
             lower = multiply_add(load(singles, p + 32), ly, lower)
             upper = multiply_add(load(singles, p + 16), hz, upper)
             lower = multiply_add(load(singles, p + 40), lz, lower)
-            inside = lower_of(upper + lower, inside)
+            inside = minimum(upper + lower, inside)
         near = singles[_NEAR + child]
-        subtiles = mask & at_least(inside, zero) & at_least(reach, splat(near))
+        subtiles = mask & greater_equal(inside, zero) & greater_equal(reach, splat(near))
         code = np.int64(children[k + 48])
-        put(stack, codes, count, near, code, subtiles)
-        count += np.int64(subtiles != 0)  # no branch: it would often be mispredicted
+        write_entry(stack, codes, count, near, code, subtiles)
+        count += np.int64(subtiles != 0)  # without a branch, which would often be mispredicted
         leaf = blocks + 4 * BLOCK * (~code >> LEAF_BITS)
         line = uint8s(nodes + 4 * NODE * code if code >= 0 else leaf)
         for byte in range(0, 4 * BLOCK, 64):
@@ -129,25 +137,25 @@ def _open_node(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore
     return count
 
 
-@stage
-def _unfinished(tile, count):  # type: ignore[no-untyped-def]
-    """Return the mask of the subtiles that reach one of the first `count` waiting nodes."""
+@noinline
+def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
+    """Return the mask of the subtiles that reach one of the first `count` pending nodes."""
     reach = load(float32s(tile), _REACH)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
     codes = int32s(address)
     subtiles = np.int64(0)
     for k in range(count):
-        subtiles |= codes[ENTRY * k + 2] & at_least(reach, splat(stack[ENTRY * k]))
+        subtiles |= codes[ENTRY * k + 2] & greater_equal(reach, splat(stack[ENTRY * k]))
     return subtiles
 
 
-@part(types.int64(*5 * WHOLE))
-def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of a mask of subtiles in a mesh, and return the mask of unfinished subtiles.
+@called_by_address(types.int64(*5 * INT64))
+def walk_tile(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
+    """Cast the rays of a mask of subtiles at a mesh, and return the mask of unfinished subtiles.
 
-    The walk ends early if the tile meets more leaves than it has rays: then the subtiles that may
-    meet a node that still waits are unfinished.
+    The traversal stops if the tile visits more leaves than it has rays. In this case, the subtiles
+    that may intersect a pending node are unfinished.
     """
     singles = float32s(tile)
     address = int64s(tile)[_STACK]
@@ -155,36 +163,36 @@ def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
     codes = int32s(address)
     nodes = int64s(mesh)[NODES]
     blocks = int64s(mesh)[BLOCKS]
-    deepest = highest(load(singles, _REACH))
+    deepest = max_lane(load(singles, _REACH))
     leaves = 0
-    put(stack, codes, 0, -FAR, 0, mask)
+    write_entry(stack, codes, 0, -FAR, 0, mask)
     count = np.int64(1)
     while count > 0:
         count -= 1
         near = stack[ENTRY * count]
         code = np.int64(codes[ENTRY * count + 1])
-        subtiles = codes[ENTRY * count + 2] & at_least(load(singles, _REACH), splat(near))
+        subtiles = codes[ENTRY * count + 2] & greater_equal(load(singles, _REACH), splat(near))
         if subtiles == 0:
             continue
         if code >= 0:
-            count = _open_node(
+            count = _push_children(
                 tile, nodes, blocks, node=code, mask=subtiles, deepest=deepest, count=count
             )
             continue
         leaves += 1
         if leaves > rays:
-            return _unfinished(tile, count + 1)
+            return _unfinished_subtiles(tile, count + 1)
         changed = test_leaf(tile, rays, mesh, instance, ~code, subtiles, deepest)
         if changed != 0:
-            deepest = limit_depths(tile, rays, changed)
+            deepest = update_depths(tile, rays, changed)
     return np.int64(0)
 
 
-@part(types.int64(*3 * WHOLE))
+@called_by_address(types.int64(*3 * INT64))
 def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
-    """Write the instances that a tile may meet, nearest last, and return their number.
+    """List the instances that a tile may hit, the closest last, and return their number.
 
-    `nodes` is the address of the tree over the instances, `mask` of the subtiles to cast.
+    `nodes` is the address of the instance tree, and `mask` contains the subtiles to cast.
     """
     singles = float32s(tile)
     numbers = int64s(tile)
@@ -193,8 +201,8 @@ def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
     codes = int32s(address)
     met = float32s(numbers[_MET])
     met_codes = int32s(numbers[_MET])
-    deepest = highest(load(singles, _REACH))
-    put(stack, codes, 0, -FAR, 0, mask)
+    deepest = max_lane(load(singles, _REACH))
+    write_entry(stack, codes, 0, -FAR, 0, mask)
     count = np.int64(1)
     met_count = np.int64(0)
     while count > 0:
@@ -203,11 +211,11 @@ def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
         code = np.int64(codes[ENTRY * count + 1])
         subtiles = codes[ENTRY * count + 2]
         if code >= 0:
-            count = _open_node(
+            count = _push_children(
                 tile, nodes, nodes, node=code, mask=subtiles, deepest=deepest, count=count
             )
         else:
-            put(met, met_codes, met_count, near, ~code >> LEAF_BITS, subtiles)
+            write_entry(met, met_codes, met_count, near, ~code >> LEAF_BITS, subtiles)
             met_count += 1
     sort_farthest_first(numbers[_MET], 0, met_count)
     return met_count

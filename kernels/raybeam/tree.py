@@ -1,14 +1,14 @@
-"""The tree for traversal: a wide, flat form of a binary hierarchy.
+"""Wide, flat bounding volume hierarchies for traversal.
 
-Boxes are rounded and padded outwards, so that a test of a ray and a box in float32 never
-loses a triangle that the ray meets in exact arithmetic:
+The boxes are padded and rounded outward, so that a float32 test of a ray and a box never misses a
+box whose triangle the ray hits in exact arithmetic. In the following, u = 2**-24, and the local
+coordinates of boxes and ray starts are within [-1, 1].
 
-With u = 2**-24, local coordinates and starts within [-1, 1] and unit directions, the distance to a
-plane is computed from a start that is off by u, a reciprocal direction that is off by 2u relative,
-and with up to three more roundings of values up to 2. Expressed as a shift of the plane, this is at
-most 12 u. Advancing a remote ray to the box in float64 adds up to 6 u at 1e9 local units, the
-distance beyond which every triangle is decided in float64. Boxes are padded by 20 u. Storing the
-boxes in float32 takes at most u of the padding.
+The distance to a plane is computed from a start with an error of u and a reciprocal direction with
+a relative error of 2 u, and there are up to three further roundings of values up to 2. Expressed as
+a shift of the plane, the error is at most 12 u. Advancing a distant ray to the box in float64 adds
+up to 6 u at a distance of 1e9 local units. Beyond this distance, every triangle is tested in
+float64. Storing the boxes in float32 adds at most u. The boxes are padded by 20 u.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ LEAF_BITS = 3
 
 @dataclass(frozen=True)
 class WideTree:
-    """Nodes with up to `width` children, starting with the root, node 0.
+    """Nodes with up to `width` children. Node 0 is the root.
 
     Attributes
     ----------
     lower, upper
-        float32 (m, 3, width): the children's boxes, padded by `PAD`; an empty slot has an
-        inverted box, which no ray hits.
+        float32 (m, 3, width): boxes of the children, padded by `PAD`. An empty slot has an inverted
+        box, which no ray intersects.
     child
-        int32 (m, width): number of a node, or ``~(first << LEAF_BITS | count - 1)`` for a leaf
-        that holds the triangles ``order[first : first + count]``; 0 in an empty slot.
+        int32 (m, width): index of a node, or ``~(first << LEAF_BITS | count - 1)`` for a leaf with
+        the triangles ``order[first : first + count]``, or 0 in an empty slot.
     order
-        int32 (k,): triangles in the order of the leaves.
+        int32 (k,): triangles in leaf order.
     """
 
     lower: Floats32
@@ -50,25 +50,27 @@ class WideTree:
 def build_tree(
     corners: Floats, width: int, leaf_size: int, triangle_cost: float | None = None
 ) -> WideTree:
-    """Build a tree over triangles, or over boxes.
+    """Build a tree over triangles or boxes.
 
     Parameters
     ----------
     corners
-        float64 (k, c, 3): local corners; of a box, the lower and the upper corner.
+        float64 (k, c, 3): vertices of the triangles, or lower and upper corners of the boxes, in
+        local coordinates.
     width
-        Maximum children of a node.
+        Maximum number of children per node.
     leaf_size
-        Maximum triangles of a leaf, up to ``1 << LEAF_BITS``.
+        Maximum number of triangles per leaf, at most ``1 << LEAF_BITS``.
     triangle_cost
-        Cost of each triangle of a leaf, as a share of the leaf's; a node costs half as much as a
-        leaf. None for leaves that cost as much as a node for each triangle.
+        Cost of each triangle in a leaf relative to the fixed cost of a leaf. The cost of a node is
+        half the cost of a leaf. If None, leaves have no fixed cost, and each triangle costs as much
+        as a node.
     """
-    each = corners.transpose(1, 0, 2)  # reduced corner by corner: ten times as fast
+    each = corners.transpose(1, 0, 2)  # reducing corner by corner is ten times as fast
     lower = np.ascontiguousarray((reduce(np.minimum, each) - PAD).T, dtype=np.float32)
     upper = np.ascontiguousarray((reduce(np.maximum, each) + PAD).T, dtype=np.float32)
-    binary = ploc.build(lower, upper)
-    count, leaf = _leaves(binary, leaf_size, triangle_cost)
+    binary = ploc.build_binary_tree(lower, upper)
+    count, leaf = _choose_leaves(binary, leaf_size, triangle_cost)
     first = _positions(binary, count)
     n = len(corners)
     order = np.empty(n, np.int32)
@@ -77,10 +79,10 @@ def build_tree(
     return _widen(binary, leaf, code, order, width)
 
 
-def build_top(boxes: Floats, width: int) -> WideTree:
-    """Build a tree over instances' boxes (n, 2, 3), with a single box in each leaf.
+def build_instance_tree(boxes: Floats, width: int) -> WideTree:
+    """Build a tree over the boxes (n, 2, 3) of instances, with a single box per leaf.
 
-    Leaves have the number of an instance in place of a position in `order`.
+    Leaves contain the index of an instance instead of a position in `order`.
     """
     tree = build_tree(boxes, width, 1)
     number = tree.order[np.maximum(~tree.child, 0) >> LEAF_BITS]
@@ -88,10 +90,10 @@ def build_top(boxes: Floats, width: int) -> WideTree:
     return WideTree(tree.lower, tree.upper, child, np.arange(len(boxes), dtype=np.int32))
 
 
-def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
-    """Join trees in sequence, and return the joint tree, and the root of each.
+def join_trees(trees: list[WideTree]) -> tuple[WideTree, Ints]:
+    """Join several trees into one, and return it with the root of each tree.
 
-    Triangles are numbered over all trees, in order.
+    Triangles are numbered consecutively over all trees.
     """
     roots = np.cumsum([0, *(len(tree.child) for tree in trees)])
     if len(trees) == 1:
@@ -112,12 +114,12 @@ def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     ), roots[:-1]
 
 
-def _leaves(
+def _choose_leaves(
     tree: ploc.BinaryTree, leaf_size: int, triangle_cost: float | None
 ) -> tuple[Ints32, Bools]:
-    """Return the number of triangles under each node, and whether a leaf is cheaper.
+    """Return the number of triangles below each node, and whether each node is best made a leaf.
 
-    By the surface area heuristic, with the costs that `build_tree` describes.
+    The decision is based on the surface area heuristic with the costs that `build_tree` describes.
     """
     area = tree.area
     fixed, slope, opened = (0.0, 1.0, 1.0) if triangle_cost is None else (1.0, triangle_cost, 0.5)
@@ -137,7 +139,7 @@ def _leaves(
 
 
 def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
-    """Return the position of each node's first triangle, with all triangles in tree order."""
+    """Return the position of the first triangle below each node in leaf order."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
         first_child = tree.first_child[start:stop]
@@ -154,7 +156,11 @@ def _widen(
     order: Ints32,
     width: int,
 ) -> WideTree:
-    """Return nodes of up to `width` children: level by level, the largest child is opened first."""
+    """Combine binary nodes into nodes with up to `width` children, level by level.
+
+    In each node, the child with the largest surface area is replaced by its own children until all
+    slots are used.
+    """
     area = np.where(leaf, -1, tree.area)
     lowers = []
     uppers = []
@@ -162,7 +168,7 @@ def _widen(
     roots = np.array([len(leaf) - 1])
     total = 1
     while len(roots):
-        slots = _open(tree, area, roots, width)
+        slots = _wide_children(tree, area, roots, width)
         used = slots >= 0
         lowers.append(np.where(used, tree.lower[:, slots], np.inf).astype(np.float32))
         uppers.append(np.where(used, tree.upper[:, slots], -np.inf).astype(np.float32))
@@ -179,8 +185,11 @@ def _widen(
     )
 
 
-def _open(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> Indices:
-    """Return up to `width` binary nodes below each root, filled up by -1: (len(roots), width)."""
+def _wide_children(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> Indices:
+    """Return up to `width` descendants of each binary node in `roots`.
+
+    The result has shape (len(roots), width) and is padded with -1.
+    """
     children = np.full((len(roots), width), -1)
     children[:, 0] = roots
     row = np.arange(len(roots))

@@ -1,16 +1,17 @@
-"""The test that decides whether a ray hits a triangle, in float64.
+"""The intersection test that decides whether a ray hits a triangle, in float64.
 
-It is the watertight test of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle
-Intersection": corners are taken relative to the ray's origin and sheared so that the ray runs
-along an axis; three signed areas in the plane across that axis then show whether the ray passes
-inside.
-Shearing a corner does not depend on its triangle, and the sign of ``a * b - c * d`` is right or
-zero in floating point as long as no multiply-add is fused. Because zero counts as inside, triangles
-that share an edge or a corner leave no gap, whatever the rounding. (Signed volumes of Plücker
-coordinates are consistent along an edge too, but round independently for the edges around one
-corner, so a ray at a corner can slip through.)
+The test is that of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle Intersection". The
+vertices are translated to the origin of the ray and sheared so that the ray runs along an axis.
+Three signed areas in the plane perpendicular to this axis then determine whether the ray passes
+through the triangle.
 
-intersect.cu does the same operations in the same order, so its distances have the same bits.
+The sheared position of a vertex does not depend on the triangle, and in floating point, the sign of
+``a * b - c * d`` is either correct or zero as long as no fused multiply-add is used. Because zero
+counts as inside, there are no gaps between triangles that share an edge or a vertex, regardless of
+rounding. Signed volumes in Plücker coordinates are also consistent along an edge, but they round
+independently for the edges that meet at a vertex, so that a ray at a vertex can slip through.
+
+intersect.cu performs the same operations in the same order, so its distances have the same bits.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from .arrays import Bools, Floats, Indices
 
 @dataclass(frozen=True)
 class ShearedRays:
-    """Rays prepared for the test, with an entry for each ray in every array.
+    """Rays prepared for the test, with one element per ray in each array.
 
     Attributes
     ----------
     kx, ky, kz
-        Axes in cyclic order; the ray advances most along kz.
+        Axes in cyclic order, where kz is the axis of the largest direction component.
     ox, oy, oz
-        Local origin along kx, ky, kz.
+        Local origin along kx, ky and kz.
     sx, sy, sz
-        The shear: direction along kx, ky over direction along kz, and 1 over direction along kz.
+        Shear: the direction components along kx and ky, divided by the component along kz, and the
+        reciprocal of the latter.
     """
 
     kx: Indices
@@ -49,17 +51,17 @@ class ShearedRays:
 
 
 class PlaneHits(NamedTuple):
-    """Where the lines of rays (m,) meet the planes of triangles.
+    """Intersections of rays with the planes of triangles, (m,) each.
 
     Attributes
     ----------
     a, b, c
-        float64 (m,): weights of the three corners times `det`. The ray passes inside if none is
-        negative or none is positive (`inside`).
+        float64 (m,): weights of the three vertices times `det`. The ray passes through the triangle
+        if all have the same sign or are zero (see `is_inside`).
     det
-        float64 (m,): ``(a + b) + c``; zero if the ray runs in the triangle's plane.
+        float64 (m,): ``(a + b) + c``, which is zero if the ray lies in the plane of the triangle.
     t
-        float64 (m,): distance in local units; meaningless where `det` is zero.
+        float64 (m,): distance in local units. Meaningless if `det` is zero.
     """
 
     a: Floats
@@ -69,8 +71,8 @@ class PlaneHits(NamedTuple):
     t: Floats
 
 
-def shear(origins: Floats, directions: Floats) -> ShearedRays:
-    """Prepare rays with local origins (n, 3) and unit directions (n, 3)."""
+def shear_rays(origins: Floats, directions: Floats) -> ShearedRays:
+    """Prepare rays with local origins (n, 3) and unit directions (n, 3) for the test."""
     kz = np.argmax(np.abs(directions), axis=1)
     kx = (kz + 1) % 3
     ky = (kz + 2) % 3
@@ -90,18 +92,19 @@ def shear(origins: Floats, directions: Floats) -> ShearedRays:
 
 
 def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices) -> PlaneHits:
-    """Compute signed areas and distance of pairs of a ray and a triangle.
+    """Compute the signed areas and distances for pairs of rays and triangles.
 
     Parameters
     ----------
     rays
         Prepared rays.
     ray, triangle
-        (m,): the pairs.
+        (m,): indices of the rays and triangles.
     corners
-        (k, 3, 3): local corners of all triangles.
+        (k, 3, 3): vertices of all triangles in local coordinates.
     """
-    # Areas of rays that are farther than 1e154 m overflow to infinity or NaN, and are never hits.
+    # If a ray is farther away than 1e154 m, the areas overflow to infinity or NaN, which is not a
+    # hit.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         x, y, z = _sheared_corners(rays, ray, corners, triangle)
         a = x[2] * y[1] - y[2] * x[1]
@@ -115,9 +118,9 @@ def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indice
 def _sheared_corners(
     rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
 ) -> tuple[list[Floats], list[Floats], list[Floats]]:
-    """Return the coordinates of the three corners of triangles (m,), relative to rays (m,).
+    """Return the coordinates of the three vertices of triangles (m,) relative to rays (m,).
 
-    Three lists by corner: x and y across the ray, by the shear, and z along kz; (m,) each.
+    The result is three lists with one array (m,) per vertex: sheared x and y, and z along kz.
     """
     flat = corners.reshape(-1)
     row_x = triangle * 9 + rays.kx[ray]
@@ -139,7 +142,7 @@ def _sheared_corners(
     return x, y, z
 
 
-def inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
-    """Return whether the line of a ray passes through a triangle, edges and corners included."""
+def is_inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
+    """Return whether rays pass through triangles, including their edges and vertices."""
     same_sign = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     return same_sign & (det != 0)

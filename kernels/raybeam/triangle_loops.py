@@ -1,4 +1,4 @@
-"""The test of triangle.py, as parts of compiled loops."""
+"""The intersection test of triangle.py for compiled loops."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from .compiled import inlined
 
 
 class PlaneHit(NamedTuple):
-    """Where the line of a ray meets the plane of a triangle.
+    """Intersection of a ray with the plane of a triangle.
 
     Attributes
     ----------
     a, b, c
-        Signed areas: weights of the three corners times `det`.
+        Signed areas: weights of the three vertices times `det`.
     det
-        ``(a + b) + c``; 0 if the ray runs in the plane.
+        ``(a + b) + c``, which is 0 if the ray lies in the plane.
     t
-        Distance in local units; meaningless if `det` is 0.
+        Distance in local units. Meaningless if `det` is 0.
     """
 
     a: float
@@ -28,8 +28,8 @@ class PlaneHit(NamedTuple):
 
 
 @inlined
-def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return the longest axis of a ray, its origin with that axis last, and its shear."""
+def shear_ray(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the longest axis of a ray, its origin with this axis last, and its shear."""
     ax = abs(dx)
     ay = abs(dy)
     az = abs(dz)
@@ -53,8 +53,11 @@ def shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def areas(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `PlaneHit` of a triangle, by corners with the axis last, and a sheared ray."""
+def intersect_plane(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
+    """Return the `PlaneHit` of a sheared ray with the plane of a triangle.
+
+    The coordinates of the three vertices have the longest axis of the ray last.
+    """
     u, v, w, sx, sy, sz = ray
     (px, py, pz), (qx, qy, qz), (rx, ry, rz) = corners
     z0 = pz - w
@@ -75,5 +78,5 @@ def areas(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a co
 
 @inlined
 def same_sign(a, b, c):  # type: ignore[no-untyped-def]
-    """Return whether no area is negative, or none is positive."""
+    """Return whether no area is negative or none is positive."""
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))

@@ -1,11 +1,12 @@
-"""Vectors as values of compiled loops: 8 float32, or 4 float64, in a processor's registers.
+"""Vectors of 8 float32 or 4 float64 numbers for compiled loops, held in the CPU's registers.
 
-Numba turns loops over arrays into vector instructions, but not the body of a tree's traversal, and
-it keeps each step of such a loop in memory. A type whose values are LLVM's vectors stays in
-registers. LLVM divides these vectors where a processor's are shorter: SSE and NEON have 4 float32.
+numba vectorizes loops over arrays, but not the body of a tree traversal, and it stores each
+intermediate result of such a loop in memory. Values of a type that is an LLVM vector remain in
+registers. LLVM splits these vectors if the registers of a CPU are shorter, such as the 4 float32
+numbers of SSE and NEON.
 
-A mask is a whole number: bit k belongs to lane k. `cast_memory.pointer` makes pointers, indices
-count elements, and no address needs to be aligned.
+A mask is an integer in which bit k belongs to lane k. Pointers come from `cast_record.pointer`,
+indices count elements, and addresses do not need to be aligned.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _I64 = ir.IntType(64)
 
 
 class Vector(types.Type):
-    """The numba type of a vector of `count` numbers of a type."""
+    """The numba type of a vector with `count` elements of a numba number type."""
 
     def __init__(self, element: Any, count: int) -> None:
         self.element = element
@@ -46,7 +47,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _define_operator(function: Any, instruction: str) -> None:
-    """Define an operator for two vectors of a type by an instruction of LLVM."""
+    """Implement an operator for two vectors of the same type by an LLVM instruction."""
 
     @infer_global(function)
     class _Typing(AbstractTemplate):
@@ -68,13 +69,13 @@ for _operator, _instruction in (
     _define_operator(_operator, _instruction)
 
 
-def _at(builder: Any, pointer: Any, index: Any, kind: Any) -> Any:
+def _element_pointer(builder: Any, pointer: Any, index: Any, kind: Any) -> Any:
     """Return a pointer to a type, `index` elements after `pointer`."""
     return builder.bitcast(builder.gep(pointer, [index]), kind.as_pointer())
 
 
 def _splat(builder: Any, number: Any, kind: Any) -> Any:
-    """Return a vector of an LLVM type with equal numbers."""
+    """Return a vector of an LLVM type with equal elements."""
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, number, _I32(0))
     lanes = ir.Constant(ir.VectorType(_I32, kind.count), [0] * kind.count)
@@ -83,13 +84,13 @@ def _splat(builder: Any, number: Any, kind: Any) -> Any:
 
 @intrinsic
 def load(context: Any, pointer: Any, index: Any) -> Any:
-    """Return the vector of numbers from an index on."""
+    """Load a vector from consecutive elements, starting at an index."""
     kind = _VECTOR[pointer.dtype]
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index = arguments
         align = kind.element.bitwidth // 8
-        return builder.load(_at(builder, pointer, index, _LLVM[kind]), align=align)
+        return builder.load(_element_pointer(builder, pointer, index, _LLVM[kind]), align=align)
 
     return kind(pointer, types.int64), generate
 
@@ -101,7 +102,7 @@ def store(context: Any, pointer: Any, index: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index, value = arguments
         align = kinds.args[2].element.bitwidth // 8
-        builder.store(value, _at(builder, pointer, index, value.type), align=align)
+        builder.store(value, _element_pointer(builder, pointer, index, value.type), align=align)
         return context.get_dummy_value()
 
     return types.void(pointer, types.int64, value), generate
@@ -109,7 +110,7 @@ def store(context: Any, pointer: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat(context: Any, number: Any) -> Any:
-    """Return a vector with all lanes equal to a float32 or float64."""
+    """Return a vector whose lanes are all equal to a float32 or float64 number."""
     kind = _VECTOR[number]
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -125,13 +126,16 @@ def _call(builder: Any, name: str, result: Any, arguments: Any) -> Any:
 
 
 def _suffix(kind: Any) -> str:
-    """Return the end of the names of LLVM's functions of a vector type."""
+    """Return the suffix of the names of LLVM intrinsics for a vector type."""
     return f"v{kind.count}f{kind.element.bitwidth}"
 
 
 @intrinsic
 def multiply_add(context: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return ``a * b + c``, rounded once where the processor can: never for what decides a hit."""
+    """Return ``a * b + c``, fused if the CPU supports it.
+
+    Whether it is fused affects the last bits, so it must not be used where a hit is decided.
+    """
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         name = f"llvm.fmuladd.{_suffix(kinds.args[0])}"
@@ -167,7 +171,7 @@ def copy_sign(context: Any, a: Any, b: Any) -> Any:
     return a(a, a), generate
 
 
-def _choice(comparison: str) -> Any:
+def _select(comparison: str) -> Any:
     @intrinsic
     def choose(context: Any, a: Any, b: Any) -> Any:
         def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -178,13 +182,14 @@ def _choice(comparison: str) -> Any:
     return choose
 
 
-lower_of = _choice("<")  # the second where a lane of either is NaN
-higher_of = _choice(">")
+# If a lane of either vector is NaN, the result is the lane of the second vector.
+minimum = _select("<")
+maximum = _select(">")
 
 
 @intrinsic
-def at_least(context: Any, a: Any, b: Any) -> Any:
-    """Return the mask of the lanes where ``a >= b``."""
+def greater_equal(context: Any, a: Any, b: Any) -> Any:
+    """Return the mask of the lanes in which ``a >= b``."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         lanes = builder.fcmp_ordered(">=", *arguments)
@@ -193,7 +198,7 @@ def at_least(context: Any, a: Any, b: Any) -> Any:
     return types.int64(a, a), generate
 
 
-def _reduction(comparison: str) -> Any:
+def _reduce_lanes(comparison: str) -> Any:
     @intrinsic
     def reduce(context: Any, a: Any) -> Any:
         def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -217,13 +222,13 @@ def _reduction(comparison: str) -> Any:
     return reduce
 
 
-highest = _reduction(">")
-lowest = _reduction("<")
+max_lane = _reduce_lanes(">")
+min_lane = _reduce_lanes("<")
 
 
 @intrinsic
-def narrow(context: Any, a: Any, b: Any) -> Any:
-    """Return two vectors of 4 float64 as a vector of 8 float32."""
+def to_float32(context: Any, a: Any, b: Any) -> Any:
+    """Convert two vectors of 4 float64 to a vector of 8 float32."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         lanes = ir.Constant(ir.VectorType(_I32, 8), list(range(8)))
@@ -234,7 +239,7 @@ def narrow(context: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def lowest_bit(context: Any, mask: Any) -> Any:
-    """Return the number of the lowest bit of a mask that is set, for a mask that is not 0."""
+    """Return the position of the lowest set bit of a nonzero mask."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _call(builder, "llvm.cttz.i64", _I64, [arguments[0], ir.IntType(1)(1)])
@@ -244,7 +249,7 @@ def lowest_bit(context: Any, mask: Any) -> Any:
 
 @intrinsic
 def bit_count(context: Any, mask: Any) -> Any:
-    """Return the number of bits of a mask that are set."""
+    """Return the number of set bits of a mask."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _call(builder, "llvm.ctpop.i64", _I64, arguments)
@@ -254,11 +259,11 @@ def bit_count(context: Any, mask: Any) -> Any:
 
 @intrinsic
 def prefetch(context: Any, pointer: Any, index: Any) -> Any:
-    """Fetch the line of an element to the cache."""
+    """Prefetch the cache line that contains a byte, `index` elements after `pointer`."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index = arguments
-        address = _at(builder, pointer, index, _I8)
+        address = _element_pointer(builder, pointer, index, _I8)
         _call(builder, "llvm.prefetch.p0", ir.VoidType(), [address, _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
@@ -266,15 +271,15 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
 
 
 @intrinsic
-def write_where(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Write the lanes of a mask of a vector from an index on, without a branch."""
+def store_masked(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
+    """Store the lanes of a vector that a mask selects, starting at an index, without a branch."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         mask, pointer, index, value = arguments
         count = value.type.count
         bits = builder.trunc(mask, ir.IntType(count))
         lanes = builder.bitcast(bits, ir.VectorType(ir.IntType(1), count))
-        target = _at(builder, pointer, index, value.type)
+        target = _element_pointer(builder, pointer, index, value.type)
         align = kinds.args[3].element.bitwidth // 8
         old = builder.load(target, align=align)
         builder.store(builder.select(lanes, value, old), target, align=align)
@@ -284,12 +289,12 @@ def write_where(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -
 
 
 @intrinsic
-def write_word(context: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Write 8 bytes, the lowest first, from an index of bytes on."""
+def store_int64(context: Any, pointer: Any, index: Any, value: Any) -> Any:
+    """Store an int64 at a byte index, in the byte order of the CPU."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index, value = arguments
-        builder.store(value, _at(builder, pointer, index, _I64), align=1)
+        builder.store(value, _element_pointer(builder, pointer, index, _I64), align=1)
         return context.get_dummy_value()
 
     return types.void(pointer, types.int64, types.int64), generate
@@ -297,7 +302,10 @@ def write_word(context: Any, pointer: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat_bits(context: Any, number: Any) -> Any:
-    """Return four copies of an int64, as the float64 with its bits: to be stored only."""
+    """Return a float64 vector whose lanes have the bits of an int64.
+
+    The vector is only meant to be stored.
+    """
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _splat(builder, builder.bitcast(arguments[0], ir.DoubleType()), _LLVM[double4])

@@ -1,12 +1,12 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from . import extras as extras  # adds its features
+from . import extras as extras  # registers the features
 from ._version import __version__
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .extras.background import after_all
 from .extras.cancelling import cancelled
-from .extras.listening import Listener
+from .extras.listening import PipeListener
 from .mapping import Results
 from .partition import Partition
 from .partition_stats import PartitionStats, StageStats
@@ -17,12 +17,12 @@ from .task_table import TaskRow, TaskTable
 from .workers import WorkerInfo
 
 __all__ = [
-    "Listener",
     "Partition",
     "PartitionStats",
     "Pipe",
     "PipeClosed",
     "PipeFailed",
+    "PipeListener",
     "Pool",
     "PoolError",
     "Results",

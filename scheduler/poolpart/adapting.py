@@ -1,17 +1,17 @@
-"""Partitions that grow with their work: how many slots are missing, and which jobs may end.
+"""Adaptive partitions, whose number of jobs follows their work.
 
-A plugin of the scheduler keeps a record of each partition: how many jobs the partition may have,
-how many slots clients request, and when its workers last ran a task. Once a second, the process
-that has the cluster object (`deploy/clusters.py`) reports its jobs, and receives how many to start
-and which have ended.
+A scheduler plugin stores a record of each partition, with the allowed number of jobs, the slots
+that clients request, and the time when its workers last ran a task. Jobs are started by the process
+with the cluster object (see `deploy/clusters.py`). Once per second, this process reports its jobs,
+and the scheduler replies with the number of jobs to start and the jobs that have ended.
 
-The scheduler decides, because no task can arrive between the moment when the scheduler finds a
-worker idle and the moment when the worker stops getting tasks. A job that waits in the queue is
-cancelled in the same way: if its worker joins after all, the worker is sent away before it gets a
-task.
+The scheduler makes these decisions because no task can arrive between the moment when it finds a
+worker idle and the moment when it stops assigning tasks to that worker. Jobs that wait in a queue
+are canceled in the same way. If the worker of a canceled job joins after all, it is rejected before
+it receives a task.
 
-A group of workers (`deploy/worker_groups.py`) has jobs without names: each worker is a job, named
-when it joins. Such a job cannot be cancelled before it joins.
+In a worker group (see `deploy/worker_groups.py`), each worker is a job, and has no name before it
+joins. Therefore, such a job cannot be canceled before it joins.
 """
 
 from __future__ import annotations
@@ -26,43 +26,43 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
-from .fetch import holds_for_driver
+from .fetch import holds_bytes
 from .internals.scheduler import (
-    call,
+    accepts_tasks,
+    call_worker,
     is_bound,
     is_idle,
-    reopen,
-    retire,
-    shut,
-    takes_tasks,
-    turn_away,
-    waiting_for_workers,
+    reject_worker,
+    resume_assigning,
+    retire_workers,
+    stop_assigning,
+    unrunnable_tasks,
 )
 from .internals.worker import has_running_tasks
 from .rules import check_count
 
 NAME = "poolpart-adapting"
-IDLE_S = 60.0  # after which a job without work ends, by default
-_ANSWER_S = 5.0  # seconds that an idle worker has to confirm that it runs no task
-_LOST_S = 120.0  # without a report, after which the process that starts jobs counts as dead
+IDLE_S = 60.0  # default time without work after which a job ends
+_ANSWER_S = 5.0  # time for an idle worker to confirm that it runs no task
+_LOST_S = 120.0  # time without a report after which the process that starts jobs counts as dead
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """Number of jobs that a partition may have."""
+class JobBounds:
+    """Allowed number of jobs of an adaptive partition."""
 
     minimum: int
     maximum: int
-    idle_s: float = IDLE_S
+    idle_s: float = IDLE_S  # time without work after which a job ends
 
     @classmethod
-    def checked(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> Bounds:
-        """Return checked bounds.
+    def validated(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> JobBounds:
+        """Create bounds from values that a user has passed.
 
         Raises
         ------
         PoolError
-            If a number is not possible.
+            If a value is invalid.
         """
         check_count(f"the minimum of partition {name!r}", minimum, minimum=0)
         check_count(f"the maximum of partition {name!r}", maximum, minimum=max(1, minimum))
@@ -75,98 +75,98 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class JobKind:
-    """Size of the jobs of a partition, and their number."""
+class JobSpec:
+    """Size and allowed number of the jobs of a partition."""
 
     slots: int  # slots per worker
     workers: int = 1  # workers per job
-    bounds: Bounds | None = None  # None for a fixed number of jobs
-    cancellable: bool = True  # before its workers have joined
+    bounds: JobBounds | None = None  # None for a fixed number of jobs
+    cancellable: bool = True  # whether a job can be canceled before its workers have joined
 
 
 @dataclass(frozen=True)
-class Advice:
-    """Jobs of a partition that the cluster's process has to start and to forget."""
+class JobAdvice:
+    """Instructions to the process with the cluster object, for one partition."""
 
     jobs_to_start: int = 0
-    jobs_to_forget: Sequence[str] = ()  # their workers have ended, or they are to be cancelled
+    jobs_to_forget: Sequence[str] = ()  # jobs to cancel, and jobs whose workers were closed
 
 
 @dataclass(frozen=True)
 class GroupReport:
-    """Report of the process that scales a group of workers."""
+    """Report about a worker group, sent to the scheduler by the process that scales the group."""
 
-    size: int  # workers that the group was scaled to
-    removed: Sequence[str] = ()  # names of workers that will not come back
+    size: int  # number of workers that the group was last scaled to
+    removed: Sequence[str] = ()  # names of workers that were removed and will not return
 
 
 @dataclass(frozen=True)
 class GroupAdvice:
-    """Order to the process that scales a group of workers."""
+    """Instructions to the process that scales a worker group."""
 
-    size: int  # workers that the group shall have
-    leaving: tuple[str, ...] = ()  # names of closed workers, to be removed from the group
+    size: int  # number of workers that the group should have
+    leaving: tuple[str, ...] = ()  # names of closed workers to remove from the group
 
 
 @dataclass(frozen=True)
 class _Decision:
-    """What happens to the jobs of a partition."""
+    """Decision about the jobs of a partition."""
 
-    advice: Advice
-    idle: dict[str, list[Any]]  # {job: states of its workers, which are to be closed}
+    advice: JobAdvice
+    idle: dict[str, list[Any]]  # {job to close: states of its workers}
 
 
 @dataclass
 class _Record:
-    """State of a partition, with times from `time.monotonic`."""
+    """State of a partition. All times are values of `time.monotonic`."""
 
-    kind: JobKind
-    queued_jobs: int = 0  # jobs whose workers have not joined
-    reported_at: float = 0.0  # when the process that starts jobs reported them
-    missing_slots: float = 0.0  # at the last report
+    spec: JobSpec
+    queued_jobs: int = 0  # number of jobs whose workers have not joined
+    reported_at: float = 0.0  # time of the last report
+    missing_slots: float = 0.0  # number of missing slots at the last report
     superfluous_since: dict[str, float] = field(default_factory=dict)  # {queued job: time}
-    leaving: set[str] = field(default_factory=set)  # closed workers that a group still has
+    leaving: set[str] = field(default_factory=set)  # closed workers that the group still lists
 
     @property
     def is_current(self) -> bool:
-        """Whether the process that starts jobs has reported them, and is not dead."""
+        """Whether the process that starts the jobs has sent a report recently."""
         return time.monotonic() - self.reported_at <= _LOST_S
 
 
-class Adaptation(SchedulerPlugin):
-    """The record of partitions whose jobs a cluster object starts."""
+class AdaptivePartitions(SchedulerPlugin):
+    """Scheduler plugin with the records of all partitions whose workers are started as jobs."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.records: dict[str, _Record] = {}  # {partition: its record}
+        self.records: dict[str, _Record] = {}  # records by partition
         self.requested: dict[tuple[str, str], int] = {}  # {(partition, client): slots}
-        self._busy_at: dict[str, float] = {}  # {address of a worker: when it last ran a task}
-        self._cancelled: set[str] = set()  # names of workers of cancelled jobs, which are unique
+        self._busy_at: dict[str, float] = {}  # {worker address: time when it last ran a task}
+        self._cancelled: set[str] = set()  # names of the workers of canceled jobs, never reused
 
     # -- hooks of the scheduler --------------------------------------------------------
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Begin to count idle time, or send a worker away whose job was cancelled meanwhile."""
+        """Start to measure the idle time of a worker, or reject the worker of a canceled job."""
         self._busy_at[worker] = time.monotonic()
         state = scheduler.workers[worker]
         if str(state.name) in self._cancelled:
-            turn_away(scheduler, state)
+            reject_worker(scheduler, state)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Forget a worker."""
+        """Delete the idle time of a worker that has left."""
         self._busy_at.pop(worker, None)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
-        """Note when a worker last ended a task: periodic looks would miss short tasks."""
+        """Record when a worker last finished a task. Periodic checks would miss short tasks."""
         if start == "processing" and worker in self._busy_at:
             self._busy_at[worker] = time.monotonic()
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Forget the requests of a client that has left."""
+        """Delete the slot requests of a client that has left."""
         for partition, requester in list(self.requested):
             if requester == client:
                 del self.requested[partition, requester]
@@ -174,7 +174,11 @@ class Adaptation(SchedulerPlugin):
     # -- decisions ---------------------------------------------------------------------
 
     def group_jobs(self, name: str, report: GroupReport) -> dict[str, list[str]]:
-        """Return {job: names of its workers} of a group: its members, and pending workers."""
+        """Return the jobs of a worker group with the names of their workers, for `decide`.
+
+        Each member is a job, and so is each worker that has not joined yet, under a placeholder
+        name.
+        """
         leaving = self.records[name].leaving
         leaving.difference_update(report.removed)
         members = [
@@ -187,33 +191,33 @@ class Adaptation(SchedulerPlugin):
         return {job: [job] for job in (*members, *pending)}
 
     def waiting_slots(self) -> dict[str, float]:
-        """Return the slots that tasks without a worker wait for, by partition."""
+        """Return the total slots that tasks without a worker request, by partition."""
         waiting: dict[str, float] = {}
-        for task in waiting_for_workers(self.scheduler):  # there may be 100,000
+        for task in unrunnable_tasks(self.scheduler):  # there may be 100,000
             if task.resource_restrictions and not is_bound(task):
                 for name, slots in task.resource_restrictions.items():
                     waiting[name] = waiting.get(name, 0.0) + slots
         return waiting
 
     def missing_slots(self, name: str, waiting: float, limit: float) -> float:
-        """Return the slots that a partition lacks, below 0 if its tasks leave slots unused.
+        """Return how many slots a partition lacks, as a negative number if slots are unused.
 
-        Tasks that are bound to a worker, or run for long there, hold its slots. All other tasks may
-        run on any worker of the partition, also on a new worker.
+        Tasks that are bound to a worker, or that have seceded there, occupy slots of that worker.
+        All other tasks can run on any worker of the partition, including a new one.
 
         Parameters
         ----------
         name
-            The partition.
+            Name of the partition.
         waiting
-            Slots that tasks without a worker wait for.
+            Number of slots that tasks without a worker request.
         limit
-            The result is at most this number of slots.
+            Upper limit of the result.
         """
         members = [
             worker
             for worker in self.scheduler.workers.values()
-            if worker.resources.get(name) and takes_tasks(worker)
+            if worker.resources.get(name) and accepts_tasks(worker)
         ]
         total = sum(worker.resources[name] for worker in members)
         free = 0.0
@@ -221,7 +225,8 @@ class Adaptation(SchedulerPlugin):
         for worker in members:
             held = 0.0
             for task in worker.processing:
-                if movable >= limit + total:  # a worker may have thousands of tasks
+                # Stop early, since a worker may have thousands of tasks.
+                if movable >= limit + total:
                     return limit
                 slots = (task.resource_restrictions or {}).get(name, 0)
                 if is_bound(task) or task in worker.long_running:
@@ -237,16 +242,21 @@ class Adaptation(SchedulerPlugin):
     def decide(
         self, name: str, jobs: Mapping[str, Sequence[str]], waiting: float
     ) -> _Decision | None:
-        """Decide which jobs of a partition start and end, or None if their number is fixed.
+        """Decide which jobs of a partition to start and to end.
 
         Parameters
         ----------
         name
-            The partition.
+            Name of the partition.
         jobs
-            {job: names of its workers}, the newest job last.
+            Names of the workers of each job, by job. The newest job is last.
         waiting
-            Slots that tasks without a worker wait for.
+            Number of slots that tasks without a worker request.
+
+        Returns
+        -------
+        _Decision or None
+            None if the number of jobs is fixed.
         """
         record = self.records[name]
         decided_at = time.monotonic()
@@ -260,23 +270,23 @@ class Adaptation(SchedulerPlugin):
         queued = [job for job, workers in present.items() if not workers and job not in ended]
         record.queued_jobs = len(queued)
         record.reported_at = decided_at
-        bounds = record.kind.bounds
+        bounds = record.spec.bounds
         if bounds is None:
             return None
-        slots_per_job = record.kind.slots * record.kind.workers
+        slots_per_job = record.spec.slots * record.spec.workers
         missing = self.missing_slots(name, waiting, float(bounds.maximum * slots_per_job))
-        # Work that lasts for less than a second is done before a job begins.
+        # Work that takes less than a second is finished before a new job starts.
         lasting = min(missing, record.missing_slots)
         record.missing_slots = missing
 
         def jobs_needed(slots: float) -> int:
-            """Return the number of queued jobs that a number of missing slots asks for."""
+            """Return the number of queued jobs that are needed to provide missing slots."""
             number = math.ceil(max(0.0, slots) / slots_per_job)
             lower = bounds.minimum - len(running)
             upper = bounds.maximum - len(running)
             return max(0, min(max(number, lower), upper))
 
-        superfluous = queued[jobs_needed(missing) :] if record.kind.cancellable else []
+        superfluous = queued[jobs_needed(missing) :] if record.spec.cancellable else []
         record.superfluous_since = {
             job: record.superfluous_since.get(job, decided_at) for job in superfluous
         }
@@ -287,14 +297,17 @@ class Adaptation(SchedulerPlugin):
         ]
         self._cancelled.update(worker for job in cancelled for worker in jobs[job])
         to_start = max(0, jobs_needed(lasting) - len(queued))
-        # Jobs that have ended are named again: an earlier answer may not have arrived.
-        advice = Advice(to_start, [*cancelled, *ended])
+        # Jobs that have ended are listed in each reply, because an earlier reply may be lost.
+        advice = JobAdvice(to_start, [*cancelled, *ended])
         return _Decision(advice, self._idle(name, running, -missing / slots_per_job, bounds))
 
     def _idle(
-        self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: Bounds
+        self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: JobBounds
     ) -> dict[str, list[Any]]:
-        """Return the workers to close by job: of the jobs that have been idle for longest."""
+        """Return the jobs to close with their workers, the longest idle jobs first.
+
+        `spare_jobs` is the number of jobs that the partition does not need at the moment.
+        """
         decided_at = time.monotonic()
         members = {
             job: workers
@@ -315,57 +328,61 @@ class Adaptation(SchedulerPlugin):
         return {job: [*members[job]] for job in idle[:number]}
 
     async def close_idle(self, workers: Sequence[Any]) -> bool:
-        """Close workers that no longer receive tasks.
+        """Close workers that have stopped receiving tasks.
 
-        If a worker turns out to be busy, let all of them receive tasks again, and return False.
+        If one of them turns out to be busy, all of them receive tasks again, and the result is
+        False.
         """
         addresses = [worker.address for worker in workers]
-        requests = (call(self.scheduler, address, _is_busy) for address in addresses)
+        requests = (call_worker(self.scheduler, address, _is_busy) for address in addresses)
         try:
             busy = any(await asyncio.wait_for(asyncio.gather(*requests), _ANSWER_S))
-        except (OSError, TimeoutError):  # stopped, or leaving by itself
+        except (OSError, TimeoutError):  # the worker is stopped, or is leaving on its own
             busy = True
-        if not busy and await retire(self.scheduler, workers):
-            # The container of a worker of Kubernetes is started again until it is removed.
+        if not busy and await retire_workers(self.scheduler, workers):
+            # Kubernetes restarts the container of a closed worker until the container is removed.
             self._cancelled.update(str(worker.name) for worker in workers)
             return True
         for worker in workers:
-            reopen(self.scheduler, worker)
+            resume_assigning(self.scheduler, worker)
             if worker.address in self._busy_at:
                 self._busy_at[worker.address] = time.monotonic()
         return False
 
 
 def _is_busy(dask_worker: Any = None) -> bool:
-    """Return whether a worker runs a task, or holds data, unknown to its scheduler."""
-    return has_running_tasks(dask_worker) or holds_for_driver()
+    """Return whether a worker runs a task, or holds data that no client has fetched yet.
+
+    The scheduler may not know about either.
+    """
+    return has_running_tasks(dask_worker) or holds_bytes()
 
 
 # -- requests of the process that starts jobs ----------------------------------------------
 
 
-def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
-    """Create the records of partitions whose jobs a process starts."""
-    record = _adaptation_of(dask_scheduler) or Adaptation(dask_scheduler)
+def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> None:
+    """Create the records of partitions whose workers are started as jobs."""
+    record = _adaptation_of(dask_scheduler) or AdaptivePartitions(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
-    for name, kind in kinds.items():
-        record.records[name] = _Record(kind)
+    for name, spec in specs.items():
+        record.records[name] = _Record(spec)
 
 
-async def look(
+async def advise_jobs(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
-) -> dict[str, Advice]:
-    """Close idle workers, then return which jobs to start and which to forget, by partition.
+) -> dict[str, JobAdvice]:
+    """Close idle workers, and return the jobs to start and to forget, by partition.
 
     `jobs` maps each partition to its jobs, and each job to the names of its workers. Partitions
-    with a fixed number of jobs are not in the result.
+    with a fixed number of jobs are omitted from the result.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
         return {}
     waiting = adaptation.waiting_slots()
-    advice: dict[str, Advice] = {}
+    advice: dict[str, JobAdvice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
     for name, jobs_of_partition in jobs.items():
         decision = adaptation.decide(name, jobs_of_partition, waiting.get(name, 0.0))
@@ -373,8 +390,8 @@ async def look(
             continue
         advice[name] = decision.advice
         for job, workers in decision.idle.items():
-            for worker in workers:  # one step of the event loop: no task can arrive before
-                shut(dask_scheduler, worker)
+            for worker in workers:  # in the same step of the event loop, so no task can arrive
+                stop_assigning(dask_scheduler, worker)
             closing.append((name, job, workers))
     results = await asyncio.gather(*(adaptation.close_idle(workers) for *_, workers in closing))
     for (name, job, _), closed in zip(closing, results, strict=True):
@@ -384,20 +401,20 @@ async def look(
     return advice
 
 
-async def look_at_groups(
+async def advise_groups(
     reports: Mapping[str, GroupReport], dask_scheduler: Any = None
 ) -> dict[str, GroupAdvice]:
-    """Close idle workers, then return the target sizes of the worker groups, by partition.
+    """Close idle workers, and return the target sizes of the worker groups, by partition.
 
-    Closed workers are listed again until a report confirms their removal, because an earlier
-    response may have been lost.
+    Closed workers are listed in each response until a report confirms their removal, because an
+    earlier response may have been lost.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
         return {}
     jobs = {name: adaptation.group_jobs(name, report) for name, report in reports.items()}
     advice: dict[str, GroupAdvice] = {}
-    for name, change in (await look(jobs, dask_scheduler)).items():
+    for name, change in (await advise_jobs(jobs, dask_scheduler)).items():
         leaving = adaptation.records[name].leaving
         leaving.update(change.jobs_to_forget)
         size = len(jobs[name]) + change.jobs_to_start - len(change.jobs_to_forget)
@@ -405,49 +422,49 @@ async def look_at_groups(
     return advice
 
 
-# -- requests of clients, by `on_scheduler` ----------------------------------------------------
+# -- requests of clients, sent by `run_on_scheduler` -------------------------------------------
 
 
-def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
-    """Change the number of jobs of a partition, or return False if no process starts its jobs."""
+def set_bounds(name: str, bounds: JobBounds, dask_scheduler: Any = None) -> bool:
+    """Change the allowed number of jobs, and return whether the partition has jobs at all."""
     record = _record(dask_scheduler, name)
     if record is not None:
-        record.kind = replace(record.kind, bounds=bounds)
+        record.spec = replace(record.spec, bounds=bounds)
     return record is not None
 
 
-def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
-    """Request slots of a partition for a client, by its id, or end the request with 0 slots.
+def request_slots(name: str, slots: int, client_id: str, dask_scheduler: Any = None) -> bool:
+    """Replace a client's slot request for a partition. A request for 0 slots ends it.
 
-    Returns False if the partition does not adapt.
+    The result is False if the partition is not adaptive.
     """
     adaptation = _adaptation_of(dask_scheduler)
-    # The last request of a client that was killed may come after it has left.
-    if adaptation is None or asking not in dask_scheduler.clients:
+    # The last request of a client that was killed may arrive after the client was removed.
+    if adaptation is None or client_id not in dask_scheduler.clients:
         return False
-    adaptation.requested.pop((name, asking), None)
+    adaptation.requested.pop((name, client_id), None)
     if slots:
-        adaptation.requested[name, asking] = slots
+        adaptation.requested[name, client_id] = slots
     return slots_of_new_worker(dask_scheduler, name) > 0
 
 
 def adaptive_names(dask_scheduler: Any = None) -> set[str]:
-    """Return the names of adaptive partitions, which may have no workers."""
+    """Return the names of adaptive partitions, including those without workers."""
     adaptation = _adaptation_of(dask_scheduler)
     records = adaptation.records if adaptation else {}
-    return {name for name, record in records.items() if record.kind.bounds is not None}
+    return {name for name, record in records.items() if record.spec.bounds is not None}
 
 
-# -- for other modules, on the scheduler -----------------------------------------------------
+# -- functions for other modules, on the scheduler -------------------------------------------
 
 
 def slots_of_new_worker(scheduler: Any, name: str) -> int:
-    """Return the slots of a worker that may join a partition, or 0 if the partition is fixed."""
+    """Return the number of slots that a new worker adds, or 0 if the partition is not adaptive."""
     return _upper_bound(scheduler, name)[1]
 
 
 def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
-    """Return the number of tasks that a partition runs at a time, now or with all its jobs.
+    """Return the number of tasks that a partition can run at a time once all its jobs have started.
 
     `slots` is the number of slots that each task takes.
     """
@@ -458,36 +475,39 @@ def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
 
 
 def max_slots(scheduler: Any, name: str) -> int:
-    """Return the slots of a partition with all its jobs, or 0 if the partition is fixed."""
+    """Return the number of slots with the maximum number of jobs, or 0 if there is no maximum."""
     return math.prod(_upper_bound(scheduler, name))
 
 
 def queued_jobs_of(scheduler: Any, name: str) -> int:
-    """Return the number of jobs of an adaptive partition that wait in the queue, or start."""
+    """Return the number of jobs of an adaptive partition that are queued or starting."""
     record = _record(scheduler, name)
-    if record is None or record.kind.bounds is None:
+    if record is None or record.spec.bounds is None:
         return 0
     return record.queued_jobs if record.is_current else 0
 
 
 def expects_workers(scheduler: Any, name: str) -> bool:
-    """Return whether jobs of a partition wait in a queue, start, or may be started."""
+    """Return whether a partition has jobs that are queued, starting, or can be started."""
     record = _record(scheduler, name)
     if record is None or not record.is_current:
         return False
-    return record.kind.bounds is not None or record.queued_jobs > 0
+    return record.spec.bounds is not None or record.queued_jobs > 0
 
 
 def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
-    """Return the number of workers with all jobs, and the slots of a worker, or (0, 0) if fixed."""
+    """Return the maximum number of workers and the number of slots of each worker.
+
+    Both are 0 if the partition is not adaptive.
+    """
     record = _record(scheduler, name)
-    if record is None or record.kind.bounds is None:
+    if record is None or record.spec.bounds is None:
         return 0, 0
-    return record.kind.bounds.maximum * record.kind.workers, record.kind.slots
+    return record.spec.bounds.maximum * record.spec.workers, record.spec.slots
 
 
-def _adaptation_of(scheduler: Any) -> Adaptation | None:
-    adaptation: Adaptation | None = scheduler.plugins.get(NAME)
+def _adaptation_of(scheduler: Any) -> AdaptivePartitions | None:
+    adaptation: AdaptivePartitions | None = scheduler.plugins.get(NAME)
     return adaptation
 
 

@@ -1,16 +1,17 @@
-"""The worker of a task, chosen in a time that does not grow with the cluster.
+"""Placement of tasks on workers in a time that does not depend on the size of the cluster.
 
-For a task with a resource, and for a task that a fence keeps out of a partition, Dask compares all
-workers that may take it, which takes the scheduler some microseconds for each worker
-(`benchmarks.placing`). Here it compares a few workers of the group that may take the task:
+If a task requires a resource, or if a fence keeps it out of a partition, Dask compares all workers
+that may run it. This takes the scheduler several microseconds per worker (see
+`benchmarks.placing`). The rule in this module only compares a few of these workers, using Dask's
+own objective function. They are the first nonempty group of the following:
 
 - workers that hold inputs of the task;
-- else workers that have free slots, the longest free worker first;
-- else, all being busy, some workers in turn.
+- workers with free slots, starting with the worker that has been free the longest;
+- if all workers are busy, some workers in rotation.
 
-Dask's own objective decides between them. The groups are the partitions and, if there are fences,
-the workers outside all fences. Small groups, tasks that are bound to workers or hosts, actors, and
-tasks whose inputs many workers hold are left to Dask, and so are all tasks if this rule fails.
+The candidates come from one group of workers, which is a partition or, if there are fences, all
+workers outside fences. Dask still places tasks of small groups, tasks that are bound to workers or
+hosts, actors, and tasks with inputs on many workers. If this rule fails, Dask places all tasks.
 """
 
 from __future__ import annotations
@@ -22,36 +23,39 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import NAME as FENCES
 from .fence import Fences
-from .internals.method_rules import Rules, rule_for_choice
+from .internals.method_rules import MethodRules, add_choice_rule
 from .internals.placing import (
+    can_run,
+    count_declaring,
+    earliest_worker,
     free_slots_of,
-    group_of,
     holders_of_inputs,
-    may_take,
-    number_declaring,
-    start_first,
+    only_resource_of,
     workers_declaring,
 )
 
 NAME = "poolpart-choice"
-COMPARED = 10  # workers that are compared for a task; smaller groups are left to Dask
-_EXAMINED = 50  # workers that are examined for free slots
-_OUTSIDE = ""  # name of the group of the workers outside all fences
+MAX_COMPARED = 10  # number of workers that are compared for a task
+_EXAMINED = 50  # number of workers that are examined for free slots
+_OUTSIDE = ""  # name of the group of workers outside all fences
 
 
 class _Group:
-    """Workers that may all take the same tasks."""
+    """Group of workers that can run the same tasks."""
 
     def __init__(self, name: str, version: Any, workers: list[Any]) -> None:
         self.name = name
-        self.version = version  # the state of the cluster when the group was made
+        self.version = version  # identifies the state of the cluster for which the group is valid
         self.workers = workers
         self.members = set(workers)
-        self.free = dict.fromkeys(workers)  # ordered set: workers that may have free slots
-        self._next_index = 0  # the first worker that `in_turn` returns next
+        self.free = dict.fromkeys(workers)  # ordered set of workers that may have free slots
+        self._next_index = 0  # index of the first worker in the next result of `in_turn`
 
     def with_free_slots(self, slots: float) -> list[Any]:
-        """Return up to `COMPARED` workers with enough free slots, and forget full workers."""
+        """Return up to `MAX_COMPARED` workers with enough free slots.
+
+        Workers without any free slot are removed from the set of free workers.
+        """
         workers: list[Any] = []
         for worker in list(islice(self.free, _EXAMINED)):
             free = free_slots_of(worker, self.name)
@@ -59,66 +63,72 @@ class _Group:
                 workers.append(worker)
             elif free < 1:
                 del self.free[worker]
-            if len(workers) == COMPARED:
+            if len(workers) == MAX_COMPARED:
                 break
         return workers
 
     def in_turn(self) -> list[Any]:
-        """Return `COMPARED` workers, evenly spread and different at each call."""
+        """Return `MAX_COMPARED` workers that are evenly spaced and differ from call to call."""
         number = len(self.workers)
         start = self._next_index
         self._next_index = (start + 1) % number
-        return [self.workers[(start + n * number // COMPARED) % number] for n in range(COMPARED)]
+        return [
+            self.workers[(start + n * number // MAX_COMPARED) % number] for n in range(MAX_COMPARED)
+        ]
 
 
-class WorkerChoice(SchedulerPlugin):
-    """The rule: chooses workers for tasks of partitions, and for tasks outside fences."""
+class WorkerChooser(SchedulerPlugin):
+    """Scheduler plugin that selects the workers of tasks in partitions and outside fences."""
 
     name = NAME
 
     def __init__(self, scheduler: Any, names: set[str]) -> None:
         self.scheduler = scheduler
-        self.names = names  # the partitions: the caller adds and removes names
-        self._changes = 0  # how often workers, or what they declare, have changed
+        self.names = names  # names of the partitions, a set that the caller updates
+        self._changes = 0  # number of changes of the workers and their declared resources
         self._groups: dict[str, _Group] = {}
-        self._rules = Rules()
-        rule_for_choice(self._rules, scheduler, self.choose)
+        self._rules = MethodRules()
+        add_choice_rule(self._rules, scheduler, self.choose)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
-        """Take the rule back."""
-        self._rules.take_back()
+        """Remove the rule from the scheduler."""
+        self._rules.remove_all()
         self.scheduler.remove_plugin(NAME)
 
     # -- groups ------------------------------------------------------------------------
 
-    def note_change(self) -> None:
-        """Note that a worker declares different resources than before."""
+    def invalidate_groups(self) -> None:
+        """Invalidate the groups after a worker has changed its declared resources."""
         self._changes += 1
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Note a worker that joins."""
+        """Invalidate the groups after a worker has joined."""
         self._changes += 1
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Note a worker that has left, and keep no reference to its state."""
+        """Delete the groups after a worker has left, so that no reference to its state remains."""
         self._changes += 1
         self._groups.clear()
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
-        """Note a worker that has ended a task, and may have a free slot."""
+        """Record that a worker may have a free slot because a task has ended."""
         if start == "processing" and (state := self.scheduler.workers.get(worker)):
             for group in self._groups.values():
                 if state in group.members:
                     group.free[state] = None
 
     def _group(self, name: str) -> _Group | None:
-        """Return the group of the workers that may take tasks, made anew after changes."""
+        """Return a group of workers by partition name, rebuilt after changes.
+
+        For `_OUTSIDE`, the group contains the workers outside all fences. The result is None if
+        there are no fences.
+        """
         fences: Fences | None = self.scheduler.plugins.get(FENCES)
         if name != _OUTSIDE:
-            version = self._changes, number_declaring(self.scheduler, name)
+            version = self._changes, count_declaring(self.scheduler, name)
         elif fences is not None:
             version = self._changes, fences.changes
         else:
@@ -129,27 +139,24 @@ class WorkerChoice(SchedulerPlugin):
         return group
 
     def _members(self, name: str) -> list[Any]:
-        """States of the workers that belong to a group now."""
+        """Return the states of the workers that currently belong to a group."""
         if name != _OUTSIDE:
             return workers_declaring(self.scheduler, name)
-        closed: set[Any] = self.scheduler.plugins[FENCES].closed
-        return [worker for worker in self.scheduler.workers.values() if worker not in closed]
+        enclosed: set[Any] = self.scheduler.plugins[FENCES].enclosed
+        return [worker for worker in self.scheduler.workers.values() if worker not in enclosed]
 
     # -- the rule ----------------------------------------------------------------------
 
     def choose(self, task: Any) -> Any:
-        """Return the state of the worker for a task.
-
-        Returns NotImplemented to leave the choice to Dask.
-        """
-        resource = group_of(task)
+        """Return the state of the worker for a task, or NotImplemented to let Dask decide."""
+        resource = only_resource_of(task)
         if resource is None:
             return NotImplemented
         name, slots = resource
         if name != _OUTSIDE and name not in self.names:
             return NotImplemented
         group = self._group(name)
-        if group is None or len(group.workers) <= 2 * COMPARED:
+        if group is None or len(group.workers) <= 2 * MAX_COMPARED:
             return NotImplemented
         holders = holders_of_inputs(task)
         if len(holders) > _EXAMINED:
@@ -160,14 +167,14 @@ class WorkerChoice(SchedulerPlugin):
             workers = self._permitted(group.with_free_slots(slots), name, slots)
         if not workers:
             workers = self._permitted(group.in_turn(), name, slots)
-        return start_first(self.scheduler, task, workers) if workers else NotImplemented
+        return earliest_worker(self.scheduler, task, workers) if workers else NotImplemented
 
     def _permitted(self, workers: list[Any], name: str, slots: float) -> list[Any]:
-        return [worker for worker in workers if may_take(self.scheduler, worker, name, slots)]
+        return [worker for worker in workers if can_run(self.scheduler, worker, name, slots)]
 
 
-def note_change(scheduler: Any) -> None:
-    """Note that a worker of a scheduler declares different resources than before."""
-    choice: WorkerChoice | None = scheduler.plugins.get(NAME)
+def invalidate_groups(scheduler: Any) -> None:
+    """Tell the rule, if it is installed, that a worker has changed its declared resources."""
+    choice: WorkerChooser | None = scheduler.plugins.get(NAME)
     if choice is not None:
-        choice.note_change()
+        choice.invalidate_groups()

@@ -1,8 +1,9 @@
-"""The CUDA device of each worker, kept on the scheduler for the worker's life.
+"""Assignment of a CUDA device to each worker, stored on the scheduler.
 
-It is stored in the scheduler's state of the worker, which ends with the worker. So everybody
-gets the same answer; a restarted worker, which is a new one to Dask and may have a new name,
-finds the device of its predecessor free; and nothing has to be cleaned up.
+The assignment is part of the scheduler's state of the worker and is removed with the worker.
+Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A restarted
+worker is a new worker for Dask and may have a new name, but it finds the device of its predecessor
+free.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from typing import Any
 from distributed import get_worker
 
 from . import probe
-from .task_context import WorkerLeft, own_client, telling_departure
-from .workers import on_scheduler
+from .task_context import WorkerLeavingError, own_client, translate_leaving_errors
+from .workers import run_on_scheduler
 
-_HELD = "poolpart-gpu"  # key in the scheduler's state of a worker: UUID of its device
+_HELD = "poolpart-gpu"  # key in the scheduler's state of a worker, whose value is a device UUID
 
-_own: dict[str, int | None] = {}  # {address of a worker of this process: its device}
+_own: dict[str, int | None] = {}  # {worker address in this process: device index}
 
 
-@telling_departure()
+@translate_leaving_errors()
 def own_device() -> int | None:
     """Return the index of the CUDA device for this task's worker, or None if the worker has no GPU.
 
@@ -34,7 +35,7 @@ def own_device() -> int | None:
 
     Raises
     ------
-    WorkerLeft
+    WorkerLeavingError
         If the worker is leaving the cluster.
     ValueError
         If the function is called outside of a task.
@@ -58,14 +59,14 @@ def own_device() -> int | None:
     if address not in _own:
         device: int | None = None
         if gpus := probe.visible_gpus():
-            device = on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
+            device = run_on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
             if device is None:
-                raise WorkerLeft(f"The scheduler has removed the worker at {address}.")
+                raise WorkerLeavingError(f"The scheduler has removed the worker at {address}.")
         _own[address] = device
     return _own[address]
 
 
-@telling_departure()
+@translate_leaving_errors()
 def own_device_share() -> float:
     """Return the fraction of the device memory that this task's worker may use, between 0 and 1.
 
@@ -75,7 +76,7 @@ def own_device_share() -> float:
 
     Raises
     ------
-    WorkerLeft, ValueError, PoolError
+    WorkerLeavingError, ValueError, PoolError
         In the same cases as `own_device`.
 
     Examples
@@ -86,7 +87,7 @@ def own_device_share() -> float:
         return 1.0
     address = get_worker().address
     gpus = probe.visible_gpus()
-    sharers: int = on_scheduler(own_client(), count_sharers, address=address, gpus=gpus)
+    sharers: int = run_on_scheduler(own_client(), count_sharers, address=address, gpus=gpus)
     return 1 / sharers
 
 
@@ -94,7 +95,10 @@ def own_device_share() -> float:
 
 
 def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
-    """Return the device of a worker for its list of UUIDs, or None if the worker has left."""
+    """Return the index of a worker's device in its list of UUIDs, or None if the worker has left.
+
+    The first call for a worker selects its device.
+    """
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return None
@@ -104,7 +108,7 @@ def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int:
-    """Return the number of workers that use a worker's device, or are about to, at least 1."""
+    """Return the number of workers that use a worker's device or are expected to, at least 1."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return 1
@@ -120,7 +124,10 @@ def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def _least_used(scheduler: Any, worker: Any, gpus: Sequence[str]) -> str:
-    """Return the device that the fewest workers use, in the partition first, then in all."""
+    """Return the UUID of the device with the fewest workers in the partition.
+
+    Ties are resolved in favor of the device with the fewest workers in the cluster.
+    """
     users_in_partition = Counter[str]()  # {UUID: workers}
     users = Counter[str]()  # {UUID: workers}
     partitions = _partitions(worker)

@@ -1,7 +1,7 @@
-"""Requests of clients to the steward: make partitions, move workers, dissolve partitions.
+"""Requests of clients that create partitions, move workers, and dissolve partitions.
 
-Each is one request to the scheduler. The scheduler completes or refuses the request, even if the
-client dies meanwhile. Simultaneous requests run one after the other.
+Each of them is a single request to the scheduler, which completes or rejects it even if the client
+dies in the meantime. Concurrent requests are processed one after the other.
 """
 
 from __future__ import annotations
@@ -15,57 +15,68 @@ from typing import Any
 from distributed import Client
 
 from .errors import PoolError
-from .features import FEATURES, begin_features, features_settled, names_with_features
-from .fence import enclose, lower
+from .features import FEATURES, enable_features, names_with_features, wait_for_features
+from .fence import lower_fence, raise_fence
 from .internals.client import ANSWER_S
-from .internals.scheduler import asks_for, lift_restrictions
-from .membership import release, release_statistics
+from .internals.scheduler import lift_restrictions, requires_any
+from .membership import release_partitions, release_statistics
 from .registration import forget_registrations
-from .rules import Rule, check_count, divide, n_workers, rest, shortfalls, workers_in_words
+from .rules import (
+    Rule,
+    check_count,
+    divide_workers,
+    find_shortfalls,
+    format_workers,
+    n_workers,
+    rest,
+)
 from .stats import statistics_of
-from .steward import Seat, Steward, names_of, steward_of
-from .workers import WorkerInfo, on_scheduler
+from .steward import Steward, WorkerRecord, join_names, steward_of
+from .workers import WorkerInfo, run_on_scheduler
 
-PATIENCE_S = 60.0  # seconds that a worker has to answer
+PATIENCE_S = 60.0  # time for new members to declare their resources
 _RETURN_S = 10.0  # minimum time for workers to declare their former resources
-_STAY_S = 1.0  # time until workers that could not be moved are members again
-_LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
+_STAY_S = 1.0  # time for workers that could not be moved to become members again
+_CHECK_EVERY_S = 0.05  # interval between checks for unfinished tasks
 _MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
-def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `question(steward, **arguments)` on the scheduler, and return its result.
+def call_steward(client: Client, operation: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `operation(steward, **arguments)` on the scheduler, and return its result.
 
-    `question` is a coroutine function of this module, such as `grow`. If it raises a PoolError on
-    the scheduler, a PoolError with the same message is raised here.
+    `operation` is a coroutine function of this module, for example `grow_partition`. If it raises a
+    PoolError on the scheduler, this function raises a PoolError with the same message.
     """
-    # The steward waits for tasks, and then for workers, for `timeout_s` each.
+    # The steward waits up to `timeout_s` for tasks and then up to `timeout_s` for workers.
     answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
-    result, complaint = on_scheduler(
-        client, _answer, question=question, arguments=arguments, answer_s=answer_s
+    result, complaint = run_on_scheduler(
+        client, _run_operation, operation=operation, arguments=arguments, answer_s=answer_s
     )
     if complaint:
         raise PoolError(complaint)
     return result
 
 
-async def _answer(
-    question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
+async def _run_operation(
+    operation: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
-    """Return a request's result and "", or None and the message of a PoolError."""
-    # Raised here, the error would be in the scheduler's log with a traceback.
+    """Call a function with the steward.
+
+    Returns the result of the function and "", or None and the message of a PoolError.
+    """
+    # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
-            return await question(steward, **arguments), ""
+            return await operation(steward, **arguments), ""
         except PoolError as error:
             return None, str(error)
 
 
-# -- making partitions -----------------------------------------------------------------
+# -- creating partitions ---------------------------------------------------------------
 
 
-async def declare(
+async def create_partitions(
     steward: Steward,
     rules: Mapping[str, Rule],
     pool: Mapping[str, WorkerInfo],
@@ -81,7 +92,7 @@ async def declare(
     rules
         Rules by partition name.
     pool
-        Workers to choose from by name, as the client saw them, including their GPUs.
+        Workers to select from, by name, as the client saw them, including their GPUs.
     known_partitions
         Partitions that the client knew when it sent the request. It may create them again.
     own_partitions
@@ -91,32 +102,35 @@ async def declare(
     -------
     notes
         Notes for users by partition name, possibly empty, about the selected workers and about
-        features that this version of Dask lacks.
+        features that this version of Dask does not support.
     remainder
         Workers of the pool that no rule has selected.
 
     Raises
     ------
     PoolError
-        If there are too few workers, another client has a partition of the same name, or a worker
-        leaves meanwhile.
+        If there are too few workers, if another client has a partition of the same name, or if a
+        worker leaves in the meantime.
     """
-    # Up to the first await nothing else happens on the scheduler.
-    seats = {seat.info.address: seat for seat in steward.seats.values() if not seat.away}
+    # Nothing else runs on the scheduler until the first await.
+    records = {
+        record.info.address: record for record in steward.records.values() if not record.is_absent
+    }
     present = [
-        replace(seat.info, resources=steward.target_resources(seat)) for seat in seats.values()
+        replace(record.info, resources=steward.target_resources(record))
+        for record in records.values()
     ]
-    # By name: a restarted worker has another address.
+    # Workers are identified by name, because the address changes when a worker is restarted.
     candidates = [w.with_gpus(pool[w.name].gpus) for w in present if w.name in pool]
-    chosen, notes = divide(rules, candidates)
+    chosen, notes = divide_workers(rules, candidates)
     as_seen = [
         worker
         if worker.partitions & {*own_partitions}
         else replace(worker, resources=pool[worker.name].resources)
         for worker in candidates
     ]
-    notes = {**shortfalls(rules, candidates, as_seen), **notes}
-    other = steward.remainder()
+    notes = {**find_shortfalls(rules, candidates, as_seen), **notes}
+    other = steward.remainder_name()
     for name in rules:
         if isinstance(rules[name], rest) and other not in (None, *rules):
             note = (
@@ -125,7 +139,7 @@ async def declare(
             )
             notes[name] = " ".join(filter(None, (notes.get(name), note)))
     for name in rules:
-        # Workers that may be in the partition already: it is made again.
+        # If the client knows the partition, it may create it again from the same workers.
         permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
         foreign = [
             worker.address
@@ -133,83 +147,94 @@ async def declare(
             if name in worker.partitions and worker.address not in permitted
         ]
         if foreign:
-            raise PoolError(_exists(steward, name, [seats[address] for address in foreign]))
-    common_note = _begin(steward, rules)
+            raise PoolError(
+                _exists_message(steward, name, [records[address] for address in foreign])
+            )
+    common_note = _prepare_scheduler(steward, rules)
     for worker in candidates:
         if worker.gpus:
-            seats[worker.address].info = seats[worker.address].info.with_gpus(worker.gpus)
+            records[worker.address].info = records[worker.address].info.with_gpus(worker.gpus)
     for name, rule in rules.items():
-        steward.enter(name, rule)
+        steward.set_rule(name, rule)
         for worker in chosen[name]:
-            steward.assign(seats[worker.address], name, rule.slots_of(worker))
-    await features_settled()  # before the members get tasks, which lend slots
-    members = [seats[worker.address] for group in chosen.values() for worker in group]
+            steward.set_home(records[worker.address], name, rule.slots_of(worker))
+    await wait_for_features()  # so that the tasks of the members can lend their slots
+    members = [records[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: " ".join(filter(None, (notes.get(name), common_note))) for name in rules}
-    return notes_of_all, [worker for worker in candidates if seats[worker.address] not in members]
+    return notes_of_all, [worker for worker in candidates if records[worker.address] not in members]
 
 
-def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
-    """Return the message for workers that have a partition and are not chosen by its rule."""
+def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
+    """Return the error message if a rule does not select all workers of an existing partition."""
     if name in steward.rules:
         return (
             f"Partition {name!r} already exists, and this call does not select all of its workers. "
-            f"Its workers are {names_of(members)}. To use the existing partition, call "
+            f"Its workers are {join_names(members)}. To use the existing partition, call "
             f"`Pool.from_client(client)[{name!r}]`. To create another partition, choose a "
             "different name."
         )
     use = f"Use the existing partition with `Pool.from_client(client)[{name!r}]`"
-    for seat in members:
-        names = [resource for resource, slots in seat.original.items() if slots]
+    for record in members:
+        names = [resource for resource, slots in record.original.items() if slots]
         if len(names) > 1:
             return (
-                f"Worker {seat.info.name} was started with the resources {', '.join(names)}, but "
+                f"Worker {record.info.name} was started with the resources {', '.join(names)}, but "
                 f"a worker can belong to only one partition. {use}, or start the worker with only "
                 f'`--resources "{name}=1"`.'
             )
     return (
         f"The rule does not select all workers that were started with the resource {name!r}. "
-        f"Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
+        f"Workers that are not selected: {join_names(members)}. {use}, pass a rule that "
         "selects all of these workers, such as `rest()`, or choose another name. A partition with "
         f"another name and the rule `n_workers(1, minimum=0)` can take workers from {name!r} with "
         f"`partition.resize(1, source={name!r})`."
     )
 
 
-async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
+async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> None:
     """Wait until new members of partitions declare their resources.
 
-    Raises PoolError if a member does not.
+    Raises
+    ------
+    PoolError
+        If a member leaves or does not respond in time.
     """
-    late = await steward.arrive(members, PATIENCE_S)
-    if absent := [seat for seat in members if seat in late or seat.removed]:
+    late = await steward.wait_until_settled(members, PATIENCE_S)
+    if absent := [record for record in members if record in late or record.is_removed]:
+        partitions = _format_partitions(sorted({str(record.partition) for record in absent}))
         raise PoolError(
-            "Some workers left or did not respond while they were assigned to "
-            f"{_in_words(sorted({str(seat.partition) for seat in absent}))}: {names_of(absent)}. "
-            "The other workers were assigned. Create a new pool to divide it again."
+            f"Some workers left or did not respond while they were assigned to {partitions}: "
+            f"{join_names(absent)}. The other workers were assigned. Create a new pool to divide "
+            "it again."
         )
 
 
-def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Prepare the scheduler for tasks of new partitions and return a remark for users, or "".
+def _prepare_scheduler(steward: Steward, rules: Mapping[str, Rule]) -> str:
+    """Prepare the scheduler for tasks of new partitions, and return a note for users or "".
 
-    From now on, features such as inheritance are on (`features.py`), fences keep other tasks off
-    exclusive partitions (`fence.py`), and tasks are counted (`stats.py`). The remark names features
-    that this version of Dask lacks. PoolError if it lacks fences, and a rule is exclusive.
+    This enables features such as inheritance (see `features.py`), raises fences around exclusive
+    partitions (see `fence.py`), and starts counting tasks (see `stats.py`). The note lists features
+    that this version of Dask does not support.
+
+    Raises
+    ------
+    PoolError
+        If a rule is exclusive and this version of Dask does not support fences.
     """
     scheduler = steward.scheduler
     try:
-        note = begin_features(scheduler, rules)
+        note = enable_features(scheduler, rules)
         for name, rule in rules.items():
             if rule.exclusive:
-                enclose(scheduler, name)
+                raise_fence(scheduler, name)
             elif name in steward.rules and steward.rules[name].exclusive:
-                lower(scheduler, name)
-    except PoolError:  # this version of Dask lacks what fences need
+                lower_fence(scheduler, name)
+    except PoolError:  # this version of Dask does not support fences
         added = rules.keys() - steward.rules.keys()
         for name in added:
-            lower(scheduler, name)
-        release(scheduler, added)
+            lower_fence(scheduler, name)
+        release_partitions(scheduler, added)
         raise
     statistics_of(scheduler)
     return note
@@ -217,65 +242,71 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
 
 # -- moving workers --------------------------------------------------------------------
 #
-# A worker that leaves gets no new tasks of its partition; waiting tasks go to other members,
-# running tasks end there; then it declares its new resources. Borrowed workers, whose home is
-# another partition, leave first.
+# A worker that leaves its partition receives no new tasks of the partition. Its waiting tasks are
+# moved to other members, and its running tasks finish before it declares its new resources.
+# Borrowed workers, whose home is another partition, leave first.
 
 
-async def grow(
+async def grow_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
     """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
-    steward.adopt(name)
-    joining = _joining(steward, name, count, source)
+    steward.adopt_partition(name)
+    joining = _select_joining(steward, name, count, source)
     return await _move(steward, dict.fromkeys(joining, name), timeout_s)
 
 
-async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition and return their names."""
     check_count(_MOVES, count)
-    steward.adopt(name)
-    return await _move(steward, _leaving(steward, name, count), timeout_s)
+    steward.adopt_partition(name)
+    return await _move(steward, _select_leaving(steward, name, count), timeout_s)
 
 
-async def resize(
+async def resize_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Resize a partition to a number of workers, and return the names of the moved workers."""
+    """Set the number of workers in a partition, and return the names of the workers moved."""
     check_count(f"the number of workers of partition {name!r}", count, minimum=0)
-    steward.adopt(name)
+    steward.adopt_partition(name)
     rule = steward.rules[name]
     if count < rule.minimum:
         raise PoolError(
-            f"Partition {name!r} cannot be resized to {workers_in_words(count)}, because its "
+            f"Partition {name!r} cannot be resized to {format_workers(count)}, because its "
             f"minimum is {rule.minimum}."
         )
-    size = len(steward.members(name))  # includes members that are starting again
-    targets: dict[Seat, str | None] = {}
+    size = len(steward.members(name))  # includes members that are being restarted
+    targets: dict[WorkerRecord, str | None] = {}
     if count > size:
-        targets = dict.fromkeys(_joining(steward, name, count - size, source), name)
+        targets = dict.fromkeys(_select_joining(steward, name, count - size, source), name)
     elif count < size:
-        targets = _leaving(steward, name, size - count)
-    # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
-    steward.resize(name, size - _asked(rule, size))
+        targets = _select_leaving(steward, name, size - count)
+    # If a worker was lost, the rule requests more workers than there are. The target is set to the
+    # present size first, because moving workers changes it by the number of workers moved.
+    steward.change_target(name, size - _requested_workers(rule, size))
     try:
         return await _move(steward, targets, timeout_s)
     finally:
         if name in steward.rules:
-            minimum = min(rule.minimum, _asked(steward.rules[name], rule.minimum))
+            minimum = min(rule.minimum, _requested_workers(steward.rules[name], rule.minimum))
             steward.rules[name] = replace(steward.rules[name], minimum=minimum)
 
 
-def _asked(rule: Rule, default: int) -> int:
-    """Return the number of workers that a rule asks for, or a default if it has no such number."""
+def _requested_workers(rule: Rule, default: int) -> int:
+    """Return the number of workers that a rule requests, or the default if there is none."""
     return rule.workers if isinstance(rule, n_workers) else default
 
 
-def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[Seat]:
-    """Return the seats of workers that can move into a partition.
+def _select_joining(
+    steward: Steward, name: str, count: int, source: str | None
+) -> list[WorkerRecord]:
+    """Select the workers to move into a partition.
 
-    Raises PoolError if there are fewer than `count`.
+    Raises
+    ------
+    PoolError
+        If fewer than `count` workers can be moved.
     """
     if source == name:
         raise PoolError(
@@ -283,15 +314,19 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
             "`source`."
         )
     if source is not None:
-        steward.adopt(source)
-    donor = source or steward.remainder()
-    spare = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
+        steward.adopt_partition(source)
+    donor = source or steward.remainder_name()
+    spare = (
+        []
+        if source
+        else [record for record in steward.free_records() if steward.is_settled(record)]
+    )
     if donor is not None and donor != name:
         members = _settled_members(steward, donor)
         spared = max(0, len(members) - steward.rules[donor].minimum)
         spare += _in_order(steward, members, name)[:spared]
     if len(spare) < count:
-        available = f"only {workers_in_words(len(spare))}" if spare else "no workers"
+        available = f"only {format_workers(len(spare))}" if spare else "no workers"
         if source:
             reason = f"partition {source!r} has {available} to spare beyond its minimum"
             advice = "pass another partition as `source`"
@@ -299,200 +334,216 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
             reason = f"the remainder of the pool has {available} to spare"
             advice = "pass the partition that should provide them as `source`"
         raise PoolError(
-            f"Partition {name!r} cannot grow by {workers_in_words(count)}, because {reason}. "
+            f"Partition {name!r} cannot grow by {format_workers(count)}, because {reason}. "
             f"Start more workers, or {advice}."
         )
     return _in_order(steward, spare, name)[:count]
 
 
-def _leaving(steward: Steward, name: str, count: int) -> dict[Seat, str | None]:
-    """Return the seats of workers that can leave a partition, with their destinations.
+def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
+    """Select the workers to move out of a partition, and return the destination of each.
 
-    Raises PoolError if fewer than its minimum would be left.
+    Raises
+    ------
+    PoolError
+        If fewer workers than the minimum of the partition would remain.
     """
     members = _settled_members(steward, name)
     minimum = steward.rules[name].minimum
     if len(members) - count < minimum:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {workers_in_words(count)}, because it has "
-            f"{workers_in_words(len(members))} and its minimum is {minimum}."
+            f"Partition {name!r} cannot shrink by {format_workers(count)}, because it has "
+            f"{format_workers(len(members))} and its minimum is {minimum}."
         )
     leaving = _in_order(steward, members)[:count]
-    return {seat: _destination(steward, seat) for seat in leaving}
+    return {record: _destination(steward, record) for record in leaving}
 
 
-def _destination(steward: Steward, seat: Seat) -> str | None:
-    """Return the partition of a worker that leaves its partition, or None for no partition.
+def _destination(steward: Steward, record: WorkerRecord) -> str | None:
+    """Return the partition that a worker moves to when it leaves its partition, or None.
 
     A borrowed worker returns to its home, and other workers go to the partition with the rule
-    `rest`. Workers that leave this partition are in none.
+    `rest`. A worker that leaves the latter partition has no partition afterwards.
     """
-    if seat.partition == (remainder := steward.remainder()):
+    if record.partition == (remainder := steward.remainder_name()):
         return None
-    home = steward.home(seat)
-    return remainder if home == seat.partition else home or remainder
+    home = steward.home_of(record)
+    return remainder if home == record.partition else home or remainder
 
 
 async def _move(
-    steward: Steward, targets: Mapping[Seat, str | None], timeout_s: float
+    steward: Steward, targets: Mapping[WorkerRecord, str | None], timeout_s: float
 ) -> list[str]:
-    """Move workers to partitions, or out of all partitions if the target is None.
+    """Move workers to the given partitions, or out of all partitions if the target is None.
 
-    Returns the names of the workers. Raises PoolError if tasks of a worker do not end in time. Such
-    a worker stays where it is.
+    Returns the names of the workers. A worker whose tasks do not finish in time stays in its
+    partition.
+
+    Raises
+    ------
+    PoolError
+        If a worker could not be moved in time.
     """
-    origins = {seat: (seat.partition, seat.slots) for seat in targets}
-    for seat, target in targets.items():
-        steward.resize(seat.partition, -1)
-        steward.resize(target, 1)
-        steward.put(seat, target)
-    late = await steward.arrive(targets, timeout_s)
-    for seat in late:
-        origin, slots = origins[seat]
-        target = targets[seat]
-        if seat.partition != target or (origin and origin not in steward.rules):
-            continue  # another client has moved it, or dissolved its partition
-        steward.resize(target, -1)
-        steward.resize(origin, 1)
-        steward.put(seat, origin, slots)
+    origins = {record: (record.partition, record.slots) for record in targets}
+    for record, target in targets.items():
+        steward.change_target(record.partition, -1)
+        steward.change_target(target, 1)
+        steward.set_partition(record, target)
+    late = await steward.wait_until_settled(targets, timeout_s)
+    for record in late:
+        origin, slots = origins[record]
+        target = targets[record]
+        if record.partition != target or (origin and origin not in steward.rules):
+            continue  # another client has moved the worker or dissolved its partition
+        steward.change_target(target, -1)
+        steward.change_target(origin, 1)
+        steward.set_partition(record, origin, slots)
     if late:
-        await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
+        await steward.wait_until_settled(late, _STAY_S)  # so that they can be moved again soon
         raise PoolError(
-            f"{len(late)} of {workers_in_words(len(targets))} could not be moved within "
+            f"{len(late)} of {format_workers(len(targets))} could not be moved within "
             f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
-            f"These workers stay in their partition: {names_of(late)}. Wait for their tasks, or "
+            f"These workers stay in their partition: {join_names(late)}. Wait for their tasks, or "
             "pass a longer `timeout_s`."
         )
-    return [seat.info.name for seat in targets if not seat.removed]
+    return [record.info.name for record in targets if not record.is_removed]
 
 
-def _settled_members(steward: Steward, name: str) -> list[Seat]:
-    """Return the members that may be moved.
+def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
+    """Return the members that can be moved.
 
-    Members that are just arriving do not count: they may return to their former partition.
+    Members that are about to arrive are excluded, because they may still return to their former
+    partition.
     """
-    return [seat for seat in steward.members(name) if steward.settled(seat)]
+    return [record for record in steward.members(name) if steward.is_settled(record)]
 
 
 def _in_order(
-    steward: Steward, seats: Sequence[Seat], destination: str | None = None
-) -> list[Seat]:
-    """Sort seats by the order in which their workers are moved to a destination.
+    steward: Steward, records: Sequence[WorkerRecord], destination: str | None = None
+) -> list[WorkerRecord]:
+    """Sort workers by the order in which they are moved to a destination.
 
-    Workers whose home is the destination come first, then workers without a partition and borrowed
-    workers. Among these, the least busy workers come first, and those with long-running tasks last.
+    Workers whose home is the destination come first, followed by workers without a partition and
+    borrowed workers, and then by all others. Within each of these groups, workers without
+    long-running tasks come first, and then those with the fewest tasks.
     """
 
-    def order(seat: Seat) -> tuple[bool, bool, int, int]:
-        worker = steward.scheduler.workers[seat.info.address]
-        is_home = seat.partition is not None and steward.home(seat) == seat.partition
-        returns = destination is not None and steward.home(seat) == destination
+    def order(record: WorkerRecord) -> tuple[bool, bool, int, int]:
+        worker = steward.scheduler.workers[record.info.address]
+        is_home = record.partition is not None and steward.home_of(record) == record.partition
+        returns = destination is not None and steward.home_of(record) == destination
         return not returns, is_home, len(worker.long_running), len(worker.processing)
 
-    return sorted(seats, key=order)
+    return sorted(records, key=order)
 
 
 # -- dissolving partitions ------------------------------------------------------------------------
 
 
-def ask_to_dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
-    """Ask the steward to undo partitions, or every partition if `names` is None."""
+def request_dissolution(
+    client: Client, names: Collection[str] | None, timeout_s: float
+) -> list[str]:
+    """Dissolve partitions, or all partitions if `names` is None, and return their names."""
     arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
     try:
-        dissolved: list[str] = ask(client, dissolve, **arguments)
+        dissolved: list[str] = call_steward(client, dissolve_partitions, **arguments)
     finally:
         forget_registrations()
     return dissolved
 
 
-async def dissolve(
+async def dissolve_partitions(
     steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
 ) -> list[str]:
-    """Undo partitions, or every partition if `names` is None, and return their names.
+    """Dissolve partitions, or all partitions if `names` is None, and return their names.
 
-    `client_id` names the client that asks. That client has to register again.
+    `client_id` is the ID of the client that sends the request. The client has to register again
+    afterwards.
     """
     scheduler = steward.scheduler
     await _wait_for_tasks(steward, names, timeout_s)
-    # Until the next await nothing else happens on the scheduler; before, another client may have
-    # dissolved the same partitions, or made some.
+    # During the wait, another client may have created or dissolved partitions. From here to the
+    # next await, nothing else runs on the scheduler.
     dissolved = _existing(steward, names)
-    seats = [seat for seat in steward.seats.values() if _belongs(seat, dissolved)]
+    records = [record for record in steward.records.values() if _belongs(record, dissolved)]
     for name in dissolved:
         del steward.rules[name]
-        for seat in steward.seats.values():
-            if seat.home == name:  # also if another partition has borrowed the worker
-                seat.home = None
-        # At once, even if the client dies or workers do not answer.
-        lower(scheduler, name)
-    release(scheduler, dissolved, client_id, had_rule=True)
-    if names is None:  # this includes partitions that workers were started with: these have no rule
-        release(scheduler, names_with_features(scheduler), client_id)
+        for record in steward.records.values():
+            if record.home == name:  # even if another partition has borrowed the worker
+                record.home = None
+        # The fence is lowered immediately, even if the client dies or workers do not respond.
+        lower_fence(scheduler, name)
+    release_partitions(scheduler, dissolved, client_id, had_rule=True)
+    if names is None:  # includes partitions without a rule, which workers were started with
+        release_partitions(scheduler, names_with_features(scheduler), client_id)
     if not steward.rules:
         for feature in FEATURES:
-            feature.end_all(scheduler)
+            feature.clean_up(scheduler)
         release_statistics(scheduler)
-    for seat in seats:
-        home = steward.home(seat)
-        steward.resize(home, 1)
-        steward.assign(seat, home)
-    lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
-    await features_settled()  # then tasks lend no more
-    # An absent worker comes back as it was started.
-    present = [seat for seat in seats if not seat.away]
-    if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
+    for record in records:
+        home = steward.home_of(record)
+        steward.change_target(home, 1)
+        steward.set_home(record, home)
+    lift_restrictions(scheduler, dissolved)  # any worker may recompute lost results
+    await wait_for_features()  # until tasks have stopped lending slots
+    # Absent workers are not awaited, because they rejoin with their original resources.
+    present = [record for record in records if not record.is_absent]
+    if late := await steward.wait_until_settled(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
-            f"Some workers did not respond while {_in_words(dissolved)} "
-            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. Their "
+            f"Some workers did not respond while {_format_partitions(dissolved)} "
+            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {join_names(late)}. Their "
             "original resources are restored as soon as they respond."
         )
     return dissolved
 
 
-def _in_words(partitions: Sequence[str]) -> str:
-    """Return partitions for a message, such as "partitions 'A' and 'B'"."""
+def _format_partitions(partitions: Sequence[str]) -> str:
+    """Format partition names for a message, for example "partitions 'A' and 'B'"."""
     plural = "s" if len(partitions) > 1 else ""
     return f"partition{plural} {' and '.join(map(repr, partitions))}"
 
 
 def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
-    """Return the partitions of these names that exist, or every partition if `names` is None."""
+    """Return the partitions with one of the names, or all partitions if `names` is None."""
     return [name for name in steward.rules if names is None or name in names]
 
 
-def _belongs(seat: Seat, names: Collection[str]) -> bool:
-    """Return whether a worker is in a partition of `names`, or was started in such a partition.
+def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
+    """Return whether a worker belongs to one of the partitions.
 
-    Only workers without a partition are judged by their start.
+    A worker without a partition belongs to a partition if it was started with its resource.
     """
-    if seat.partition is None:
-        return not seat.original.keys().isdisjoint(names)
-    return seat.partition in names
+    if record.partition is None:
+        return not record.original.keys().isdisjoint(names)
+    return record.partition in names
 
 
 async def _wait_for_tasks(
     steward: Steward, names: Collection[str] | None, timeout_s: float
 ) -> None:
-    """Wait until the tasks of partitions have ended.
+    """Wait until the tasks of partitions have finished.
 
-    Raises PoolError if they do not end in time.
+    Raises
+    ------
+    PoolError
+        If they do not finish in time.
     """
     deadline = time.monotonic() + timeout_s
-    # Tasks that the client just submitted arrive by another connection, milliseconds later.
-    await asyncio.sleep(_LOOK_EVERY_S)
+    # Tasks that the client has just submitted arrive on another connection, milliseconds later.
+    await asyncio.sleep(_CHECK_EVERY_S)
     while tasks := _unfinished(steward.scheduler, _existing(steward, names)):
         if time.monotonic() >= deadline:
             one = len(tasks) == 1
+            partitions = _format_partitions(_existing(steward, names))
             raise PoolError(
-                f"{len(tasks)} {'task' if one else 'tasks'} of "
-                f"{_in_words(_existing(steward, names))} {'has' if one else 'have'} not finished "
-                f"after {timeout_s:g} s, for example {tasks[0].key!r}. Wait for the tasks or "
-                "cancel them, and dissolve again."
+                f"{len(tasks)} {'task' if one else 'tasks'} of {partitions} "
+                f"{'has' if one else 'have'} not finished after {timeout_s:g} s, for example "
+                f"{tasks[0].key!r}. Wait for the tasks or cancel them, and dissolve again."
             )
-        await asyncio.sleep(_LOOK_EVERY_S)
+        await asyncio.sleep(_CHECK_EVERY_S)
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
-    """Return the states of the tasks of partitions that have not ended."""
+    """Return the states of the unfinished tasks of partitions."""
     tasks = scheduler.tasks.values()
-    return [task for task in tasks if task.state in _UNFINISHED and asks_for(task, names)]
+    return [task for task in tasks if task.state in _UNFINISHED and requires_any(task, names)]

@@ -1,13 +1,13 @@
-"""Errors of pools and pipes."""
+"""Exceptions that pools, partitions and pipes raise."""
 
 
 class PoolError(RuntimeError):
-    """Raised when the pool or a partition cannot be used as requested."""
+    """Raised if a pool or a partition cannot be used as requested."""
 
 
-class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an error
-    """Raised when the pipe is closed and, for a consumer, also empty."""
+class PipeClosed(Exception):  # noqa: N818 - not an error, like StopIteration
+    """Raised by `put` if the pipe is closed, and by `get` if it is closed and empty."""
 
 
-class PipeFailed(RuntimeError):  # noqa: N818 - reads as what happened to the pipe
-    """Raised when the pipe has failed. The message contains the reason."""
+class PipeFailed(RuntimeError):  # noqa: N818 - describes the state of the pipe
+    """Raised by pipe methods if the pipe has failed. The message contains the reason."""

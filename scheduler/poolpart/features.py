@@ -1,7 +1,8 @@
-"""Features that begin and end with partitions on a scheduler, unknown to the core.
+"""Interface of features that are enabled per partition and that the core does not know.
 
-The core calls `FEATURES` where partitions begin and end, and where tasks are counted. The modules
-of `extras` add themselves: inheritance, the page of partitions, and figures for Prometheus.
+The core calls the objects in `FEATURES` when a partition is created or dissolved, and when the
+scheduler begins or stops counting tasks. The modules in `extras` add their features to the list:
+inheritance of partitions by nested tasks, the dashboard page, and Prometheus metrics.
 """
 
 from __future__ import annotations
@@ -11,53 +12,57 @@ from typing import Any
 
 
 class Feature:
-    """A feature beside the core. Its methods run on the scheduler, and do nothing by default."""
+    """Base class of features, whose methods run on the scheduler and do nothing by default."""
 
-    def begin(self, scheduler: Any, names: Iterable[str]) -> str:
-        """Begin in partitions and return a remark for users on what this version of Dask lacks."""
+    def enable(self, scheduler: Any, names: Iterable[str]) -> str:
+        """Enable the feature in partitions.
+
+        Returns a note for users if this version of Dask does not support a part of the feature, or
+        an empty string.
+        """
         return ""
 
-    def end(self, scheduler: Any, name: str) -> None:
-        """End in a partition, if the feature has begun there."""
+    def disable(self, scheduler: Any, name: str) -> None:
+        """Disable the feature in a partition where it is enabled."""
 
     def names(self, scheduler: Any) -> Set[str]:
-        """Return the partitions that the feature has begun in."""
+        """Return the names of the partitions in which the feature is enabled."""
         return frozenset()
 
-    async def settle(self) -> None:
-        """Wait, for a limited time, until workers know what has started and stopped."""
+    async def wait_for_workers(self) -> None:
+        """Wait until the workers have applied recent changes, up to a time limit."""
 
-    def end_all(self, scheduler: Any) -> None:
-        """End with the last partition that has a rule."""
+    def clean_up(self, scheduler: Any) -> None:
+        """Clean up after the last partition with a rule was dissolved."""
 
     def begin_counting(self, statistics: Any) -> None:
-        """Begin when a scheduler begins to count its tasks, in a `Statistics`."""
+        """Handle that the scheduler begins to count tasks in a `TaskStatistics`."""
 
     def end_counting(self, statistics: Any) -> None:
-        """End when a scheduler ends to count its tasks."""
+        """Handle that the scheduler stops counting tasks."""
 
 
 FEATURES: list[Feature] = []  # filled when `poolpart` is imported
 
 
-def begin_features(scheduler: Any, names: Iterable[str]) -> str:
-    """Begin all features in partitions and return their remarks for users, or ""."""
+def enable_features(scheduler: Any, names: Iterable[str]) -> str:
+    """Enable all features in partitions, and return their notes for users, joined by semicolons."""
     names = [*names]
-    return "; ".join(filter(None, (feature.begin(scheduler, names) for feature in FEATURES)))
+    return "; ".join(filter(None, (feature.enable(scheduler, names) for feature in FEATURES)))
 
 
-def end_features(scheduler: Any, name: str) -> None:
-    """End all features in a partition."""
+def disable_features(scheduler: Any, name: str) -> None:
+    """Disable all features in a partition."""
     for feature in FEATURES:
-        feature.end(scheduler, name)
+        feature.disable(scheduler, name)
 
 
 def names_with_features(scheduler: Any) -> frozenset[str]:
-    """Return the partitions that features have begun in."""
+    """Return the names of the partitions in which any feature is enabled."""
     return frozenset().union(*(feature.names(scheduler) for feature in FEATURES))
 
 
-async def features_settled() -> None:
-    """Wait, for a limited time, until workers know which features have started and stopped."""
+async def wait_for_features() -> None:
+    """Wait until the workers have applied recent changes to all features, up to a time limit."""
     for feature in FEATURES:
-        await feature.settle()
+        await feature.wait_for_workers()

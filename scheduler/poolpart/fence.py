@@ -1,26 +1,28 @@
-"""A fence around a partition keeps other tasks out.
+"""Fences, which keep other tasks off the workers of exclusive partitions.
 
-A Dask resource works in one direction: tasks that ask for it run on workers that have it, but
-all other tasks run there as well. A fence closes the other direction. Only tasks that take a slot
-of the partition run on its workers; un-annotated tasks, dask collections, nested tasks, recomputed
-and stolen ones, actors and the outputs of shuffles go to the rest of the cluster, whoever
-submitted them and when.
+A Dask resource only works in one direction: tasks that request it run on workers that have it, but
+all other tasks can run there as well. A fence adds the other direction. Only tasks that take a slot
+of the partition run on its workers. All other tasks run on the rest of the cluster, regardless of
+when and by which client they were submitted. This includes tasks without annotations, collections,
+nested tasks, recomputed and stolen tasks, actors, and the outputs of shuffles.
 
-A fence does not affect tasks that a worker already has, `Client.run`, which reaches all workers,
-and data that is scattered, replicated or rebalanced (give ``workers=`` to keep it out). Dask may
-place a task with ``allow_other_workers=True`` inside if none of its workers, or no worker outside,
-has room.
+A fence does not affect tasks that are already assigned to a worker, and it does not affect
+`Client.run`, which reaches all workers. It does not restrict data that is scattered, replicated or
+rebalanced either (pass ``workers=`` to keep it out). Dask may place a task with
+``allow_other_workers=True`` inside the fence if none of its workers, or no worker outside, has
+capacity.
 
-The fence lives on the scheduler until it is lowered, also when the client has gone. Workers
-that join late, are restarted or move between partitions are covered. Tasks that no worker outside
-may take wait; the scheduler logs that, and every client gets a warning.
+The fence exists on the scheduler until it is lowered, even if the client has closed. It includes
+workers that join later, are restarted, or move between partitions. Tasks that no worker outside the
+fence can run have to wait. In this case, the scheduler logs a warning and sends it to all clients.
 
-A fence is a rule that is called whenever the scheduler places a task (`internals.method_rules`).
-Tasks and workers are not modified. Two approaches without such a rule were tried:
-a resource that all workers outside declare, put on every task without one, and
-`worker_restrictions` that name the workers outside. Both restrict every task, and Dask does not
-hold back restricted tasks: the open worker got all of 200 root tasks at once, and its memory all
-their results. With the rule it gets 2, and 198 wait.
+A fence is a rule that is called whenever the scheduler places a task (see
+`internals.method_rules`). Tasks and workers are not modified. Two approaches without such a rule
+were rejected: a resource that all outside workers declare and all other tasks request, and
+`worker_restrictions` that list the outside workers. Both restrict every task, and Dask does not
+queue restricted tasks on the scheduler. In an experiment, the outside worker received all of 200
+root tasks at once and had to store all their results. With the rule, it receives two, and 198 are
+queued.
 """
 
 from __future__ import annotations
@@ -32,41 +34,46 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals.method_rules import Rules, rule_for_fences, take_back_fences, workers_without_fences
-from .internals.names import FENCES, require
-from .internals.scheduler import open_to_all
+from .internals.method_rules import (
+    MethodRules,
+    add_fence_rules,
+    remove_fence_rules,
+    workers_without_fences,
+)
+from .internals.names import FENCES, require_feature
+from .internals.scheduler import admit_other_tasks
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
 WARN_EVERY_S = 10.0
-_EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker
+_EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker: its future partition
 
 
-def enclose(scheduler: Any, name: str) -> None:
-    """Raise a fence: from now on, tasks without the resource of a partition stay out.
+def raise_fence(scheduler: Any, name: str) -> None:
+    """Keep tasks without the resource of a partition off its workers from now on.
 
     Raises
     ------
     PoolError
-        If this version of Dask places tasks in another way.
+        If this version of Dask lacks the private API that fences require.
     """
-    require(FENCES)
+    require_feature(FENCES)
     fences: Fences = scheduler.plugins.get(NAME) or Fences(scheduler)
     fences.names.add(name)
-    fences.look_again()
+    fences.update_workers()
 
 
-def expect(scheduler: Any, worker: Any, name: str | None) -> None:
-    """Record the future partition of a worker, which is behind its fence from now on."""
+def set_expected_partition(scheduler: Any, worker: Any, name: str | None) -> None:
+    """Record the future partition of a worker, and enclose the worker in its fence immediately."""
     worker.extra.pop(_EXPECTED, None)
     if name is not None:
         worker.extra[_EXPECTED] = name
     if fences := scheduler.plugins.get(NAME):
-        fences.look_at(worker)
+        fences.update_worker(worker)
 
 
-def lower(scheduler: Any, name: str) -> None:
+def lower_fence(scheduler: Any, name: str) -> None:
     """Lower a fence, and uninstall the scheduler plugin if no fences remain."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
@@ -74,83 +81,83 @@ def lower(scheduler: Any, name: str) -> None:
     fences.names.discard(name)
     if not fences.names:
         fences.uninstall()
-    fences.look_again()
+    fences.update_workers()
 
 
-def fences_of(scheduler: Any) -> frozenset[str]:
-    """Return the names of the raised fences."""
+def fence_names(scheduler: Any) -> frozenset[str]:
+    """Return the names of the partitions that have a fence."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     return frozenset(fences.names) if fences else frozenset()
 
 
 class Fences(SchedulerPlugin):
-    """The rule: a worker behind a fence takes only tasks that ask for the fence's resource."""
+    """Scheduler plugin that keeps tasks without the resource of a fence off enclosed workers."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        self.closed: set[Any] = set()  # states of the workers behind fences
-        self.changes = 0  # changes of the set `closed`
-        self._rules = Rules()
+        self.enclosed: set[Any] = set()  # states of the enclosed workers
+        self.changes = 0  # number of changes of `enclosed`
+        self._rules = MethodRules()
         self._warned_at = float("-inf")  # time.monotonic()
-        rule_for_fences(self._rules, scheduler, self.closed, self.stop)
+        add_fence_rules(self._rules, scheduler, self.enclosed, self.keeps_out)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
-        """Remove all rules."""
-        take_back_fences(self._rules, self.scheduler)
+        """Remove all rules from the scheduler."""
+        remove_fence_rules(self._rules, self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
-    # -- who is behind a fence ---------------------------------------------------------
+    # -- enclosed workers --------------------------------------------------------------
 
-    def look_again(self) -> None:
-        """Enclose or release each worker, after a change of the fences."""
+    def update_workers(self) -> None:
+        """Enclose or release all workers after a fence was raised or lowered."""
         for worker in self.scheduler.workers.values():
-            self.look_at(worker)
+            self.update_worker(worker)
 
-    def look_at(self, worker: Any) -> None:
-        """Enclose or release a worker, by its resources and its future partition."""
+    def update_worker(self, worker: Any) -> None:
+        """Enclose or release a worker according to its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
-            self.changes += worker not in self.closed
-            self.closed.add(worker)
+            self.changes += worker not in self.enclosed
+            self.enclosed.add(worker)
             self.scheduler.idle_task_count.discard(worker)
-        elif worker in self.closed:
-            self.closed.discard(worker)
+        elif worker in self.enclosed:
+            self.enclosed.discard(worker)
             self.changes += 1
-            open_to_all(self.scheduler, worker)
+            admit_other_tasks(self.scheduler, worker)
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Enclose a worker that joins, if necessary."""
-        self.look_at(scheduler.workers[worker])
+        """Enclose a joining worker if necessary."""
+        self.update_worker(scheduler.workers[worker])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Forget a worker that has left."""
-        self.closed.intersection_update(scheduler.workers.values())
+        """Remove a worker that has left from the enclosed workers."""
+        self.enclosed.intersection_update(scheduler.workers.values())
 
     # -- the rule ----------------------------------------------------------------------
 
-    def stop(self, task: Any) -> bool:
-        """Return whether fences keep a task out: the task asks for no resource of a fence."""
+    def keeps_out(self, task: Any) -> bool:
+        """Return whether fences keep a task out, because it requests no resource of a fence."""
         resources = task.resource_restrictions
         return not resources or self.names.isdisjoint(resources)
 
     # -- warnings ----------------------------------------------------------------------
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Warn when a task waits because of fences."""
+        """Warn if a task has to wait because of fences."""
         if finish not in ("no-worker", "queued"):
             return
-        # Queued tasks may also wait just for their turn.
-        if finish == "queued" and not self.scheduler.running <= self.closed:
+        # A queued task may also be waiting for other tasks to finish.
+        if finish == "queued" and not self.scheduler.running <= self.enclosed:
             return
         task = self.scheduler.tasks[key]
         elapsed_s = time.monotonic() - self._warned_at
-        if elapsed_s < WARN_EVERY_S or not self.stop(task):
+        if elapsed_s < WARN_EVERY_S or not self.keeps_out(task):
             return
-        if not workers_without_fences(self.scheduler, task):  # it waits also without fences
+        if not workers_without_fences(self.scheduler, task):  # it would wait without fences, too
             return
         self._warned_at = time.monotonic()
         fences = ", ".join(sorted(self.names))

@@ -1,4 +1,4 @@
-"""Fetching results and held bytes from the workers that have them, past the scheduler."""
+"""Direct transfer of results and other data from workers, without passing through the scheduler."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from .internals.client import as_bytes, ask, take_from_worker
-from .internals.names import FETCHING, require
-from .internals.worker import answer_to
+from .internals.client import fetch_from_worker, send_request, wrap_bytes
+from .internals.names import FETCHING, require_feature
+from .internals.worker import add_handler
 
 T = TypeVar("T")
 
 _HANDLER = "poolpart_take_held"  # name of the worker's handler for held bytes
 
-_held: dict[str, Any] = {}  # {name: bytes that this process holds}
+_held: dict[str, Any] = {}  # held bytes by name
 
 
 def fetch_available(
@@ -27,13 +27,15 @@ def fetch_available(
 ) -> dict[str, Any]:
     """Fetch the results that are currently available.
 
-    Later calls fetch further results. `Client.gather` is not suitable for a long-running consumer.
-    If a worker dies, it tries to connect to it for half a minute, and does not deliver other
-    results in the meantime. If a key was released, its future lets the scheduler wait forever for a
-    task that nobody submits. This function asks the scheduler which workers hold the results,
-    fetches them, and gives up on a worker that is silent for `patience_s` seconds. The next call
-    asks again, and finds recomputed results on other workers. The submitter must hold references to
-    the keys.
+    Call this function repeatedly to fetch further results. Unlike `Client.gather`, it is suitable
+    for a long-running consumer. If a worker dies, `gather` tries to connect to it for half a minute
+    and does not return other results in the meantime. If a key was released, its future makes the
+    scheduler wait forever for a task that nobody submits.
+
+    This function asks the scheduler which workers hold the results, fetches the results from these
+    workers, and gives up on a worker that does not respond for `patience_s` seconds. The next call
+    asks again and finds results that were recomputed on other workers. The submitter must hold
+    references to the keys.
 
     Parameters
     ----------
@@ -42,8 +44,8 @@ def fetch_available(
     keys
         Keys of finished or unfinished tasks.
     patience_s
-        Maximum time in seconds to wait for a response of the scheduler, and then for a response of
-        each worker. A transfer may take longer.
+        Maximum time in seconds to wait for a response from the scheduler, and then for a response
+        from each worker. A transfer may take longer.
     holder
         Address of a worker that holds all results. If given, the scheduler is not asked.
 
@@ -52,45 +54,53 @@ def fetch_available(
     dict
         Results by key, possibly empty.
     """
-    require(FETCHING)
+    require_feature(FETCHING)
 
     async def fetch() -> dict[str, Any]:
         if holder is not None:
-            return await _take(client, holder, list(keys), patience_s)
+            return await _fetch_from(client, holder, list(keys), patience_s)
         try:
-            holders = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
+            holders = await wait_for(
+                send_request(client, None, "who_has", keys=list(keys)), patience_s
+            )
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
         for key, addresses in holders.items():
             if addresses:
-                # Any of the workers: if it does not answer, the next call may ask another.
+                # If the selected worker does not respond, the next call may select another one.
                 by_worker[random.choice(list(addresses))].append(key)
         results = await asyncio.gather(
-            *(_take(client, address, held, patience_s) for address, held in by_worker.items())
+            *(_fetch_from(client, address, held, patience_s) for address, held in by_worker.items())
         )
         return {key: result for part in results for key, result in part.items()}
 
     return client.sync(fetch)
 
 
-async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
-    request = take_from_worker(client, address, held)
+async def _fetch_from(
+    client: Client, address: str, held: list[str], patience_s: float
+) -> dict[str, Any]:
+    request = fetch_from_worker(client, address, held)
     return await _unless_silent(client, address, request, patience_s) or {}
 
 
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker, or return None if it does not respond in `patience_s`."""
+    """Await a request to a worker, or return None if the worker stops responding.
+
+    The worker counts as unresponsive if it does not answer a ping within `patience_s` seconds.
+    """
     answer_task = asyncio.ensure_future(request)
     try:
-        # Giving up a worker that answers would discard the data so far, and the next call would be
-        # as slow: on a busy machine that never ended. And a worker keeps each message that nobody
-        # reads to its end (the error holds its own stream).
+        # Do not give up on a slow worker that still responds to a ping. Its partial transfer would
+        # be lost, and on a busy machine the next transfers would not finish either. The worker
+        # would also keep every message that was not read to the end, because the error holds a
+        # reference to its own stream.
         while not (await asyncio.wait([answer_task], timeout=patience_s))[0]:
             try:
-                await wait_for(ask(client, address, "ping"), patience_s)
+                await wait_for(send_request(client, address, "ping"), patience_s)
             except (TimeoutError, OSError):
                 return None
         return answer_task.result()
@@ -98,41 +108,42 @@ async def _unless_silent(
         answer_task.cancel()
 
 
-def hold_for_driver(name: str, data: Any) -> str:
-    """Keep bytes in this worker's memory until `take_held` and return the worker's address.
+def hold_bytes(name: str, data: Any) -> str:
+    """Keep bytes in this worker's memory until they are fetched, and return the worker's address.
 
-    The caller has to limit the amount: bytes that nobody fetches stay for ever.
+    The caller must limit the amount of data, because bytes that are never fetched are never freed.
     """
     worker = get_worker()
     _held[name] = data
-    answer_to(worker, _HANDLER, _hand_over)
+    add_handler(worker, _HANDLER, _hand_over)
     return str(worker.address)
 
 
-def holds_for_driver() -> bool:
-    """Whether this process holds bytes that no driver has fetched yet."""
+def holds_bytes() -> bool:
+    """Return whether this process holds bytes that have not been fetched yet."""
     return bool(_held)
 
 
-def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch bytes that a worker holds under a name and then forgets.
+def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
+    """Fetch the bytes that a worker holds under a name, and free them on the worker.
 
-    The address is the result of `hold_for_driver`. Returns None if the bytes were taken before, or
-    if the worker has died or is silent for `patience_s`; a transfer may take longer.
+    `address` is the return value of `hold_bytes`. The result is None if the bytes have already been
+    fetched, if the worker has died, or if it does not respond for `patience_s` seconds. A transfer
+    may take longer.
     """
 
     async def take() -> Any:
-        request = ask(client, address, _HANDLER, name=name)
+        request = send_request(client, address, _HANDLER, name=name)
         answer = await _unless_silent(client, address, request, patience_s)
         return answer and answer["data"]
 
     try:
         return client.sync(take)
     except (OSError, ValueError, AttributeError, TypeError, KeyError):
-        return None  # the worker has died; a restarted one has no such handler
+        return None  # the worker has died, or was restarted and has no such handler
 
 
 def _hand_over(name: str) -> dict[str, Any]:
-    """Return and forget held bytes, as a handler of a worker."""
+    """Return held bytes and free them. This is a handler of the worker."""
     data = _held.pop(name, None)
-    return {"data": None if data is None else as_bytes(data)}
+    return {"data": None if data is None else wrap_bytes(data)}

@@ -1,4 +1,4 @@
-"""Tables as text, and as the HTML that notebooks show."""
+"""Formatting of tables as plain text and as HTML for notebooks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from tornado.template import Template
 
-# tornado escapes all that is written into a template: names come from users.
+# Names come from users, and tornado escapes everything that is inserted into a template.
 _TABLE = Template("""<table>
 <caption style="text-align: left">{{ title }}</caption>
 <thead><tr>{% for name in head %}<th style="text-align: {{ sides[name] }}">{{ name }}</th>{% end %}\
@@ -18,18 +18,18 @@ _TABLE = Template("""<table>
 </table>
 """)
 _PARAGRAPH = Template("<p>{{ text }}</p>\n")
-# Columns of words, which begin at the left; numbers end at the right.
-WORDS = frozenset({"", "partition", "stage", "worker", "pipe", "state", "status", "address"})
+# Columns that contain text and are left-aligned. Numbers are right-aligned.
+TEXT_COLUMNS = frozenset({"", "partition", "stage", "worker", "pipe", "state", "status", "address"})
 
 
 def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table with a title, the names of the columns and rows of cells."""
-    sides = {name: "left" if name in WORDS else "right" for name in head}
+    """Return an HTML table with a title, column names and rows of cells."""
+    sides = {name: "left" if name in TEXT_COLUMNS else "right" for name in head}
     return _TABLE.generate(title=title, head=head, rows=rows, sides=sides).decode()
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as lines of text, with columns of equal width."""
+    """Return a plain-text table whose columns are padded to equal width."""
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
@@ -39,12 +39,12 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def html_paragraph(text: str) -> str:
-    """Return a text as a paragraph."""
+    """Return a text as an HTML paragraph."""
     return _PARAGRAPH.generate(text=text).decode()
 
 
-def shown_seconds(seconds: float) -> str:
-    """Return a running time with three digits, or a dash if nothing has run."""
+def format_seconds(seconds: float) -> str:
+    """Format a running time with three significant digits, or as a dash if it is zero."""
     if not seconds:
         return "–"
     return f"{seconds:,.0f}" if seconds >= 100 else f"{seconds:.3g}"

@@ -1,4 +1,4 @@
-"""How much work a map keeps in flight, so that workers do not wait for the client."""
+"""Amount of work that a map keeps in flight so that workers do not wait for the client."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 
-LEAD_S = 1.0  # at first
+LEAD_S = 1.0  # initial lead time
 MOST_LEAD_S = 3600.0
-IDLE = 0.1  # share of the time for which both sides wait, that shows a lead which is too short
+IDLE = 0.1  # the lead time is too short if both sides are idle for more than this fraction
 
 
-class Lead:
-    """Work in flight for each slot of a map, in seconds.
+class LeadTime:
+    """Amount of work in flight for each slot of a map, in seconds.
 
-    A client that computes between results, or a machine that is short of processor time, sends the
-    next tasks late. The lead covers this delay. It doubles if, over a whole window of tasks, both
-    the slots and the client were idle for a tenth of the time. If the client never waits, it is
-    slower than the workers, and more tasks in flight would not help.
+    A client that computes between results, or that runs on a busy machine, sends the next tasks
+    late. The lead time covers this delay. It doubles if both the slots and the client were idle for
+    more than 10 % of the time over a whole window of tasks. If the client never waits, it is slower
+    than the workers, and more tasks in flight would not help.
 
     Examples
     --------
-    >>> lead = Lead()
+    >>> lead = LeadTime()
     >>> lead.seconds
     1.0
     >>> lead.grow()
@@ -37,34 +37,35 @@ class Lead:
         self._since = time.monotonic()
         self._tasks = 0
         self._waited_s = 0.0
-        self._busy_s: Counter[str] = Counter()  # {partition: seconds for which all slots were busy}
+        self._busy_s: Counter[str] = Counter()  # {partition: time for which all slots were busy}
 
     def count_task(self, busy_s: Mapping[str, float]) -> None:
-        """Count a task that has come back.
+        """Record that a task has finished.
 
         Parameters
         ----------
         busy_s
-            {partition: seconds for which the task kept a slot, divided by the number of slots}
+            Time in seconds for which the task occupied a slot, divided by the number of slots, by
+            partition.
         """
         self._tasks += 1
         self._busy_s.update(busy_s)
 
     def count_wait(self, seconds: float) -> None:
-        """Count the time for which the client waited for tasks."""
+        """Record a time in seconds for which the client has waited for tasks."""
         self._waited_s += seconds
 
     def review(self, window: int) -> None:
-        """Grow after a window of tasks during which slots and client were idle."""
+        """Double the lead time if both sides were idle during the last `window` tasks."""
         if self._tasks < window:
             return
         elapsed_s = time.monotonic() - self._since
-        # Of a map of a map, the partition with the most work limits the rate.
+        # In a chain of maps, the partition with the most work limits the rate.
         idle_s = elapsed_s - max(self._busy_s.values())
         if min(idle_s, self._waited_s) > IDLE * elapsed_s:
             self.grow()
         self._start_period()
 
     def grow(self) -> None:
-        """Double the lead."""
+        """Double the lead time, up to `MOST_LEAD_S`."""
         self.seconds = min(2 * self.seconds, MOST_LEAD_S)

@@ -1,7 +1,8 @@
-"""Results of one function for many items, several items in a task, with a bounded number of tasks.
+"""Maps: results of a function for many items, with several items per task and few tasks in flight.
 
-A map of a map is one map of two stages: each task of the first is followed by a task of the
-second, which fetches the result of the first from its worker.
+A map over the results of another map is a single map with two stages. Each task of the first stage
+is followed by a task of the second stage, which fetches the result of the first directly from its
+worker.
 """
 
 from __future__ import annotations
@@ -26,32 +27,32 @@ from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
-from .internals.client import gather, slots_lent, when_done
-from .map_lead import Lead
-from .membership import Prospects, prospects
-from .worker_wait import WAIT_S, WorkerWait, check_wait
+from .internals.client import call_when_done, gather, lend_slots
+from .map_lead import LeadTime
+from .membership import PartitionCapacity, request_capacity
+from .worker_wait import WAIT_S, WorkerWait, check_wait_s
 
 logger = logging.getLogger(__name__)
 
-NOTE = "poolpart: "  # how the notes that name a failed item start
-MOST_ITEMS = 1024
-MOST_TASKS = 512  # in flight, unless there are more slots: then two a slot
-GROWTH = 4  # most items in a chunk, in multiples of those that have come back
-MOST_BYTES = 2**20
-MOST_BYTES_IN_FLIGHT = 64 * 2**20  # of all tasks, unless two tasks a slot have more
-SEND_S = 0.05  # longest time for which items of a slow iterable are held back
-LOOK_S = 5.0  # between looks at the number of slots
-CHUNK_S = 0.1  # target time of a task …
-CHUNK_S_PER_SLOT = 0.005  # … or longer with many slots, so that the scheduler keeps up
-PATIENCE = 4  # a task ends after so many times the target; its other items are sent again
+NOTE = "poolpart: "  # beginning of the notes that name a failed item
+MOST_ITEMS = 1024  # maximum number of items in a chunk
+MOST_TASKS = 512  # maximum number of tasks in flight, unless two per slot are more
+GROWTH = 4  # maximum number of items in a chunk, relative to the number of items processed so far
+MOST_BYTES = 2**20  # maximum size of the items and results of a chunk
+MOST_BYTES_IN_FLIGHT = 64 * 2**20  # maximum size of all chunks, unless two per slot are more
+SEND_S = 0.05  # maximum time to collect items of a slow iterable before they are sent
+CHECK_S = 5.0  # interval between requests for the number of slots
+CHUNK_S = 0.1  # target duration of a task
+CHUNK_S_PER_SLOT = 0.005  # minimum target per slot, so that the scheduler keeps up with many slots
+PATIENCE = 4  # a task ends early after this multiple of the target, and its other items are resent
 
-Call = tuple[Any, ...]  # the arguments of one call
-Row = tuple[Call, ...]  # calls of an item, by stage: arguments besides the previous result
+Call = tuple[Any, ...]  # positional arguments of a call, without the result of the previous stage
+Row = tuple[Call, ...]  # calls of an item by stage
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items of a task: index of the first item, and the calls of each item, by stage."""
+    """Items of a task: the index of the first item, and the calls of each item by stage."""
 
     first: int
     rows: Sequence[Row]
@@ -59,14 +60,14 @@ class Chunk:
 
 @dataclass(frozen=True)
 class ChunkResult:
-    """Result of a chunk."""
+    """Results of a chunk, with the time that each stage took."""
 
-    results: list[Any]  # at least one; results of all items, unless one failed or time was up
-    seconds: tuple[float, ...]  # from start to end, by stage
-    nbytes: int  # estimated size of items and results
+    results: list[Any]  # at least one, but not all if an item failed or the time limit was reached
+    seconds: tuple[float, ...]  # duration by stage
+    nbytes: int  # estimated size of the items and results of the last stage
 
     def __sizeof__(self) -> int:
-        """Return the size of the results in bytes, which Dask counts and spills by."""
+        """Return the size of the results in bytes, which Dask uses for its memory limits."""
         return int(sizeof(self.results))
 
 
@@ -81,18 +82,16 @@ def run_chunk(
     result_position: int,
     return_exceptions: bool,
 ) -> ChunkResult:
-    """Call a function for each item of a chunk in turn.
+    """Call a function for each item of a chunk. Runs on a worker.
 
-    Runs on a worker.
-
-    The task fails if the function fails for the first item of the chunk. If the function fails for
-    a later item, the task ends before that item, and the error occurs when the items are sent
-    again.
+    If the function fails for the first item of the chunk, the task fails. If the function fails for
+    a later item, the task ends before that item, and the error occurs when the remaining items are
+    sent again.
 
     Parameters
     ----------
     function, keywords
-        The function and its keyword arguments.
+        Function and its keyword arguments.
     first
         Index of the first item of the chunk in the map.
     calls
@@ -100,12 +99,12 @@ def run_chunk(
     previous
         Results of the previous stage, if there is one.
     patience_s
-        The task ends after the item at which so many seconds have passed, so that items which take
-        longer than earlier items do not wait for each other on one worker.
+        Time in seconds after which the task ends early. Otherwise, if items take longer than
+        earlier items, they would all wait for each other on one worker.
     result_position
         Position of the previous result among the arguments.
     return_exceptions
-        Return the error of an item as its result.
+        Whether to return the error of an item as its result.
     """
     start = time.perf_counter()
     results: list[Any] = []
@@ -138,7 +137,7 @@ def _call(function: Callable[..., Any], call: Call, keywords: dict[str, Any]) ->
     try:
         return function(*call, **keywords)
     except StopIteration as error:
-        # Raised from an iterator's `__next__`, it would end the map silently.
+        # A StopIteration that is raised in an iterator's `__next__` would end the map silently.
         raise RuntimeError(f"{function} raised StopIteration") from error
 
 
@@ -153,10 +152,10 @@ def _sendable(error: Exception) -> Exception:
 
 
 class ChunkSize:
-    """Number of items for a task of about `target_s` seconds, learned from past chunks.
+    """Number of items for a task of about `target_s` seconds, learned from previous chunks.
 
-    It starts with one, is at most four times the number of items that have come back, and limits a
-    task's items and results to about a mebibyte.
+    The first chunk has one item. Later chunks have at most four times as many items as have been
+    processed so far, and their items and results are limited to about 1 MiB.
 
     Examples
     --------
@@ -172,11 +171,11 @@ class ChunkSize:
     """
 
     def __init__(self) -> None:
-        self._tried = 0  # items that have come back
+        self._tried = 0  # number of items processed so far
         self._item_s = self._item_bytes = 0.0  # moving averages
 
     def learn(self, items: int, seconds: float, nbytes: int) -> None:
-        """Learn from a chunk that ran."""
+        """Update the averages with a chunk that has been processed."""
         weight = 0.3 if self._tried else 1.0
         self._item_s += weight * (seconds / items - self._item_s)
         self._item_bytes += weight * (nbytes / items - self._item_bytes)
@@ -189,9 +188,9 @@ class ChunkSize:
         return round(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
 
     def chunks(self, items: int, seconds: float, nbytes: int) -> int:
-        """Return how many chunks of so many items take `seconds`, or have `nbytes` in all.
+        """Return how many chunks with `items` items take `seconds` or have a size of `nbytes`.
 
-        Return 0 before any item has come back.
+        The smaller of both numbers is returned, or 0 if no item has been processed yet.
         """
         if not self._tried:
             return 0
@@ -200,13 +199,13 @@ class ChunkSize:
         return int(min(by_time, by_bytes))
 
     def will_grow(self, items: int) -> bool:
-        """Return whether few items have come back, so that later chunks may have more items."""
+        """Return whether `items` is limited because few items have been processed so far."""
         return items >= GROWTH * self._tried
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a map: function, partition and options."""
+    """Stage of a map, with its function, partition and options."""
 
     client: Client
     partition: str
@@ -219,9 +218,9 @@ class Stage:
     slots: int = 1
     return_exceptions: bool = False
     keywords: dict[str, Any] = field(default_factory=dict)
-    result_position: int = 0  # number of the argument that is a result of the stage before
-    by_rule: bool = False  # the partition can be dissolved
-    empty_s: float = WAIT_S  # longest wait without workers
+    result_position: int = 0  # position of the argument that is the result of the previous stage
+    by_rule: bool = False  # whether the partition can be dissolved
+    empty_s: float = WAIT_S  # maximum time to wait without workers
 
     def __post_init__(self) -> None:
         for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
@@ -231,11 +230,11 @@ class Stage:
                     f"Invalid value {value!r} for `{name}`. Expected an integer of at least "
                     f"{minimum}."
                 )
-        check_wait(self.empty_s)
+        check_wait_s(self.empty_s)
 
-    def prospects(self) -> Prospects:
-        """Ask what the tasks of this stage may expect of the partition."""
-        return prospects(self.client, self.partition, self.slots, self.by_rule)
+    def request_capacity(self) -> PartitionCapacity:
+        """Ask the scheduler whether and how many tasks of this stage the partition can run."""
+        return request_capacity(self.client, self.partition, self.slots, self.by_rule)
 
     def send(
         self,
@@ -244,10 +243,10 @@ class Stage:
         calls: Sequence[Sequence[Call]],
         previous_tasks: Sequence[Future] | None = None,
     ) -> list[Future]:
-        """Submit a task for each chunk, after `previous_tasks`, the tasks of the stage before."""
-        # Dask tries again only what fails.
+        """Submit a task for each chunk, optionally after the tasks of the previous stage."""
+        # Dask only retries tasks that fail, so errors must not become results if `retries` is set.
         keep_errors = self.return_exceptions and not self.retries
-        # One message is cheaper for the scheduler than one for each task.
+        # A single message for all tasks is cheaper for the scheduler than one message per task.
         futures: list[Future] = self.client.map(
             partial(
                 run_chunk,
@@ -258,11 +257,11 @@ class Stage:
             ),
             firsts,
             calls,
-            # As an argument, so that futures among them are replaced by results. Dask's own keyword
-            # arguments share one key on the cluster if they are large.
+            # Keyword arguments are passed as a positional argument, so that futures among them are
+            # replaced by their results. Dask's own keyword arguments share a key if they are large.
             [self.keywords] * len(firsts),
             *([previous_tasks] if previous_tasks else []),
-            # Dask takes the first word, and further words of letters only, as the prefix.
+            # Dask derives the prefix from the first word and further words that only have letters.
             key=f"{funcname(self.function)}-map",
             pure=False,
             priority=self.priority,
@@ -290,39 +289,41 @@ class Results(Iterator[Any]):
         lengths = [_length(iterable) for iterable in iterables]
         self._length = math.inf if math.inf in lengths else min(lengths, default=0)
         self._closed = False
-        self._begun = False  # a result was requested
-        self._items_read = 0  # items read from the source
-        self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent again
+        self._begun = False  # whether a result was requested
+        self._items_read = 0  # number of items read from the source
+        self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to send again
         self._size = ChunkSize()
-        self._lead = Lead()
+        self._lead = LeadTime()
         self._running: dict[Future, Chunk] = {}
-        self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that were sent
-        # {index of the first item: a chunk that has ended, and its result or the failed task}
+        self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that have ended
+        # {index of the first item: (finished chunk, its result or the failed task)}
         self._undelivered: dict[int, tuple[Chunk, ChunkResult | Future]] = {}
-        self._next_item = 0  # index of the next one to deliver, if in order
-        self._ready: deque[Any] = deque()  # results to be delivered
-        self._failed: tuple[Chunk, Future] | None = None  # raised after these
+        self._next_item = 0  # index of the next item to deliver if the map is ordered
+        self._ready: deque[Any] = deque()  # results to deliver
+        self._failed: tuple[Chunk, Future] | None = None  # raised after the results in `_ready`
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
-        # A second map is an ordinary iterable: its tasks have other items.
+        # A second map is an ordinary iterable, because its chunks have different items.
         previous = iterables[maps[0]] if maps else None
         if isinstance(previous, Results):
             other_iterables = [i for i in iterables if i is not previous]
-            self._follow(previous, replace(stage, result_position=maps[0]), other_iterables)
+            self._continue_map(previous, replace(stage, result_position=maps[0]), other_iterables)
         else:
             self._stages: tuple[Stage, ...] = (stage,)
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
-            self._waits = [_wait_of(stage)]
-            self._look()
+            self._waits = [_worker_wait(stage)]
+            self._update_slots()
         self._submit()
 
-    def _follow(self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
-        """Take over an unread map, as the stages before the last."""
+    def _continue_map(
+        self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]
+    ) -> None:
+        """Take over the source and the running tasks of an unread map as the previous stages."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*previous._stages, stage)
-        self._waits = [*previous._waits, _wait_of(stage)]
+        self._waits = [*previous._waits, _worker_wait(stage)]
         self._source = ((*row, call) for call, row in zip(calls, previous._source, strict=False))
         self._items_read = previous._items_read
-        self._look()
+        self._update_slots()
         sent: dict[Future, Chunk] = {}
         for future, chunk in previous._running.items():
             if rows := [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]:
@@ -331,7 +332,7 @@ class Results(Iterator[Any]):
         previous._begun = previous._closed = True
         previous._running.clear()
 
-    # -- for the user ------------------------------------------------------------------
+    # -- iteration ---------------------------------------------------------------------
 
     def __next__(self) -> Any:
         self._begun = True
@@ -356,7 +357,7 @@ class Results(Iterator[Any]):
         return int(self._length)
 
     def __bool__(self) -> bool:
-        # Dask's `as_completed` asks first; it would take the results for futures.
+        # Dask's `as_completed` evaluates this before it would interpret the results as futures.
         raise TypeError(
             "`Partition.map` returns an iterator of results, not futures. Iterate over it, with "
             "`ordered=False` to receive results as they complete. To obtain futures for "
@@ -377,7 +378,7 @@ class Results(Iterator[Any]):
         self._failed = None
         for held in (self._ready, self._undelivered, self._unfinished):
             held.clear()
-        # Release each one: the callback that waits for it holds a reference as well.
+        # Futures are released explicitly, because their callbacks hold references as well.
         for future in self._running:
             future.release()
         self._running.clear()
@@ -393,40 +394,46 @@ class Results(Iterator[Any]):
         if not self._running:
             self._submit()
         if self._running:
-            self._look_for_idle_slots()
-            self._take_back(self._wait())
+            self._grow_if_idle()
+            self._collect_results(self._wait())
             self._deliver()
             self._submit()
         else:
             self.close()
 
-    def _look_for_idle_slots(self) -> None:
-        """Grow if the client is about to wait while slots idle, as behind a slow item, in order."""
+    def _grow_if_idle(self) -> None:
+        """Increase the lead time if the client is about to wait while slots are idle.
+
+        This happens in an ordered map if later tasks have finished before a slow one.
+        """
         in_flight = len(self._running) - self._ended.qsize()
         if self._ended.empty() and in_flight < max(self._slots):
             self._lead.grow()
             self._submit()
 
-    def _look(self) -> None:
-        """Read the number of slots: partitions grow, shrink, and lose workers.
+    def _update_slots(self) -> None:
+        """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
 
-        PoolError if tasks of a stage could never run, or have waited for workers too long.
+        Raises
+        ------
+        PoolError
+            If tasks of a stage could never run, or have waited too long for workers.
         """
-        prospects = [stage.prospects() for stage in self._stages]
-        self._slots = [of_stage.running for of_stage in prospects]
-        for wait, of_stage in zip(self._waits, prospects, strict=True):
+        request_capacity = [stage.request_capacity() for stage in self._stages]
+        self._slots = [of_stage.max_running for of_stage in request_capacity]
+        for wait, of_stage in zip(self._waits, request_capacity, strict=True):
             wait.check(of_stage)
-        until_next = min(wait.until_next_check(LOOK_S) for wait in self._waits)
-        self._next_look = time.monotonic() + until_next
+        until_next = min(wait.seconds_until_check(CHECK_S) for wait in self._waits)
+        self._next_check = time.monotonic() + until_next
 
     def _submit(self) -> None:
-        """Send chunks up to the window, in as few messages as possible."""
+        """Send chunks until the window is full, in as few messages as possible."""
         size, window = self._sizes()
         free = window - len(self._running)
-        # Avoid a message for each chunk; the tasks under way keep the slots busy.
+        # Several chunks are sent in one message, since the tasks in flight keep the slots busy.
         if self._running and free < window // 4:
             return
-        # Chunks that came out of order take room as well, but not from earlier items.
+        # Undelivered results limit the number of new items, but not items to send again.
         fresh = free - len(self._undelivered)
         started = time.monotonic()
         chunks: list[Chunk] = []
@@ -438,24 +445,24 @@ class Results(Iterator[Any]):
             if time.monotonic() - started > SEND_S:
                 self._run(chunks)
                 if self._ready or not self._ended.empty():
-                    return  # read results first, because items come slowly
+                    return  # deliver results before reading more of a slow iterable
                 chunks = []
                 started = time.monotonic()
         self._run(chunks)
 
     def _sizes(self) -> tuple[int, int]:
-        """Return the number of items in the next chunk, and the number of tasks under way."""
+        """Return the number of items in the next chunk, and the maximum number of tasks."""
         learned = self._size.items(self._target_s())
         given = next((stage.chunk for stage in self._stages[::-1] if stage.chunk), None)
         size = given or learned
         slots = zip(self._stages, self._slots, strict=True)
         window = sum(stage.window or max(2, 2 * number) for stage, number in slots)
-        # Items of quick calls are not all sent in chunks of the few that were tried first.
+        # The window only grows with the final chunk size, so that not all items of fast functions
+        # are sent in the small chunks at the beginning.
         if not any(stage.window for stage in self._stages) and (
             given or not self._size.will_grow(size)
         ):
             slot_count = max(1, sum(self._slots))
-            # Work for the lead in each slot.
             grown = self._size.chunks(size, slot_count * self._lead.seconds, MOST_BYTES_IN_FLIGHT)
             window = max(window, min(grown, MOST_TASKS // len(self._stages)))
         return size, window
@@ -470,14 +477,17 @@ class Results(Iterator[Any]):
         for number, stage in stages if previous_tasks is None else stages[-1:]:
             patience_s = math.inf if stage.chunk else PATIENCE * self._target_s()
             calls = [[row[number] for row in chunk.rows] for chunk in chunks]
-            # Only the next task holds the result of a stage.
+            # Only the task of the next stage keeps the result of this stage in memory.
             futures = stage.send(patience_s, firsts, calls, futures)
         for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
-            when_done(future, self._ended.put)
+            call_when_done(future, self._ended.put)
 
     def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
-        """Return a chunk of items to send again or, if `fresh`, of new items, or None if empty."""
+        """Return the next chunk, or None if there is none.
+
+        Items that have to be sent again come first. New items are only read if `fresh` is true.
+        """
         if self._unfinished:
             first, rows = heapq.heappop(self._unfinished)
             if len(rows) > size:
@@ -500,10 +510,10 @@ class Results(Iterator[Any]):
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
 
     def _wait(self) -> list[Future]:
-        """Wait until tasks are done, and lend the slots of a task of a partition meanwhile."""
+        """Wait until tasks have ended, lending the slots of the calling task in the meantime."""
         ended: list[Future] = []
         started = time.monotonic()
-        with slots_lent(self._ended.empty()):
+        with lend_slots(self._ended.empty()):
             while not ended:
                 self._check_while_waiting()
                 with suppress(queue.Empty):
@@ -514,23 +524,23 @@ class Results(Iterator[Any]):
         return ended
 
     def _check_while_waiting(self) -> None:
-        """Raise if the client was closed, and count the partition's slots from time to time."""
+        """Update the number of slots regularly, and raise if the client was closed."""
         if self._stages[-1].client.status in ("closing", "closed"):
             raise CancelledError(
                 f"The client that partition {self._stages[-1].partition!r} uses was closed."
             )
-        # Not while there are results: results of a dissolved partition are read first.
-        if self._ended.empty() and time.monotonic() > self._next_look:
-            self._look()
+        # If the partition was dissolved, the results of finished tasks are delivered first.
+        if self._ended.empty() and time.monotonic() > self._next_check:
+            self._update_slots()
 
-    def _take_back(self, ended: list[Future]) -> None:
-        """Fetch the results of finished tasks, all at once."""
+    def _collect_results(self, ended: list[Future]) -> None:
+        """Fetch the results of ended tasks in a single request."""
         finished = []
         for future in ended:
             if future.status == "finished":
                 finished.append(future)
-            elif future.status in ("pending", "lost"):  # lost with its worker: run it again
-                when_done(future, self._ended.put)
+            elif future.status in ("pending", "lost"):  # lost with its worker, and runs again
+                call_when_done(future, self._ended.put)
             else:
                 chunk = self._running.pop(future)
                 self._undelivered[chunk.first] = chunk, future
@@ -543,14 +553,14 @@ class Results(Iterator[Any]):
         self._lead.review(self._sizes()[1])
 
     def _busy_s(self, seconds: Sequence[float]) -> dict[str, float]:
-        """Return how long a task kept its slots busy, over their number, by partition."""
+        """Return how long a task occupied its slots, divided by their number, by partition."""
         busy_s: dict[str, float] = {}
         for stage, stage_s, slots in zip(self._stages, seconds, self._slots, strict=True):
             busy_s[stage.partition] = busy_s.get(stage.partition, 0.0) + stage_s / max(1, slots)
         return busy_s
 
     def _deliver(self) -> None:
-        """Queue the results to be delivered next."""
+        """Move the results that come next to the queue of ready results."""
         while self._undelivered and self._failed is None:
             first = self._next_item if self._stages[-1].ordered else next(iter(self._undelivered))
             if first not in self._undelivered:
@@ -558,7 +568,7 @@ class Results(Iterator[Any]):
             chunk, answer = self._undelivered.pop(first)
             if isinstance(answer, Future):
                 error = answer.exception() if self._stages[-1].return_exceptions else None
-                if not _of_item(error):
+                if not _is_item_error(error):
                     self._failed = chunk, answer
                     return
                 answer = ChunkResult([error], (), 0)
@@ -569,12 +579,12 @@ class Results(Iterator[Any]):
                 heapq.heappush(self._unfinished, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
-        """Stop, and raise a task's error with a note that names the item."""
+        """Close the map, and raise the error of a task with a note that names the item."""
         self.close()
         try:
             future.result()
         except Exception as error:
-            if not (_of_item(error) or future.cancelled() or isinstance(error, PoolError)):
+            if not (_is_item_error(error) or future.cancelled() or isinstance(error, PoolError)):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(
                     f"{NOTE}The task processed items {chunk.first} to {last} of a map. Unless "
@@ -584,17 +594,17 @@ class Results(Iterator[Any]):
         raise AssertionError("the task has not failed")
 
 
-def _wait_of(stage: Stage) -> WorkerWait:
+def _worker_wait(stage: Stage) -> WorkerWait:
     return WorkerWait(stage.partition, "The map", stage.empty_s)
 
 
-def _of_item(error: BaseException | None) -> bool:
-    """Whether an error comes from an item, rather than from Dask."""
+def _is_item_error(error: BaseException | None) -> bool:
+    """Return whether an error was raised by the function for an item, rather than by Dask."""
     return any(note.startswith(NOTE) for note in getattr(error, "__notes__", ()))
 
 
 def _length(iterable: Iterable[Any]) -> float:
-    """Return the number of items to come, or infinity if an iterable has no length."""
+    """Return the number of remaining items, or infinity if an iterable has no length."""
     if isinstance(iterable, Results):
         return iterable._length - iterable.done
     return len(iterable) if isinstance(iterable, Sized) else math.inf

@@ -1,20 +1,22 @@
-"""Tasks that could never run are refused by the scheduler, so that submitting asks nothing.
+"""Registration of clients, and rejection of tasks that could never run.
 
 A client registers with the scheduler before its first task for a partition (`register`). From then
-on, features such as inheritance are on in the partition (`features.py`), and a rule looks at each
-graph of the client when the graph arrives. Tasks for a partition that was dissolved,
-for more slots than any worker of the partition has, or for a worker outside the partition fail with
-a `PoolError`; otherwise they would wait for ever. Tasks of other clients are not looked at.
+on, features such as inheritance are enabled in the partition (see `features.py`), and a rule checks
+each graph of the client when it arrives. Tasks fail with a `PoolError` if their partition was
+dissolved, if they request more slots than any worker of the partition has, or if they name a worker
+outside the partition. Without this check, they would wait forever. Tasks of clients that are not
+registered are not checked.
 
-The scheduler knows the members at that moment. A client that asked for them would wait for the
-answer of a busy scheduler, and the answer would be old when it arrives.
+The check runs on the scheduler because only the scheduler knows the current members. A client would
+have to wait for the response of a busy scheduler, and the response could be outdated when it
+arrives.
 
-The registration ends with the connection of the client. It also ends when the partition is
-dissolved, by the client itself, or without any client outside tasks that uses the partition: then
-workers are told that their clients have to register again.
+The registration ends with the connection of the client, or when the partition is dissolved. The
+registrations of clients in tasks end when no client outside of tasks uses the partition anymore. In
+this case, the workers are notified that their clients have to register again.
 
-Tasks are counted (`stats.py`) from the first registration on. Counts that nobody has asked for are
-deleted with the last registration.
+Tasks are counted (see `stats.py`) from the first registration on. Unless somebody has requested the
+counts, they are deleted with the last registration.
 """
 
 from __future__ import annotations
@@ -29,17 +31,17 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .adapting import adaptive_names, expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
-from .features import begin_features, end_features, features_settled, names_with_features
-from .internals.method_rules import Rules, rule_for_arriving_graphs
-from .internals.names import REFUSING, require
+from .features import disable_features, enable_features, names_with_features, wait_for_features
+from .internals.method_rules import MethodRules, add_arrival_rule
+from .internals.names import REFUSING, require_feature
 from .internals.placing import has_worker_for, workers_declaring
-from .internals.worker import task_of_thread
-from .registration import is_registered, note_registration
+from .internals.worker import current_task
+from .registration import is_registered, record_registration
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
 from .steward import Steward, names_with_rule
-from .workers import on_scheduler
+from .workers import run_on_scheduler
 
 logger = logging.getLogger(__name__)
 
@@ -47,42 +49,45 @@ NAME = "poolpart-registrations"
 
 
 class MemberName(str):
-    """Name or address of a member of a partition, for the scheduler to look its address up."""
+    """Name or address of a member, which the scheduler resolves to an address."""
 
     __slots__ = ()
 
 
 def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
-    """Register a client for a partition, once.
-
-    Returns whether the partition has, or had, a rule.
+    """Register a client for a partition unless it is already registered.
 
     Parameters
     ----------
     client, name
-        The client and the partition.
+        Client and name of the partition.
     slots
-        Slots of the client's first task.
+        Number of slots that the first task requests.
     by_rule
-        Whether the caller knows that the partition has, or had, a rule.
+        Whether the caller knows that a division of the pool has created the partition.
+
+    Returns
+    -------
+    bool
+        Whether a division of the pool has created the partition, even if it was dissolved.
 
     Raises
     ------
     PoolError
-        If the first task could never run, the scheduler lacks this package, or the client is
-        closed or asynchronous.
+        If the first task could never run, if poolpart is not installed in the scheduler's
+        environment, or if the client is closed or asynchronous.
     """
     if is_registered(client, name):
         return by_rule
     connection = client.scheduler_comm
-    has_or_had_rule, objection, others = on_scheduler(
+    has_or_had_rule, objection, others = run_on_scheduler(
         client,
         _register,
         name=name,
         slots=slots,
         by_rule=by_rule,
         client_id=client.id,
-        in_task=task_of_thread() is not None,
+        in_task=current_task() is not None,
     )
     if objection:
         raise PoolError(objection)
@@ -95,25 +100,27 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
             name,
             existing,
         )
-    note_registration(client, name, connection)
+    record_registration(client, name, connection)
     return bool(has_or_had_rule)
 
 
 @dataclass(frozen=True)
-class Prospects:
-    """What tasks of a partition may expect of its workers."""
+class PartitionCapacity:
+    """Ability of a partition to run tasks of a certain size."""
 
-    running: int  # tasks that run at a time, now or with all workers that may be started
-    has_workers: bool  # now, or a worker is starting, waits in a queue, or may be started
-    objection: str  # why the tasks could never run, or ""
+    max_running: int  # number of tasks that run at a time, once all adaptive jobs have started
+    has_workers: bool  # whether a worker exists, is queued or starting, or can be started
+    rejection: str  # reason why the tasks could never run, or ""
 
 
-def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects:
-    """Ask what tasks of so many slots may expect of a partition.
+def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> PartitionCapacity:
+    """Ask the scheduler whether and how many tasks with `slots` slots a partition can run.
 
-    The arguments are as in `register`.
+    The arguments are the same as in `register`.
     """
-    answer: Prospects = on_scheduler(client, _prospects, name=name, slots=slots, by_rule=by_rule)
+    answer: PartitionCapacity = run_on_scheduler(
+        client, _capacity, name=name, slots=slots, by_rule=by_rule
+    )
     return answer
 
 
@@ -121,20 +128,20 @@ def prospects(client: Client, name: str, slots: int, by_rule: bool) -> Prospects
 
 
 class Registrations(SchedulerPlugin):
-    """Clients that use partitions, and the rule that refuses their tasks."""
+    """Scheduler plugin that stores the registered clients and rejects their impossible tasks."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        # {partition: {id of a client: whether the client keeps the registrations of all clients}}
+        # {partition: {client ID: whether this client keeps the registrations of all clients}}
         self.clients: dict[str, dict[str, bool]] = {}
-        self.with_rule: set[str] = set()  # partitions that have, or had, a rule
-        self._rules = Rules()
+        self.with_rule: set[str] = set()  # partitions that have or had a rule
+        self._rules = MethodRules()
         try:
-            require(REFUSING)
-            rule_for_arriving_graphs(self._rules, scheduler, self._check)
-        except PoolError as error:  # partitions are of use without
+            require_feature(REFUSING)
+            add_arrival_rule(self._rules, scheduler, self._check)
+        except PoolError as error:  # partitions are useful without this check
             logger.warning(
                 "Partitions: Tasks that can never run wait instead of failing. %s", error
             )
@@ -142,29 +149,33 @@ class Registrations(SchedulerPlugin):
 
     # -- clients -----------------------------------------------------------------------
 
-    def add(self, name: str, client: str, keeps: bool, has_or_had_rule: bool) -> None:
+    def register(self, name: str, client: str, keeps: bool, has_or_had_rule: bool) -> None:
         """Register a client for a partition."""
         self.clients.setdefault(name, {})[client] = keeps
         if has_or_had_rule:
             self.with_rule.add(name)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Remove a client that has left."""
+        """Remove the registrations of a client that has left."""
         for name in [name for name, clients in self.clients.items() if client in clients]:
-            self.remove(name, client)
+            self.unregister(name, client)
 
-    def remove(self, name: str, client: str) -> None:
-        """Remove the registration of a client, and all of a partition that nothing keeps."""
+    def unregister(self, name: str, client: str) -> None:
+        """Remove the registration of a client for a partition.
+
+        If no other client keeps the registrations of a partition without a rule, all of them are
+        removed.
+        """
         clients = self.clients[name]
         clients.pop(client, None)
         if not has_rule(self.scheduler, name) and not any(clients.values()):
             clients.clear()
-            end_features(self.scheduler, name)
+            disable_features(self.scheduler, name)
         if not clients:
             del self.clients[name]
             self.with_rule.discard(name)
         if not self.clients:
-            self._rules.take_back()
+            self._rules.remove_all()
             self.scheduler.remove_plugin(NAME)
             statistics = self.scheduler.plugins.get(STATISTICS)
             if statistics is not None and not statistics.is_kept:
@@ -173,30 +184,33 @@ class Registrations(SchedulerPlugin):
     # -- tasks -------------------------------------------------------------------------
 
     def _check(self, graph: dict[str, Any]) -> dict[str, Any]:
-        """Return the arguments of a graph, with addresses of members.
+        """Return the arguments of a graph, with the names of members replaced by addresses.
 
-        Raises PoolError to refuse the graph.
+        Raises
+        ------
+        PoolError
+            If the graph contains a task that could never run.
         """
         annotations = graph["global_annotations"] or {}
         client = graph["client"]
         for resources in graph["annotations_by_type"].get("resources", {}).values():
             self._refuse(client, resources)
         resources = annotations.get("resources")
-        if not isinstance(resources, dict):  # none, or a function
+        if not isinstance(resources, dict):  # None or a callable
             return graph
         self._refuse(client, resources)
         workers = annotations.get("workers")
         if not workers or not all(isinstance(worker, MemberName) for worker in workers):
             return graph
         [name] = resources
-        workers = addresses_of(self.scheduler, name, workers)
+        workers = addresses_of_members(self.scheduler, name, workers)
         return {**graph, "global_annotations": {**annotations, "workers": workers}}
 
     def _refuse(self, client: str, resources: Mapping[str, float]) -> None:
-        """Raise a PoolError if tasks of a client with these resources could never run."""
+        """Raise PoolError if tasks of a client with these resources could never run."""
         for name, slots in resources.items():
             if client in self.clients.get(name, ()):
-                objection = objection_to(self.scheduler, name, slots, name in self.with_rule)
+                objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
                 if objection:
                     raise PoolError(objection)
 
@@ -209,27 +223,33 @@ async def _register(
     in_task: bool,
     dask_scheduler: Any = None,
 ) -> tuple[bool, str, list[str] | None]:
-    """Register a client, unless its task could never run.
+    """Register a client unless its task could never run.
 
-    Returns whether the partition has or had a rule, why the task cannot run, or "", and, if no
-    worker of the partition exists or is expected, the names of the partitions that exist.
+    Returns
+    -------
+    has_or_had_rule
+        Whether a division of the pool has created the partition.
+    rejection
+        Reason why the task could never run, or "".
+    others
+        Names of all partitions if this partition has no workers and expects none, otherwise None.
     """
     registrations: Registrations | None = dask_scheduler.plugins.get(NAME)
     ruled = has_rule(dask_scheduler, name)
     was_ruled = registrations is not None and name in registrations.with_rule
     has_or_had_rule = by_rule or ruled or was_ruled
-    objection = objection_to(dask_scheduler, name, slots, has_or_had_rule)
-    # The last request of a client that was killed may come after it has left.
+    objection = rejection_reason(dask_scheduler, name, slots, has_or_had_rule)
+    # The last request of a client that was killed may arrive after the client was removed.
     if not objection and client_id in dask_scheduler.clients:
-        # A worker's client closes only with the worker, so that it must not prolong an inheritance
-        # that other clients have begun.
+        # The client of a worker stays connected as long as the worker. Therefore, it must not keep
+        # the features enabled that other clients have enabled.
         keeps = not (in_task and (ruled or name in names_with_features(dask_scheduler)))
         registrations = registrations or Registrations(dask_scheduler)
-        registrations.add(name, client_id, keeps, has_or_had_rule)
+        registrations.register(name, client_id, keeps, has_or_had_rule)
         statistics_of(dask_scheduler, keep=False)
-        if not ruled:  # or the division of the pool has begun it
-            begin_features(dask_scheduler, [name])
-        await features_settled()
+        if not ruled:  # otherwise, the division of the pool has enabled them
+            enable_features(dask_scheduler, [name])
+        await wait_for_features()
     others = None
     if not expects_any_worker(dask_scheduler, name, slots):
         others = partition_names(dask_scheduler)
@@ -237,7 +257,7 @@ async def _register(
 
 
 def partition_names(dask_scheduler: Any = None) -> list[str]:
-    """Return the names of all partitions, including divided and adaptive ones without workers.
+    """Return the names of all partitions, including created and adaptive ones without workers.
 
     Runs on the scheduler.
     """
@@ -251,7 +271,7 @@ def partition_names(dask_scheduler: Any = None) -> list[str]:
 
 
 def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
-    """Return whether a partition has a worker, or a worker is starting or may be started."""
+    """Return whether a partition has a worker, or a worker is starting or can be started."""
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     return bool(
         has_worker_for(scheduler, name, slots)
@@ -260,38 +280,42 @@ def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
     )
 
 
-def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None) -> Prospects:
-    return Prospects(
+def _capacity(
+    name: str, slots: int, by_rule: bool, dask_scheduler: Any = None
+) -> PartitionCapacity:
+    return PartitionCapacity(
         max_running_tasks(dask_scheduler, name, slots),
         expects_any_worker(dask_scheduler, name, slots),
-        objection_to(dask_scheduler, name, slots, by_rule),
+        rejection_reason(dask_scheduler, name, slots, by_rule),
     )
 
 
-def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False) -> None:
-    """End features in partitions without a rule, unless further clients are registered.
+def release_partitions(
+    scheduler: Any, names: Iterable[str], client: str = "", had_rule: bool = False
+) -> None:
+    """Disable features in partitions without a rule, unless other clients are registered.
 
     Parameters
     ----------
     scheduler, names
-        The scheduler, and the partitions.
+        Scheduler, and names of the partitions.
     client
-        Id of a client that has to register again.
+        ID of a client whose registration is removed.
     had_rule
         Whether these partitions had a rule until now.
     """
     for name in names:
         registrations: Registrations | None = scheduler.plugins.get(NAME)
         if registrations is None or name not in registrations.clients:
-            end_features(scheduler, name)
+            disable_features(scheduler, name)
             continue
         if had_rule:
             registrations.with_rule.add(name)
-        registrations.remove(name, client)
+        registrations.unregister(name, client)
 
 
 def release_statistics(scheduler: Any) -> None:
-    """Stop counting tasks, or stop with the last client that submits to a partition."""
+    """Delete the statistics, or let them end with the last registered client if there is one."""
     if NAME in scheduler.plugins:
         statistics_of(scheduler).is_kept = False
     else:
@@ -299,15 +323,15 @@ def release_statistics(scheduler: Any) -> None:
 
 
 def has_rule(scheduler: Any, name: str) -> bool:
-    """Return whether a partition was made by a division of the pool, and is not dissolved."""
+    """Return whether a partition was created by a division of the pool and is not dissolved."""
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     return steward is not None and name in steward.rules
 
 
-def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
-    """Return why a task could never run in a partition, or "".
+def rejection_reason(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
+    """Return the reason why a task could never run in a partition, or "".
 
-    Without any members the task waits: the only member may be starting again.
+    If the partition has no members, the task waits, because the only member may be restarting.
     """
     if has_worker_for(scheduler, name, slots):
         return ""
@@ -315,11 +339,11 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     if has_or_had_rule and not members and not has_rule(scheduler, name):
         return f"Partition {name!r} was dissolved. Divide the pool again, or use another partition."
     steward: Steward | None = scheduler.plugins.get(STEWARD)
-    seats = steward.members(name) if steward is not None else []
+    records = steward.members(name) if steward is not None else []
     max_slots = max(
         slots_of_new_worker(scheduler, name),
         *(worker.resources[name] for worker in members),
-        *(seat.slots for seat in seats),  # includes members that are starting
+        *(record.slots for record in records),  # includes members that are restarting
         0,
     )
     if not max_slots or slots <= max_slots:
@@ -331,10 +355,10 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     )
 
 
-def addresses_of(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
-    """Return the present addresses of members, given by names or addresses.
+def addresses_of_members(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
+    """Return the current addresses of members that are given by name or address.
 
-    An address without any worker is returned as given: the worker may have just left.
+    An address without a worker is returned unchanged, because the worker may have just left.
 
     Raises
     ------

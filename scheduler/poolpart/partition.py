@@ -1,4 +1,4 @@
-"""A partition: the workers that declare one Dask resource, and the tasks for them."""
+"""A partition: the workers that declare a Dask resource, and methods to run tasks on them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,20 @@ import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
-from .adapting import IDLE_S, Bounds, adapt, want
-from .division import ask, ask_to_dissolve, grow, resize, shrink
+from .adapting import IDLE_S, JobBounds, request_slots, set_bounds
+from .division import (
+    call_steward,
+    grow_partition,
+    request_dissolution,
+    resize_partition,
+    shrink_partition,
+)
 from .errors import PoolError
-from .extras.background import in_background
-from .extras.cancelling import ask_to_cancel
-from .extras.for_each import ItemTasks
+from .extras.background import run_in_background
+from .extras.cancelling import cancel_tasks
 from .extras.notebook import table_of_partition
-from .internals.names import CANCELLING, MAP, require
+from .for_each import ItemTasks
+from .internals.names import CANCELLING, MAP, require_feature
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
@@ -31,11 +37,11 @@ from .pipe_states import USES_PIPES
 from .rules import check_count
 from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
-from .task_table import TaskTable, moment
+from .task_table import TaskTable, to_datetime
 from .worker_wait import WAIT_S
-from .workers import WorkerInfo, all_workers, ask_for_repr, on_scheduler
+from .workers import WorkerInfo, all_workers, query_for_repr, run_on_scheduler
 
-# Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
+# Cleanup of the active `with partition:` blocks in this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
@@ -96,8 +102,8 @@ class Partition:
 
     @property
     def client(self) -> Client:
-        """The client that the partition uses."""
-        # Not when unpickled: that happens in the event loops of scheduler and worker.
+        """Client that the partition uses."""
+        # The client is not created during unpickling, which may happen in an event loop.
         if self._client is None:
             self._client = own_client()
         return self._client
@@ -106,7 +112,7 @@ class Partition:
     def workers(self) -> tuple[WorkerInfo, ...]:
         """Current members, sorted by name."""
         members = (w for w in all_workers(self.client) if w.resources.get(self.name))
-        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 10 behind 9
+        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 9 before 10
 
     @property
     def slots(self) -> int:
@@ -117,15 +123,15 @@ class Partition:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        size = self._size_in_words()  # without the note, which is logged when it is made
+        size = self._size_in_words()
         return f"<Partition {self.name!r}: {size}>" if size else f"<Partition {self.name!r}>"
 
     def _size_in_words(self) -> str:
-        """Return the number of workers and slots, or "" where the scheduler cannot be asked."""
-        return str(ask_for_repr(self._client, size_of, name=self.name) or "")
+        """Describe the size of the partition, or return "" if the scheduler is unavailable."""
+        return str(query_for_repr(self._client, size_of, name=self.name) or "")
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
+        """Return the table of the partition's statistics for notebooks."""
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
@@ -145,7 +151,7 @@ class Partition:
         >>> gpu.stats().running                                          # doctest: +SKIP
         4
         """
-        stats: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
+        stats: list[PartitionStats] = run_on_scheduler(self.client, stats_of, names=[self.name])
         return stats[0]
 
     def tasks(self) -> TaskTable:
@@ -164,8 +170,8 @@ class Partition:
         >>> [task.function for task in gpu.tasks() if task.state == "failed"]  # doctest: +SKIP
         ['cast']
         """
-        rows, since = on_scheduler(self.client, tasks_of, name=self.name)
-        return TaskTable.from_rows(rows, moment(since))
+        rows, since = run_on_scheduler(self.client, tasks_of, name=self.name)
+        return TaskTable.from_rows(rows, to_datetime(since))
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -228,8 +234,8 @@ class Partition:
         """
         _check_function(self.name, function)
         _refuse_options("submit", kwargs, **_OF_TASKS)
-        asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
-        resources = self._taking(slots, asks)
+        asks = not self.client.asynchronous  # a request would block the client's event loop
+        resources = self._resources_for(slots, asks)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
             if not isinstance(several, Iterable):
@@ -237,7 +243,7 @@ class Partition:
                     f"Invalid value {workers!r} for `workers`. Expected the name or address of a "
                     f"member of partition {self.name!r}, or a list of names and addresses."
                 )
-            # LocalCluster's are numbers.
+            # Names are converted to strings, because LocalCluster uses integers.
             workers = [MemberName(name) if asks else str(name) for name in several]
         pipes = _names_of_pipes([*args, *kwargs.values()])
         with dask.annotate(**{USES_PIPES: pipes}) if pipes else nullcontext():
@@ -253,10 +259,11 @@ class Partition:
                 **kwargs,
             )
 
-    def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
-        """Check and return the resources of a task.
+    def _resources_for(self, slots: int, asks: bool = True) -> dict[str, int]:
+        """Check the number of slots, and return the resources of a task.
 
-        `asks` allows a request to the scheduler.
+        If `asks` is true, the client is registered for the partition, which may send a request to
+        the scheduler.
         """
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(
@@ -351,10 +358,10 @@ class Partition:
         >>> sum(io.map(abs, range(-9, 0)))                               # doctest: +SKIP
         45
         """
-        require(MAP)
+        require_feature(MAP)
         _check_function(self.name, function)
         _refuse_options("map", kwargs, **_OF_MAPS)
-        self._taking(slots)
+        self._resources_for(slots)
         stage = Stage(
             self.client,
             self.name,
@@ -471,9 +478,9 @@ class Partition:
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
-        self._taking(slots)
+        self._resources_for(slots)
         tasks = ItemTasks(self, items, function, window, options, empty_s)
-        return tasks.run() if wait else in_background(tasks.run, tasks.stop)
+        return tasks.run() if wait else run_in_background(tasks.run, tasks.stop)
 
     def cancel(
         self,
@@ -520,7 +527,7 @@ class Partition:
         >>> gpu.cancel(future, running="restart")                        # doctest: +SKIP
         {'sleep-1f3a': 'restarted: worker GPU-0'}
         """
-        require(CANCELLING)
+        require_feature(CANCELLING)
         if running not in ("continue", "restart"):
             raise ValueError(
                 f'Invalid value {running!r} for `running`. Expected "continue" or "restart".'
@@ -534,7 +541,7 @@ class Partition:
             key: "ended" if task.status in ("finished", "error") else "cancelled"
             for key, task in tasks.items()
         }
-        outcomes |= ask_to_cancel(tasks, self, running == "restart")
+        outcomes |= cancel_tasks(tasks, self.client, self.name, running == "restart")
         self.client.cancel(
             [task for key, task in tasks.items() if not outcomes[key].startswith("kept")]
         )
@@ -571,7 +578,7 @@ class Partition:
         1000000000.0
         """
         _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
-        return self.client.compute(collections, resources=self._taking(slots), **options)
+        return self.client.compute(collections, resources=self._resources_for(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
         """Scatter data into the memory of these workers and return futures.
@@ -599,7 +606,7 @@ class Partition:
             "scatter", options, workers="The data is stored on the members of the partition."
         )
         addresses = [worker.address for worker in self.workers]
-        if not addresses:  # Dask would take any worker
+        if not addresses:  # Dask would interpret an empty list as any worker
             raise PoolError(f"Partition {self.name!r} has no workers to store the data.")
         return self.client.scatter(data, workers=addresses, **options)
 
@@ -620,9 +627,9 @@ class Partition:
         >>> with io:                                                     # doctest: +SKIP
         ...     total = dask.array.ones(10**9).sum().compute()
         """
-        resources = self._taking(1)
-        # Dataframes ignore annotations when they are created, and Dask warns of it once. It does
-        # apply annotations to all tasks when they are computed, as in this block.
+        resources = self._resources_for(1)
+        # Dask warns that dataframes ignore annotations when they are created. The warning is
+        # suppressed, because annotations are applied when a dataframe is computed in this block.
         annotations = {"resources": resources}
         warnings.filterwarnings("ignore", re.escape(f"Dask annotations {annotations} detected."))
         with ExitStack() as stack:
@@ -674,7 +681,7 @@ class Partition:
         ['5', '6']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, grow, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, grow_partition, name=self.name, **arguments)
         return moved
 
     def resize(
@@ -719,7 +726,7 @@ class Partition:
         ['5']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, resize, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, resize_partition, name=self.name, **arguments)
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
@@ -743,19 +750,19 @@ class Partition:
         ['6']
         """
         arguments = {"count": workers, "timeout_s": timeout_s}
-        moved: list[str] = ask(self.client, shrink, name=self.name, **arguments)
+        moved: list[str] = call_steward(self.client, shrink_partition, name=self.name, **arguments)
         return moved
 
-    # -- workers that come and go ------------------------------------------------------
+    # -- adaptive size -----------------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
         """Set the minimum and maximum number of jobs for an adaptive partition.
 
         Once per second, jobs are started for tasks that are ready to run but have no slot, and for
-        slots that clients request with `want`. A job that has not been needed for `idle_s` seconds
-        is ended or, if it is still queued, canceled. A worker is kept as long as it has a task
-        (even if the task has seceded), an actor, or the only copy of a result. A lost worker is
-        replaced as long as there is work. For a fixed number of jobs, pass the same number as
+        slots that clients request with `request_slots`. A job that has not been needed for `idle_s`
+        seconds is ended or, if it is still queued, canceled. A worker is kept as long as it has a
+        task (even if the task has seceded), an actor, or the only copy of a result. A lost worker
+        is replaced as long as there is work. For a fixed number of jobs, pass the same number as
         `minimum` and `maximum`.
 
         Parameters
@@ -775,21 +782,21 @@ class Partition:
         --------
         >>> gpu.adapt(0, 8)                                              # doctest: +SKIP
         """
-        bounds = Bounds.checked(self.name, minimum, maximum, idle_s)
-        if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
+        bounds = JobBounds.validated(self.name, minimum, maximum, idle_s)
+        if not run_on_scheduler(self.client, set_bounds, name=self.name, bounds=bounds):
             raise PoolError(
                 f"Partition {self.name!r} has no jobs that can be started. Only partitions that "
                 "`start_partitions` or `scale_groups` created are adaptive. To change the size of "
                 "a partition of a divided pool, use `Partition.resize`."
             )
 
-    def want(self, slots: int) -> bool:
+    def request_slots(self, slots: int) -> bool:
         """Request slots for this client, and return whether the partition is adaptive.
 
         This method is intended for programs that assign each task to a specific worker, so that
         their tasks never wait for a slot. While slots are requested, jobs are started and kept as
-        if tasks were waiting for the slots. The request ends with ``want(0)`` or when the client
-        closes. Tasks that wait for a slot do not need a request.
+        if tasks were waiting for the slots. The request ends with ``request_slots(0)`` or when the
+        client closes. Tasks that wait for a slot do not need a request.
 
         Raises
         ------
@@ -798,12 +805,12 @@ class Partition:
 
         Examples
         --------
-        >>> gpu.want(4)                                                  # doctest: +SKIP
+        >>> gpu.request_slots(4)                                                  # doctest: +SKIP
         True
         """
         check_count("the number of requested slots", slots, minimum=0)
-        asking = {"slots": slots, "asking": self.client.id}
-        return bool(on_scheduler(self.client, want, name=self.name, **asking))
+        arguments = {"slots": slots, "client_id": self.client.id}
+        return bool(run_on_scheduler(self.client, request_slots, name=self.name, **arguments))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions.
@@ -811,12 +818,12 @@ class Partition:
         Workers that this partition has borrowed return to the partition that they were started in
         or that a rule has selected them for. Other workers declare their original resources again.
         """
-        ask_to_dissolve(self.client, [self.name], timeout_s)
+        request_dissolution(self.client, [self.name], timeout_s)
 
 
 _SLOTS_INSTEAD = "To request several slots of the partition, pass `slots`."
 _BOUND = " To pass an argument of this name to the function, use `functools.partial`."
-# {option of Dask that the partition sets: what to do instead}
+# {Dask option that the partition sets itself: advice what to use instead}
 _OF_TASKS = {
     "resources": _SLOTS_INSTEAD + _BOUND,
     "pure": "Each call runs separately, unless calls have the same `key`." + _BOUND,
@@ -828,24 +835,28 @@ _OF_MAPS = {
 
 
 def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> None:
-    """Raise PoolError if options of Dask were given that the partition sets itself."""
+    """Raise PoolError if a Dask option is passed that the partition sets itself."""
     for option, advice in instead.items():
         if option in options:
             raise PoolError(f"`Partition.{method}` does not accept `{option}`. {advice}")
 
 
 def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
-    """Return the names of pipes among arguments, or in lists, that fail with their tasks."""
+    """Return the names of the pipes among the arguments that fail with their tasks.
+
+    Pipes in lists and tuples are included.
+    """
     members = (a if isinstance(a, list | tuple) else [a] for a in arguments)
     pipes = (pipe for group in members for pipe in group if isinstance(pipe, Pipe))
     return [pipe.name for pipe in pipes if pipe.fails_with_tasks]
 
 
 def _check_function(name: str, function: Callable[..., Any]) -> None:
-    """Raise if a function would run in the event loop of a worker, or cannot be called.
+    """Raise PoolError if a function cannot be called, or is a coroutine function.
 
-    Nobody knows there which task submits something, so that the tasks which a coroutine submits
-    would leave the partition; and a coroutine cannot lend its slot while it waits for them.
+    A coroutine function runs in the worker's event loop, where it is unknown which task submits
+    further tasks. Therefore, these tasks would not stay in the partition, and the coroutine could
+    not lend its slot while it waits for them.
     """
     if not callable(function):
         raise PoolError(f"Partition {name!r} expects a callable, but got {function!r}.")

@@ -1,4 +1,4 @@
-"""Figures of partitions and their stages, as users and ``/metrics`` get them."""
+"""Statistics of partitions and their stages, for users and for the ``/metrics`` endpoint."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .html_table import html_table, shown_seconds, text_table
-from .rules import workers_in_words
+from .html_table import format_seconds, html_table, text_table
+from .rules import format_workers
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
-NO_PARTITION = "no partition"  # row of workers without a partition, and of ordinary Dask tasks
+NO_PARTITION = "no partition"  # label for workers without a partition and for plain Dask tasks
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 
 
-def size_in_words(workers: int, target: int | None, slots: int) -> str:
-    """Return the size of a partition in words, such as "1 of 2 workers, 4 slots"."""
-    counted = workers_in_words(workers)
+def describe_size(workers: int, target: int | None, slots: int) -> str:
+    """Return a description of the size of a partition, for example "1 of 2 workers, 4 slots"."""
+    counted = format_workers(workers)
     if target is not None and target != workers:
-        counted = f"{workers} of {workers_in_words(target)}"
+        counted = f"{workers} of {format_workers(target)}"
     return f"{counted}, {slots} {'slot' if slots == 1 else 'slots'}"
 
 
@@ -66,13 +66,12 @@ class StageStats:
     lost: int = 0
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
         return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])
 
     @property
     def _figures(self) -> list[object]:
-        """Cells of a row of a table: the counts, and the running time in seconds."""
-        return [*(getattr(self, count) for count in COUNTS), shown_seconds(self.seconds)]
+        """Table cells with the number of tasks in each state and the running time in seconds."""
+        return [*(getattr(self, count) for count in COUNTS), format_seconds(self.seconds)]
 
 
 @dataclass(frozen=True, repr=False)
@@ -111,7 +110,7 @@ class PartitionStats(StageStats):
     target: int | None = None
 
     def __repr__(self) -> str:
-        size = size_in_words(self.workers, self.target, self.slots)
+        size = describe_size(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
         stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
         lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""
@@ -119,7 +118,6 @@ class PartitionStats(StageStats):
         return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 
     def _repr_html_(self) -> str:
-        """Return the tables that notebooks show: the partition, and its stages."""
         name = self.name or NO_PARTITION
         row = [name, self.workers, self.slots, self.busy, *self._figures]
         tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])

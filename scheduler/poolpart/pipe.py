@@ -1,15 +1,17 @@
 """Bounded, closable pipes between the tasks of a Dask cluster.
 
-A pipe is a `distributed.Queue` of items and a `distributed.Variable` with its state, both under
-the pipe's name; `pipe_states.py` is their side on the scheduler. Any client can look at them, put
-and take by `Queue(name)`, and close the pipe by `Variable(name)`.
+A pipe consists of a `distributed.Queue` with the items and a `distributed.Variable` with the state,
+both under the name of the pipe. `pipe_states.py` is the scheduler's side. Any client can inspect
+both, put and get items with `Queue(name)`, and close the pipe with `Variable(name)`.
 
-`Pipe.put` and `Pipe.get` send the scheduler special requests. A request waits there for a second at
-most, and is then asked again. So no item goes to a process that was killed while it waited, and to
-a process that was stopped, or a machine that was cut off, at most the items of one second.
+`Pipe.put` and `Pipe.get` send the scheduler special requests. A request waits on the scheduler for
+at most one second and is then repeated. Therefore, no item is sent to a process that was killed
+while it was waiting. If a process was stopped or disconnected, at most the items of one second are
+lost.
 
-Pipes end with the client that made them, even if it was killed. Otherwise tasks at both ends would
-wait for ever, and keep their slots; Dask does not stop the thread of a task whose client has left.
+A pipe ends with the client that created it, even if the client was killed. Otherwise, tasks at both
+ends would wait forever and keep their slots, because Dask does not stop the threads of tasks whose
+client has left.
 """
 
 from __future__ import annotations
@@ -31,29 +33,29 @@ from distributed import Client, Future
 from distributed.protocol.pickle import dumps
 
 from .errors import PipeClosed, PipeFailed
-from .extras.listening import Listener
+from .extras.listening import PipeListener
 from .extras.notebook import table_of_pipe
-from .internals.client import ask
-from .internals.names import PIPES, require
-from .internals.queues import Packed, unpack
-from .internals.worker import task_of_thread
+from .internals.client import send_request
+from .internals.names import PIPES, require_feature
+from .internals.queues import Packed, unpack_item
+from .internals.worker import current_task
 from .pipe_states import (
     CHANGE,
     PUT,
     TAKE,
     Replies,
     Reply,
-    answer_pipes,
-    delete_pipes,
-    open_pipe,
-    state_in_words,
+    create_pipe,
+    delete_existing_pipes,
+    describe_pipe,
+    install_pipe_handlers,
 )
 from .task_context import own_client
-from .workers import ask_for_repr, check_client, on_scheduler
+from .workers import check_client, query_for_repr, run_on_scheduler
 
-WAIT_S = 1.0  # longest wait of a request, seconds; a pipe that is closed or fails ends it
-_AGAIN_S = 0.01  # between two requests of one wait
-_LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
+WAIT_S = 1.0  # maximum wait of a request, which ends early if the pipe is closed or fails
+_AGAIN_S = 0.01  # interval between the requests of one wait
+_LINGER_S = 0.002  # time that `get` waits for further items to reduce the number of requests
 
 
 class Pipe:
@@ -162,10 +164,10 @@ class Pipe:
         self.producers = producers
         self.fails_with_tasks = fails_with_tasks
         self._client = client
-        # Items that the scheduler has handed over and no call has returned yet. The event loop of
-        # the client appends them, threads that share this object remove them.
+        # Items that were fetched from the scheduler but not returned yet. The client's event loop
+        # appends them, and threads that share this object remove them.
         self._buffer: deque[Packed] = deque()
-        self._advice: int | None = None  # advice of the last reply
+        self._advice: int | None = None  # advice in the last reply
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (self.name, self.capacity, None, self.producers)
@@ -176,17 +178,17 @@ class Pipe:
         return f"<Pipe {self.name!r}: {state}>" if state else f"<Pipe {self.name!r}>"
 
     def _state_in_words(self) -> str:
-        """Return the number of items and the state, or "" where the scheduler cannot be asked."""
-        return str(ask_for_repr(self._client, state_in_words, name=self.name) or "")
+        """Describe the state of the pipe, or return "" if the scheduler is unavailable."""
+        return str(query_for_repr(self._client, describe_pipe, name=self.name) or "")
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show: depth, capacity and state."""
+        """Return the table of depth, capacity and state for notebooks."""
         return table_of_pipe(lambda: self.client, repr(self), self.name)
 
     @property
     def client(self) -> Client:
-        """The client that the pipe uses."""
-        # Kept: a seceded thread of a worker would get another one each time.
+        """Client that the pipe uses."""
+        # The client is stored, because a seceded thread would get a new client on each access.
         if self._client is None:
             self._client = own_client()
         return self._client
@@ -203,10 +205,10 @@ class Pipe:
         PoolError
             If the installed version of Dask does not support pipes.
         """
-        require(PIPES)
+        require_feature(PIPES)
         client = self.client
         state = {"owner": client.id, "capacity": self.capacity, "producers": self.producers}
-        if not on_scheduler(client, open_pipe, name=self.name, **state):
+        if not run_on_scheduler(client, create_pipe, name=self.name, **state):
             raise ValueError(
                 f"The cluster already has a queue or variable named {self.name!r}. Choose another "
                 "name for the pipe, or delete an earlier pipe of this name."
@@ -215,7 +217,7 @@ class Pipe:
 
     def delete(self) -> None:
         """Delete the pipe and its queued items from the scheduler, if the pipe exists."""
-        forget_pipes(self.client, [self.name])
+        delete_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
         return self.create()
@@ -224,11 +226,16 @@ class Pipe:
         self.delete()
 
     def _reply(self, replies: Replies) -> Reply:
-        """Return the reply for this pipe, and remember the advice in the reply.
+        """Return the reply for this pipe, and store the advice that it contains.
 
-        A reply has the state of the pipe (`closed`, `failure`, `advice`) and the `answer` to the
-        request: the number of queued items (CHANGE), the number of items that fitted (PUT), or the
-        list of packed items that were taken (TAKE). `PipeFailed` if the pipe does not exist.
+        A reply contains the state of the pipe (`closed`, `failure`, `advice`) and the `answer` to
+        the request: the number of queued items (CHANGE), the number of items that were put (PUT),
+        or a list of packed items (TAKE).
+
+        Raises
+        ------
+        PipeFailed
+            If the pipe does not exist.
         """
         if self.name not in replies:
             raise PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted or never created.")
@@ -239,8 +246,8 @@ class Pipe:
     def _change(self, **changes: Any) -> Reply:
         """Change the state of the pipe on the scheduler, and return the reply with the new state.
 
-        `changes` are `producer`, the id of a producer that closes the pipe, `failure` and `advice`.
-        Without changes, the reply has the current state. The answer is the number of queued items.
+        The possible changes are `producer`, the ID of a producer that closes the pipe, `failure`
+        and `advice`. Without changes, the reply contains the current state.
         """
         return self._reply(_ask(self.client, CHANGE, names=[self.name], **changes))
 
@@ -248,25 +255,26 @@ class Pipe:
         self,
         deadline: float,
         is_settled: Callable[[Reply], Any],
-        question: str,
+        handler: str,
         on_reply: Callable[[Reply], None] = lambda reply: None,
         **arguments: Any,
     ) -> Reply:
-        """Repeat a request to the scheduler until a reply ends the wait, and return the last reply.
+        """Repeat a request until a reply ends the wait, and return the last reply.
 
         Parameters
         ----------
         deadline
-            Time of `time.monotonic` at which the wait ends; with -inf the request is made once, and
-            does not wait.
+            Value of `time.monotonic` at which the wait ends. If it is -inf, the request is sent
+            once and does not wait.
         is_settled
-            Returns True for a reply that ends the wait. A reply of a pipe that was closed, has
-            failed or is gone always ends the wait.
-        question
-            PUT or TAKE, with the `arguments` of this request of `pipe_states.Pipes`.
+            Function that returns whether a reply ends the wait. The wait also ends if the pipe was
+            closed, has failed or does not exist.
+        handler
+            PUT or TAKE. `arguments` are the arguments of this request of
+            `pipe_states.PipeRegistry`.
         on_reply
-            Called with each reply in the event loop of the client, even if this thread has been
-            interrupted.
+            Function that is called with each reply in the client's event loop, even if this thread
+            has been interrupted.
         """
 
         def has_settled_reply(replies: Replies) -> bool:
@@ -279,7 +287,7 @@ class Pipe:
 
         options = {"names": [self.name], "task": _key_of_task(), **arguments}
         return self._reply(
-            _ask_until(self.client, deadline, has_settled_reply, question, pass_on, **options)
+            _ask_until(self.client, deadline, has_settled_reply, handler, pass_on, **options)
         )
 
     # -- both ends ---------------------------------------------------------------------
@@ -440,13 +448,13 @@ class Pipe:
         deadline = _deadline(timeout_s)
         while True:
             try:
-                packed = self._buffer.popleft()  # one atomic operation: threads may share this
+                packed = self._buffer.popleft()  # atomic, since threads may share this object
             except IndexError:
                 reply = self._fill_buffer(deadline, linger_s=_LINGER_S)
                 if not self._buffer:
                     self._raise_at_end(reply, deadline, timeout_s)
             else:
-                return unpack(self.client, packed)
+                return unpack_item(self.client, packed)
 
     def _fill_buffer(
         self,
@@ -454,11 +462,16 @@ class Pipe:
         is_settled: Callable[[Reply], bool] | None = None,
         **arguments: Any,
     ) -> Reply:
-        """Take queued items into the buffer, in the event loop of the client.
+        """Fetch queued items into the buffer, and return the last reply.
 
-        Without `is_settled`, the wait ends once the buffer has items, even if another thread has
-        taken them. `_ask_until` describes `deadline` and `is_settled`; `arguments` belong to the
-        request TAKE. Returns the last reply. Raises `PipeFailed`.
+        The items are added in the client's event loop. By default, the wait ends once the buffer
+        contains items, even if another thread has fetched them. See `_ask_until` for `deadline` and
+        `is_settled`. The `arguments` are those of the request TAKE.
+
+        Raises
+        ------
+        PipeFailed
+            If the pipe has failed or does not exist.
         """
 
         def append_items(reply: Reply) -> None:
@@ -474,7 +487,7 @@ class Pipe:
         return reply
 
     def _remove(self, limit: float = math.inf) -> list[Packed]:
-        """Remove and return the first items of the buffer, at most `limit`, still pickled."""
+        """Remove and return at most `limit` items from the buffer, still pickled."""
         packed: list[Packed] = []
         with suppress(IndexError):  # threads may share this object
             while len(packed) < limit:
@@ -482,15 +495,15 @@ class Pipe:
         return packed
 
     def _unpack(self, packed: Sequence[Packed]) -> list[Any]:
-        """Unpickle items of the buffer, up to the first item that cannot be unpickled.
+        """Unpickle items, up to the first one that cannot be unpickled.
 
-        If that item is the first of all, its error is raised, and the item is lost. Otherwise the
-        item and the items after it go back to the buffer.
+        If the first item cannot be unpickled, it is lost and its error is raised. Otherwise, the
+        item that cannot be unpickled and all later items are returned to the buffer.
         """
         items: list[Any] = []
         for number, packed_item in enumerate(packed):
             try:
-                items.append(unpack(self.client, packed_item))
+                items.append(unpack_item(self.client, packed_item))
             except Exception:
                 remaining = packed[number:] if items else packed[1:]
                 self._buffer.extendleft(reversed(remaining))
@@ -500,7 +513,7 @@ class Pipe:
         return items
 
     def _raise_at_end(self, reply: Reply, deadline: float, timeout_s: float | None) -> None:
-        """Raise PipeClosed if no item can come any more, TimeoutError after the deadline."""
+        """Raise PipeClosed if the pipe is closed, or TimeoutError if the deadline has passed."""
         if reply["closed"]:
             raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
         if time.monotonic() > deadline:
@@ -512,7 +525,7 @@ class Pipe:
             while True:
                 yield self.get()
 
-    def listen(self, function: Callable[[Any], Any]) -> Listener:
+    def listen(self, function: Callable[[Any], Any]) -> PipeListener:
         """Start calling a function in this process for each item, until the pipe ends.
 
         The function is called in a single background thread, in the order of the items. The
@@ -537,80 +550,96 @@ class Pipe:
         >>> with hits.listen(print):                                     # doctest: +SKIP
         ...     gpu.submit(cast, scans, hits).result()
         """
-        _ = self.client  # the thread of the listener would get another client on a worker
-        return Listener(self, function)
+        _ = self.client  # on a worker, the listener's thread would create another client
+        return PipeListener(self, function, partial(put_back, self))
 
 
 def _deadline(timeout_s: float | None) -> float:
-    """Return the time of `time.monotonic` after a time-out in seconds, inf without a time-out."""
+    """Convert a timeout to a value of `time.monotonic`, or to infinity if it is None."""
     return math.inf if timeout_s is None else time.monotonic() + timeout_s
 
 
 def _is_answered(reply: Reply) -> bool:
-    """Return whether items of a PUT, at least 1, fitted into the pipe."""
+    """Return whether at least one item of a PUT request has been put."""
     return bool(reply["answer"])
 
 
 def _key_of_task() -> str:
-    """Return the key of this thread's task, or "" elsewhere."""
-    running = task_of_thread()
+    """Return the key of the task that runs in this thread, or ""."""
+    running = current_task()
     return "" if running is None else str(running[1].key)
 
 
 def _producer() -> str:
-    """Return an id of the producer: the key of this thread's task, or a random id elsewhere."""
+    """Return the ID of a producer: the key of the current task, or a random ID outside of tasks."""
     return _key_of_task() or uuid.uuid4().hex
 
 
-def forget_pipes(client: Client, names: Sequence[str]) -> None:
-    """Delete pipes on the scheduler, with their items, if they exist."""
-    on_scheduler(client, delete_pipes, names=list(names))
+def delete_pipes(client: Client, names: Sequence[str]) -> None:
+    """Delete the pipes that exist, and their items, from the scheduler."""
+    run_on_scheduler(client, delete_existing_pipes, names=list(names))
 
 
-def advice_of(pipe: Pipe) -> int:
-    """Return the number of records that the consumer of a pipe wants bundled in an item.
+def get_advice(pipe: Pipe) -> int:
+    """Return the number of records that the consumer of a pipe recommends to bundle in an item.
 
-    The number is as old as the last request of the object; before the first request, the scheduler
-    is asked. A producer may ignore the number.
+    The value is from the last request of this `Pipe` object. If there was none, the scheduler is
+    asked. Producers may ignore it.
     """
     return int(pipe._change()["advice"] if pipe._advice is None else pipe._advice)
 
 
-def advise(pipe: Pipe, amount: int) -> None:
-    """Set the number of records that producers should bundle in an item, 1 or more.
+def set_advice(pipe: Pipe, amount: int) -> None:
+    """Recommend to producers how many records to bundle in an item, at least 1.
 
-    Only one consumer may call this.
+    Only one consumer of a pipe may call this function.
     """
     if amount < 1:
         raise ValueError(
             f"Invalid advice {amount} for pipe {pipe.name!r}. Expected an integer of at least 1."
         )
-    if amount != advice_of(pipe):
+    if amount != get_advice(pipe):
         pipe._change(advice=amount)
 
 
 def put_back(pipe: Pipe, item: Any) -> None:
-    """Make an item that a pipe object has returned the next item that it returns."""
+    """Put an item back into a `Pipe` object, so that its next `get` returns the item."""
     pipe._buffer.appendleft(dumps(item))
 
 
-def take_beside(
+def take_items(
     pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float
 ) -> tuple[list[Any], bool, bool]:
-    """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
+    """Fetch up to `limit` items, after waiting for an item or for the end of a task.
 
-    For `Partition.for_each`, which waits beside its running tasks, for `seconds` at most. With a
-    limit of 0, the call waits for the end of the pipe or of a task. Raises `PipeFailed`.
+    `Partition.for_each` uses this function to wait for items and running tasks at the same time.
+
+    Parameters
+    ----------
+    pipe
+        Pipe to fetch items from.
+    futures
+        Futures of tasks, of which the first that ends also ends the wait.
+    limit
+        Maximum number of items. If it is 0, the function only waits for the end of the pipe or a
+        task.
+    seconds
+        Maximum time to wait.
 
     Returns
     -------
     items
-        The items, possibly none.
+        Items, possibly none.
     closed
-        True if the scheduler has replied that the pipe is closed; False if this call took items
-        from the buffer, and did not ask.
+        True if the scheduler has reported that the pipe is closed. False if the items came from the
+        buffer, in which case the scheduler was not asked.
     drained
-        True if the pipe is closed and all its items were taken.
+        True if the pipe is closed and all of its items have been fetched.
+
+    Raises
+    ------
+    PipeFailed
+        If the pipe has failed or does not exist.
     """
 
     def is_settled(reply: Reply) -> bool:
@@ -626,7 +655,7 @@ def take_beside(
     return items, closed, closed and not pipe._buffer and len(items) < limit
 
 
-def take_news(
+def exchange_items(
     client: Client,
     seconds: float,
     pipes: Collection[str],
@@ -635,27 +664,33 @@ def take_news(
     puts: Mapping[str, Sequence[Any]] | None = None,
     linger_s: float = 0.0,
 ) -> dict[str, list[Any]]:
-    """Wait until a pipe has an item or a task has ended, and take the items of the pipes.
+    """Put items into pipes, then wait for items or for the end of a task, and fetch items.
 
-    Before, put items into other pipes; all in one request, which is most of what an item costs.
+    All of this is done in one request, because most of the cost of an item is the cost of its
+    request.
 
     Parameters
     ----------
+    client
+        Client of the cluster.
     seconds
-        Longest wait.
-    pipes, keys
-        Names of pipes, one at least, and keys of tasks. A pipe that was closed, has failed or is
-        gone ends the wait as well, as does a task that the scheduler does not know.
+        Maximum time to wait.
+    pipes
+        Names of the pipes to fetch items from, at least one. A pipe that was closed, has failed or
+        does not exist also ends the wait.
+    keys
+        Keys of tasks whose end also ends the wait. Unknown tasks count as ended.
     puts
-        {pipe: items to put}, beyond the capacity if necessary. Items for a pipe that has ended or
-        is gone are lost.
+        Items to put, by pipe, regardless of the capacity of the pipe. Items for a pipe that has
+        ended or does not exist are lost.
     linger_s
-        Longest wait in seconds for more items after the first, `seconds` at most.
+        Maximum time to wait for further items after the first one, within `seconds`.
 
     Returns
     -------
-    {pipe: its items}, without pipes that had no items. An item that cannot be unpickled raises, and
-    all items of the request are lost.
+    dict
+        Items by pipe. Pipes without items are omitted. If an item cannot be unpickled, the error is
+        raised, and all items of the request are lost.
     """
     pickled = {name: [dumps(item) for item in items] for name, items in (puts or {}).items()}
     replies = _ask(
@@ -668,33 +703,37 @@ def take_news(
         puts=pickled,
     )
     answers = {name: reply["answer"] for name, reply in replies.items() if reply["answer"]}
-    return {name: [unpack(client, item) for item in items] for name, items in answers.items()}
+    return {name: [unpack_item(client, item) for item in items] for name, items in answers.items()}
 
 
-# {client: connection on which the client has asked its scheduler to answer requests}
+# {client: connection on which the client has installed the request handlers}
 _connections: WeakKeyDictionary[Client, Any] = WeakKeyDictionary()
 
 
-def _let_answer(client: Client) -> None:
-    """Have the scheduler answer requests, whether it has pipes or not, once a connection."""
+def _install_handlers(client: Client) -> None:
+    """Install the scheduler's handlers for pipe requests, once per connection of the client.
+
+    The handlers are installed even if the scheduler has no pipes yet.
+    """
     connection = client.scheduler_comm
     if connection is None or _connections.get(client) is not connection:
-        on_scheduler(client, answer_pipes)
+        run_on_scheduler(client, install_pipe_handlers)
         _connections[client] = connection
     else:
         check_client(client)
 
 
-def _ask(client: Client, question: str, **arguments: Any) -> Replies:
-    """Send a single request to the scheduler.
+def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
+    """Send a single request to the scheduler, and return its replies by pipe.
 
-    Returns {pipe: reply} of the pipes that exist.
-
-    `question` is CHANGE, PUT or TAKE: the name of a handler that `pipe_states.Pipes` adds to the
-    scheduler. The handler takes `arguments`.
+    `handler` is CHANGE, PUT or TAKE, the name of a handler that `pipe_states.PipeRegistry` adds to
+    the scheduler and that receives `arguments`. Pipes that do not exist are omitted from the
+    replies.
     """
-    _let_answer(client)
-    replies: Replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
+    _install_handlers(client)
+    replies: Replies = client.sync(
+        send_request, client, None, handler, asker=client.id, **arguments
+    )
     return replies
 
 
@@ -702,49 +741,51 @@ def _ask_until(
     client: Client,
     deadline: float,
     is_settled: Callable[[Replies], bool],
-    question: str,
+    handler: str,
     on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
-    """Repeat a request to the scheduler until its replies end the wait; return the last replies.
+    """Repeat a request to the scheduler until its replies end the wait, and return them.
 
-    All requests are one wait of this thread: a task of a partition that waits lends its slot once.
+    All requests belong to a single wait of this thread, so that the waiting task of a partition
+    lends its slot only once.
 
     Parameters
     ----------
     client
-        The client that asks.
+        Client that sends the requests.
     deadline
-        Time of `time.monotonic` at which the wait ends. The first request is made in any case.
+        Value of `time.monotonic` at which the wait ends. The first request is always sent.
     is_settled
-        Returns True for replies, {pipe: reply}, that end the wait.
-    question
-        PUT or TAKE, with `arguments` for the handler, as in `_ask`.
+        Function that returns whether the replies, by pipe, end the wait.
+    handler
+        PUT or TAKE, with `arguments` for the handler as in `_ask`.
     on_replies
-        Called with the replies to each request, in the event loop of the client.
+        Function that is called with the replies to each request, in the client's event loop.
     """
     interrupted = threading.Event()
 
     async def request() -> Replies:
         seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
         options = {"asker": client.id, "seconds": seconds, **arguments}
-        replies: Replies = await ask(client, None, question, **options)
+        replies: Replies = await send_request(client, None, handler, **options)
         on_replies(replies)
         return replies
 
     async def repeat_request() -> Replies:
         while True:
-            # Dask cancels this wait if its thread is interrupted. The scheduler answers all the
-            # same, and has then removed the items from its queue.
+            # Dask cancels this wait if its thread is interrupted. The request is shielded, because
+            # the scheduler has already removed the items of its reply from the queue.
             replies = await asyncio.shield(request())
             expired = time.monotonic() > deadline or interrupted.is_set()
             if expired or is_settled(replies):
                 return replies
-            # A reply may come at once, though not settled: while this client reconnects, or until
-            # it hears that a task has ended.
+            # Without a pause, the loop would be busy if replies arrive immediately but do not end
+            # the wait, for example while the client reconnects or has not yet been notified that a
+            # task has ended.
             await asyncio.sleep(_AGAIN_S)
 
-    _let_answer(client)
+    _install_handlers(client)
     try:
         return client.sync(repeat_request)
     except BaseException:

@@ -1,13 +1,13 @@
-"""Pipes on the scheduler: a `distributed.Queue` and a `distributed.Variable` of one name each.
+"""The scheduler's side of pipes, each of which is a Dask Queue and a Dask Variable.
 
-The Queue holds the items. The Variable holds all else that is known of the pipe, and is the only
-copy: a client that sets it to ``{**state, "closed": True}`` closes the pipe. Other clients may put,
-take and look by Dask's own classes.
+The Queue contains the items. The Variable is the only copy of the pipe's state. A client that sets
+it to ``{**state, "closed": True}`` closes the pipe. Other clients can put, get and inspect items
+with Dask's own classes.
 
-Pipes use special requests, because Dask's lack three things: `Queue.get` does not know its client,
-so that the item which a killed client waits for is lost; a queue cannot be closed; and state and
-items cannot be asked for together. A request waits here, for the pipes that it names only, and
-takes items only if its client is still there.
+Pipes use special requests, because those of Dask lack three things. `Queue.get` does not know its
+client, so an item is lost if the client that waits for it is killed. A queue cannot be closed.
+State and items cannot be requested together. A special request only waits for the pipes that it
+names, and only takes items if its client is still connected.
 """
 
 from __future__ import annotations
@@ -34,38 +34,38 @@ NAME = "poolpart-pipes"
 CHANGE, PUT, TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "take"))
 
 Reply = dict[str, Any]  # state of a pipe, and the answer to a request
-Replies = dict[str, Reply]  # {pipe that exists: its reply}
+Replies = dict[str, Reply]  # replies by pipe, for pipes that exist
 
-USES_PIPES = "poolpart-pipes"  # annotation of tasks: the names of their pipes
-_UNFINISHED = ("waiting", "queued", "no-worker", "processing")  # states before the end of a task
-_ENDED = ("memory", "erred", "forgotten")  # states of tasks that nobody need wait for
-_SETTABLE = ("closed", "failure", "advice")  # what any client may set
+USES_PIPES = "poolpart-pipes"  # annotation of tasks with the names of their pipes
+_UNFINISHED = ("waiting", "queued", "no-worker", "processing")  # states of unfinished tasks
+_ENDED = ("memory", "erred", "forgotten")  # states of tasks that have ended
+_SETTABLE = ("closed", "failure", "advice")  # fields that any client may set
 
 
 class PipeState:
     """State and queue of a pipe on the scheduler.
 
-    The value of the Variable, which all clients see, is a dict:
+    The value of the Variable, which all clients can read, is a dict with these fields:
 
-    ==========  ====================================================================
-    owner       id of the client that has created the pipe; the pipe ends with it
-    capacity    items that may be queued
-    producers   number of producers that close the pipe, each for itself
-    closed_by   those that have: keys of their tasks, or random ids
-    closed      whether nothing may be put any more
-    failure     reason why the pipe has failed, "" while it has not
-    advice      number of records that the consumer wants in one item
-    ==========  ====================================================================
+    ==========  ========================================================================
+    owner       ID of the client that created the pipe, which ends with this client
+    capacity    maximum number of queued items
+    producers   number of producers, each of which has to close the pipe
+    closed_by   producers that have closed the pipe: keys of their tasks, or random IDs
+    closed      whether the pipe is closed and accepts no more items
+    failure     reason why the pipe has failed, or ""
+    advice      number of records that the consumer recommends to bundle in an item
+    ==========  ========================================================================
     """
 
     def __init__(
         self, scheduler: Any, name: str, owner: str, capacity: int, producers: int
     ) -> None:
         self.name = name
-        self.owner = owner  # cannot change, and outlasts a Variable that a client has deleted
+        self.owner = owner  # constant, and still available if a client deletes the Variable
         self.putters: set[str] = set()  # keys of the tasks that have put items
         self.takers: set[str] = set()  # keys of the tasks that have requested items
-        self.queue = BoundedQueue(capacity, self.why_no_put, self.why_no_get)
+        self.queue = BoundedQueue(capacity, self.put_error, self.get_error)
         value = {
             "owner": owner,
             "capacity": capacity,
@@ -77,19 +77,19 @@ class PipeState:
         }
         self._dask = QueueAndVariable(scheduler, name, self.queue, value)
         self.put = self._dask.put
-        self.take = self._dask.take
+        self.pop_items = self._dask.pop_items
         self.delete = self._dask.delete
         self.wake_early_readers = self._dask.wake_early_readers
 
     @property
     def value(self) -> dict[str, Any]:
-        """Value of the Variable."""
+        """Current value of the Variable, which contains the state."""
         value: dict[str, Any] = self._dask.value
         return value
 
     @property
     def exists(self) -> bool:
-        """Whether no client has deleted the Queue or the Variable."""
+        """Whether the Queue and the Variable exist, either of which a client can delete."""
         return self._dask.exists
 
     @property
@@ -97,23 +97,23 @@ class PipeState:
         """Whether the pipe was closed or deleted, or has failed."""
         return not self.exists or self.value["closed"] or bool(self.value["failure"])
 
-    def why_no_get(self) -> PipeFailed | None:
-        """Return the error of taking items now, or None while items may be taken."""
+    def get_error(self) -> PipeFailed | None:
+        """Return the error that a `get` would raise now, or None."""
         if not self.exists:
             return PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
-    def why_no_put(self) -> PipeFailed | PipeClosed | None:
-        """Return the error of putting items now, or None while items may be put."""
-        if (error := self.why_no_get()) is not None:
+    def put_error(self) -> PipeFailed | PipeClosed | None:
+        """Return the error that a `put` would raise now, or None."""
+        if (error := self.get_error()) is not None:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
     @property
-    def figures(self) -> tuple[int, int, str]:
-        """Number of queued items, capacity, and the state in words."""
-        end = self.why_no_put()
+    def summary(self) -> tuple[int, int, str]:
+        """Number of queued items, capacity, and a description of the state."""
+        end = self.put_error()
         words = "closed" if isinstance(end, PipeClosed) else f"failed: {end}" if end else "open"
         return self.queue.qsize(), self.queue.capacity, words
 
@@ -122,41 +122,42 @@ class PipeState:
         self._dask.set({**self.value, **changes})
 
     def close(self, producer: str) -> None:
-        """Close the pipe for a producer.
+        """Close the pipe on behalf of a producer.
 
-        The last producer closes the pipe for all.
+        The pipe is closed once all producers have closed it.
         """
         closed_by = tuple(dict.fromkeys((*self.value["closed_by"], producer)))
         closed = self.value["closed"] or len(closed_by) >= self.value["producers"]
         self.change(closed_by=closed_by, closed=closed)
 
     def fail(self, reason: str) -> None:
-        """Let the pipe fail.
+        """Make the pipe fail.
 
-        The first reason stays. Later reasons are its consequences.
+        If it has already failed, the first reason is kept, because later failures are consequences
+        of it.
         """
         self.change(failure=self.value["failure"] or reason)
 
     def check(self, value: Any) -> None:
-        """Raise ValueError unless a client may set the Variable to a value."""
+        """Raise ValueError unless a client may set the Variable to the value."""
         if not self.exists:
             raise ValueError(f"Variable {self.name!r} belonged to a pipe that was deleted.")
-        if doubt := self._doubt(value):
+        if doubt := self._invalid_reason(value):
             raise ValueError(
                 f"Variable {self.name!r} holds the state of a pipe, and {doubt}. The current state "
                 f"is {self.value}. Get the value with `Variable.get`, and only change `closed`, "
                 "`failure` and `advice`."
             )
 
-    def _doubt(self, value: Any) -> str:
-        """Return why a client may not set the Variable to a value, or an empty string."""
+    def _invalid_reason(self, value: Any) -> str:
+        """Return the reason why a client may not set the Variable to the value, or ""."""
         state = self.value
         if not isinstance(value, dict) or value.keys() != state.keys():
             return f"the value {value!r} has different fields"
         for name, setting in value.items():
             current = state[name]
             if name == "closed_by" and isinstance(setting, list | tuple):
-                # A list comes as a tuple from another process, and as a list from this one.
+                # Lists from other processes arrive as tuples, unlike lists from this process.
                 setting = tuple(setting)
                 current = tuple(current)
             if type(setting) is not type(current):
@@ -171,7 +172,7 @@ class PipeState:
 
 
 def pipes_of(scheduler: Any) -> dict[str, PipeState]:
-    """Return the states of all pipes, by name."""
+    """Return the states of all pipes by name."""
     return scheduler.plugins[NAME].states if NAME in scheduler.plugins else {}
 
 
@@ -180,99 +181,95 @@ def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
     return list(pipes_of(dask_scheduler))
 
 
-def state_in_words(name: str, dask_scheduler: Any = None) -> str:
-    """Return the number of queued items of a pipe and its state in words.
-
-    Runs on the scheduler.
-    """
+def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
+    """Describe the number of queued items and the state of a pipe. Runs on the scheduler."""
     pipe = pipes_of(dask_scheduler).get(name)
     if pipe is None:
         return "does not exist"
-    depth, capacity, state = pipe.figures
+    depth, capacity, state = pipe.summary
     return f"{depth} of {capacity} items, {state}"
 
 
-async def open_pipe(
+async def create_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
-    """Create a pipe, or return False if its name is used.
-
-    Runs on the scheduler.
-    """
-    # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
-    # or get the answer.
+    """Create a pipe, or return False if its name is already in use. Runs on the scheduler."""
+    # The last request of a killed owner may arrive after the owner was removed. Nobody would delete
+    # its pipe or receive the reply.
     if QueueAndVariable.is_used(dask_scheduler, name) or owner not in dask_scheduler.clients:
         return False
     if NAME not in dask_scheduler.plugins:
-        dask_scheduler.add_plugin(Pipes(dask_scheduler))
+        dask_scheduler.add_plugin(PipeRegistry(dask_scheduler))
     state = PipeState(dask_scheduler, name, owner, capacity, producers)
     pipes_of(dask_scheduler)[name] = state
     await state.wake_early_readers()
     return True
 
 
-def no_pipes(**_: Any) -> Replies:
-    """Answer a request of a client while the scheduler has no pipes."""
+def reply_without_pipes(**_: Any) -> Replies:
+    """Reply to any request of a client while the scheduler has no pipes."""
     return {}
 
 
-def answer_pipes(dask_scheduler: Any = None) -> None:
-    """Answer requests from now on, also without any pipes. Runs on the scheduler.
+def install_pipe_handlers(dask_scheduler: Any = None) -> None:
+    """Install handlers for pipe requests that also work without pipes. Runs on the scheduler.
 
-    Dask would log a traceback for a request that it does not know, besides the client's error.
+    For a request without a handler, Dask would log a traceback, in addition to the error of the
+    client.
     """
-    for question in (CHANGE, PUT, TAKE):
-        handlers_of(dask_scheduler).setdefault(question, no_pipes)
+    for handler in (CHANGE, PUT, TAKE):
+        handlers_of(dask_scheduler).setdefault(handler, reply_without_pipes)
 
 
-def fail_pipes_of_killed(scheduler: Any, key: Any, annotations: Mapping[str, Any] | None) -> None:
-    """Let the pipes of a cancelled task fail whose worker was restarted under it."""
+def fail_pipes_of_killed_task(
+    scheduler: Any, key: Any, annotations: Mapping[str, Any] | None
+) -> None:
+    """Make the pipes of a canceled task fail after the task's worker was restarted."""
     if NAME in scheduler.plugins:
         scheduler.plugins[NAME].fail_for_killed(key, (annotations or {}).get(USES_PIPES, ()))
 
 
-def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
-    """Delete pipes, as far as they exist. Runs on the scheduler."""
+def delete_existing_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
+    """Delete the named pipes that exist. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].delete(names)
 
 
-class Pipes(SchedulerPlugin):
-    """The pipes of a scheduler, which exists as long as there are any pipes."""
+class PipeRegistry(SchedulerPlugin):
+    """Scheduler plugin with the states of all pipes, removed when there are no pipes left."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.states: dict[str, PipeState] = {}
-        # {key of a task that requests wait for: those requests}
+        # {task key: requests that wait for the end of the task}
         self._awaited: defaultdict[str, Waiters] = defaultdict(Waiters)
-        # Keys of tasks with pipes that have left their worker, or the queue, before they had ended:
-        # they are either run again or forgotten.
+        # Keys of unfinished tasks with pipes that were released from their worker or the queue.
+        # Dask either runs such a task again or forgets it.
         self._released: set[str] = set()
         handlers = handlers_of(scheduler)
-        handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.take})
+        handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.pop_items})
         self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
 
-    # -- what happens on the scheduler -------------------------------------------------
+    # -- hooks of the scheduler --------------------------------------------------------
 
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Delete the pipes of a client that has left."""
         self.delete([name for name, state in self.states.items() if state.owner == client])
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Let requests that wait for a task look again after the end of the task."""
-        # A look every 5 ms took the scheduler of a run 2 % of a core.
+        """Notify the requests that wait for the end of a task, and fail the pipes of lost tasks."""
+        # Polling every 5 ms used 2 % of a core on the scheduler of a run.
         if finish in _ENDED and key in self._awaited:
             self._awaited[key].notify()
         task = self.scheduler.tasks[key]
         if task.annotations and (names := task.annotations.get(USES_PIPES)):
-            self._follow(task, names, start, finish)
+            self._fail_if_lost(task, names, start, finish)
 
-    def _follow(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
-        """Let the pipes of a task fail if the task is lost."""
-        # Without this, a consumer of a producer that had raised an error waited until the pipe was
-        # deleted, and so did a producer whose consumer was gone.
+    def _fail_if_lost(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
+        """Make the pipes of a task fail if the task is lost."""
+        # Otherwise, the tasks at the other end of the pipe would wait until the pipe is deleted.
         if finish == "erred":
             blamed = task.exception_blame or task
             error = blamed.exception_text or "the workers that ran the task died"
@@ -289,10 +286,11 @@ class Pipes(SchedulerPlugin):
             self._released.discard(task.key)
 
     def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
-        """Let open pipes fail after this step of the event loop.
+        """Make open pipes fail after the current step of the event loop.
 
-        `cancelled` is the key of a cancelled task. If the task has used a pipe, the task is running
-        and can go on using the pipe, because Dask does not stop functions.
+        `cancelled` is the key of a canceled task. If this task has already used a pipe, the pipe
+        does not fail, because the task is running and can continue to use the pipe. Dask does not
+        stop functions.
         """
 
         def fail() -> None:
@@ -300,24 +298,25 @@ class Pipes(SchedulerPlugin):
                 if not state.has_ended and cancelled not in state.putters | state.takers:
                     state.fail(reason)
 
-        # `Scheduler.restart` and the end of a client first cancel the tasks, and then call
-        # `restart` and `remove_client`, which know the reason.
+        # The call is deferred, because `Scheduler.restart` and the removal of a client cancel the
+        # tasks before they call `restart` and `remove_client`, which know the actual reason.
         asyncio.get_running_loop().call_soon(fail)
 
     def fail_for_killed(self, key: Any, names: Sequence[str]) -> None:
-        """Let the open pipes of a cancelled task fail whose worker was restarted under it."""
+        """Make the open pipes of a canceled task fail after the task's worker was restarted."""
         for state in self._existing(names).values():
-            if not state.has_ended and str(key) not in state.takers:  # other consumers can go on
+            # If a consumer is lost, other consumers can continue, so the pipe does not fail.
+            if not state.has_ended and str(key) not in state.takers:
                 state.fail(
                     f"Task {key!r}, which uses the pipe, was canceled, and its worker "
                     "was restarted."
                 )
 
     def restart(self, scheduler: Any) -> None:
-        """Let all open pipes fail: `Client.restart` has ended the tasks at their ends."""
-        # Dask keeps queues and variables over a restart. In a test on two worker processes, `get`,
-        # `put`, `for_each` and listeners waited until the pipe was deleted, while futures and maps
-        # raised a CancelledError at once.
+        """Make all open pipes fail, because `Client.restart` has ended the tasks that use them."""
+        # Dask does not reset queues and variables in a restart. Without this method, `get`, `put`,
+        # `for_each` and listeners would wait until the pipe is deleted, whereas futures and maps
+        # raise a CancelledError immediately.
         self._released.clear()
         for state in self.states.values():
             if not state.has_ended:
@@ -327,22 +326,24 @@ class Pipes(SchedulerPlugin):
                 )
 
     def delete(self, names: Collection[str]) -> None:
-        """Delete pipes, as far as they exist, and leave the scheduler after the last pipe."""
+        """Delete the named pipes that exist, and remove the plugin after the last pipe."""
         for name in self.states.keys() & set(names):
             self.states.pop(name).delete()
         if not self.states:
             self.scheduler.remove_plugin(NAME)
             self._end_interception()
-            # Clients that have used pipes may ask again.
-            handlers_of(self.scheduler).update(dict.fromkeys((CHANGE, PUT, TAKE), no_pipes))
+            # Clients that have used pipes may still send requests.
+            handlers_of(self.scheduler).update(
+                dict.fromkeys((CHANGE, PUT, TAKE), reply_without_pipes)
+            )
 
     def _check(self, name: str, value: Any) -> None:
-        """Check a value that a client sets a Variable to."""
+        """Raise ValueError if a client sets a pipe's Variable to an invalid value."""
         if (state := self.states.get(name)) is not None:
             state.check(value)
 
     def _notify(self, name: str) -> None:
-        """Let waiting requests look at a Variable that a client has set."""
+        """Notify waiting requests that a client has set a Variable."""
         if (state := self.states.get(name)) is not None:
             state.queue.waiters.notify()
 
@@ -356,7 +357,10 @@ class Pipes(SchedulerPlugin):
         failure: str = "",
         advice: int = 0,
     ) -> Replies:
-        """Close pipes for a producer, let pipes fail, or set an advice, and answer the depth."""
+        """Close pipes for a producer, make pipes fail, or set the advice.
+
+        The answer is the number of queued items.
+        """
         states = self._existing(names)
         for state in states.values():
             if producer:
@@ -376,20 +380,22 @@ class Pipes(SchedulerPlugin):
         seconds: float,
         task: str = "",
     ) -> Replies | Awaitable[Replies]:
-        """Put items into a pipe as soon as there is room for any, and answer their number.
+        """Put items into a pipe once it has space for at least one.
 
-        At once if there is room: for a coroutine Dask makes a task, which takes longer than this.
+        The answer is the number of items that were put. If there is space, the reply is returned
+        directly, because Dask would create a task for a coroutine, which takes longer than the
+        request itself.
         """
 
         def put_into(state: PipeState) -> int:
             if state.has_ended or asker not in self.scheduler.clients:
                 return 0
-            fitting = items if unbounded else items[: state.queue.room]
+            fitting = items if unbounded else items[: state.queue.free_capacity]
             state.put(fitting)
             return len(fitting)
 
         def ready() -> bool:
-            return unbounded or all(s.has_ended or s.queue.room for s in states.values())
+            return unbounded or all(s.has_ended or s.queue.free_capacity for s in states.values())
 
         async def later() -> Replies:
             await wait_until(ready, [state.queue.waiters for state in states.values()], seconds)
@@ -400,7 +406,7 @@ class Pipes(SchedulerPlugin):
             state.putters |= {task} - {""}
         return self._replies(states, put_into) if ready() else later()
 
-    async def take(
+    async def pop_items(
         self,
         names: Sequence[str],
         asker: str,
@@ -449,12 +455,14 @@ class Pipes(SchedulerPlugin):
             )
 
         def is_full_or_ended() -> bool:
-            return any(state.has_ended or not state.queue.room for state in states.values())
+            return any(
+                state.has_ended or not state.queue.free_capacity for state in states.values()
+            )
 
         def take_from(state: PipeState) -> list[Any]:
-            return state.take(limit) if asker in self.scheduler.clients else []
+            return state.pop_items(limit) if asker in self.scheduler.clients else []
 
-        states = self._taken_by(task, names)
+        states = self._states_for_taker(task, names)
         pipe_waiters = [state.queue.waiters for state in states.values()]
         try:
             task_waiters = [self._awaited[key] for key in keys]
@@ -467,8 +475,8 @@ class Pipes(SchedulerPlugin):
             await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
         return self._replies(states, take_from)
 
-    def _taken_by(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
-        """Return the states of pipes that exist, and record the task that takes their items."""
+    def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
+        """Return the states of the pipes that exist, and record the task that takes their items."""
         states = self._existing(names)
         for state in states.values():
             state.takers |= {task} - {""}
@@ -479,7 +487,7 @@ class Pipes(SchedulerPlugin):
         return {name: state for name, state in states.items() if state.exists}
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
-        """Return a reply for each pipe that exists, with `answer(state)`."""
+        """Return a reply with `answer(state)` for each pipe that exists."""
         replies: Replies = {}
         for name, state in states.items():
             if state.exists:

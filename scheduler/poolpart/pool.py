@@ -1,4 +1,4 @@
-"""All workers of a cluster, and their division into partitions."""
+"""The pool: all workers of a cluster, which can be divided into partitions."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 from distributed import Client
 
 from .adapting import adaptive_names
-from .division import ask, ask_to_dissolve, declare
+from .division import call_steward, create_partitions, request_dissolution
 from .errors import PoolError
-from .extras.dashboard_page import leave_page, partitions_page
+from .extras.dashboard_page import leave_page, open_page
 from .extras.notebook import table_of_partitions
 from .membership import partition_names
 from .partition import Partition
@@ -23,7 +23,7 @@ from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
 from .steward import names_with_rule
-from .workers import WorkerInfo, all_workers, ask_workers, note_on_slots, on_scheduler
+from .workers import WorkerInfo, all_workers, run_on_scheduler, run_on_workers, slots_note
 
 if TYPE_CHECKING:
     from .deploy.local_pool import LocalPool
@@ -56,14 +56,14 @@ class Pool:
 
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
         self.client = client
-        self._workers = tuple(workers)  # at the last look
-        # Workers as this pool saw them first: {name: description}
+        self._workers = tuple(workers)  # workers at the last access
+        # {name: description at the first access}
         self._first_seen = {worker.name: worker for worker in self._workers}
-        # Whether a worker of the cluster belongs to this pool; None if the workers are fixed.
+        # Predicate for the workers that belong to this pool. None if the workers are fixed.
         self._belongs: Callable[[WorkerInfo], bool] | None = None
         self._noted: set[str] = set()  # partitions whose note was logged
-        self._partition_names: list[str] = []  # made by this pool or its remainders
-        self._local: LocalPool | None = None  # the cluster that `local` has started
+        self._partition_names: list[str] = []  # partitions created by this pool or its remainders
+        self._local: LocalPool | None = None  # cluster started by `local`
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
@@ -90,7 +90,7 @@ class Pool:
         >>> Pool.from_client(client)                                       # doctest: +SKIP
         <Pool: workers 3, hosts 1, GPUs 0; partitions: IO 1, OTHER 2>
         """
-        if not all_workers(client) and not on_scheduler(client, adaptive_names):
+        if not all_workers(client) and not run_on_scheduler(client, adaptive_names):
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers. Start workers, for "
                 f'example with `dask worker {client.scheduler.address} --resources "GPU=1"`.'
@@ -137,7 +137,7 @@ class Pool:
         ...     pool["GPU"].submit(pow, 2, 10).result()
         1024
         """
-        from .deploy.local_pool import LocalPool  # dividing a cluster needs nothing that starts one
+        from .deploy.local_pool import LocalPool  # not needed to divide a running cluster
 
         started = LocalPool(partitions, idle_s, options)
         try:
@@ -148,7 +148,7 @@ class Pool:
         pool._local = started
         return pool
 
-    # -- looking -----------------------------------------------------------------------
+    # -- workers and partitions --------------------------------------------------------
 
     def __len__(self) -> int:
         return len(self.workers)
@@ -159,9 +159,9 @@ class Pool:
     def __repr__(self) -> str:
         try:
             workers = self.workers
-            declared = Counter(dict.fromkeys(on_scheduler(self.client, partition_names), 0))
+            declared = Counter(dict.fromkeys(run_on_scheduler(self.client, partition_names), 0))
             declared.update(name for w in all_workers(self.client) for name in w.partitions)
-        except (PoolError, OSError):  # its client was closed
+        except (PoolError, OSError):  # the client was closed
             workers = self._workers
             declared = Counter()
         hosts = {worker.host for worker in workers}
@@ -171,7 +171,7 @@ class Pool:
         return f"<Pool: workers {len(workers)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     def _repr_html_(self) -> str:
-        """Return the table of all partitions of the cluster that notebooks show."""
+        """Return the table of all partitions of the cluster for notebooks."""
         return table_of_partitions(self.client, repr(self))
 
     def __getitem__(self, name: str) -> Partition:
@@ -202,7 +202,7 @@ class Pool:
             present = [worker for worker in all_workers(self.client) if self._belongs(worker)]
             gpus = {worker.address: worker.gpus for worker in self._workers}
             gpus |= _ask_for_gpus(self.client, [w for w in present if w.address not in gpus])
-            # Workers that have not answered have left, or are silent.
+            # Workers that did not respond have left or are silent, and are omitted.
             self._workers = tuple(
                 w.with_gpus(gpus[w.address]) for w in present if w.address in gpus
             )
@@ -227,12 +227,12 @@ class Pool:
         ['GPU', 'IO']
         """
         workers = all_workers(self.client)
-        names, with_rule = on_scheduler(self.client, _all_and_divided)
+        names, with_rule = run_on_scheduler(self.client, _all_and_divided)
         return {
             name: Partition(
                 name,
                 self.client,
-                "" if name in with_rule else note_on_slots(name, workers),
+                "" if name in with_rule else slots_note(name, workers),
                 by_rule=name in with_rule,
             )
             for name in names
@@ -287,7 +287,7 @@ class Pool:
                     f'--resources "{name}={minimum}"`.'
                 )
 
-    # -- dividing ----------------------------------------------------------------------
+    # -- division ----------------------------------------------------------------------
 
     def __enter__(self) -> Self:
         return self
@@ -297,15 +297,14 @@ class Pool:
             self._local.close()
             return
         try:
-            if self._partition_names:  # `dissolve` may have undone them by now
-                ask_to_dissolve(self.client, self._partition_names, timeout_s=30.0)
+            if self._partition_names:  # empty if `dissolve` was called in the block
+                request_dissolution(self.client, self._partition_names, timeout_s=30.0)
                 self._partition_names.clear()
         except (PoolError, OSError) as failure:
             if error is None:
                 raise
-            error.add_note(
-                f"poolpart: The partitions were not dissolved. {failure}"
-            )  # what came first counts
+            # The first error is more important than the failure that follows it.
+            error.add_note(f"poolpart: The partitions were not dissolved. {failure}")
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
         """Divide this pool into partitions according to rules.
@@ -444,18 +443,18 @@ class Pool:
         >>> pool.page()                                                    # doctest: +SKIP
         'http://127.0.0.1:8787/partitions'
         """
-        return partitions_page(self.client)
+        return open_page(self.client)
 
     def pipes(self) -> list[str]:
         """Return the names of all pipes in the cluster, whichever client created them.
 
         Dask's ``Queue(name)`` contains the items of a pipe, and ``Variable(name)`` its state.
         """
-        return sorted(on_scheduler(self.client, names_of_pipes))
+        return sorted(run_on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
         """Remove the page, unless another client has opened it as well."""
-        on_scheduler(self.client, leave_page, owner=self.client.id)
+        run_on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
         """Dissolve all partitions that any client has created on this cluster.
@@ -480,12 +479,12 @@ class Pool:
         PoolError
             If tasks have not finished in time. In this case, nothing changes.
         """
-        names = ask_to_dissolve(self.client, None, timeout_s)
+        names = request_dissolution(self.client, None, timeout_s)
         self._partition_names.clear()
         return names
 
     def _divide(self, rules: Mapping[str, Rule]) -> tuple[dict[str, Partition], Pool]:
-        """Make all partitions or none, and return them by name, with a pool of the remainder."""
+        """Create all partitions or none, and return them by name, with a pool of the remainder."""
         if not isinstance(rules, Mapping):
             raise PoolError(
                 f"Invalid rules {rules!r}. Expected a mapping of partition names to rules, for "
@@ -498,12 +497,12 @@ class Pool:
                     f"Invalid rule {rule!r} for partition {name!r}. Expected a rule such as "
                     "`n_workers(2)`, `per_gpu(1)` or `rest()`."
                 )
-        for worker in self.workers:  # workers that have joined since the pool was made
+        for worker in self.workers:  # adds workers that have joined since the last access
             first_seen = self._first_seen.get(worker.name, worker)
             self._first_seen[worker.name] = first_seen.with_gpus(worker.gpus)
-        notes, remaining_workers = ask(
+        notes, remaining_workers = call_steward(
             self.client,
-            declare,
+            create_partitions,
             rules=dict(rules),
             pool=self._first_seen,
             known_partitions=set(self.partitions()),
@@ -522,7 +521,7 @@ class Pool:
 
 
 def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
-    """Return the names of all partitions, and of partitions with a rule.
+    """Return the names of all partitions and of the partitions with a rule.
 
     Runs on the scheduler.
     """
@@ -530,21 +529,24 @@ def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:
-    """Return whether a worker declares one of these resources, or True if `names` is None."""
+    """Return whether a worker declares one of the resources, or True if `names` is None."""
     return names is None or not names.isdisjoint(worker.resources)
 
 
 def _is_free(worker: WorkerInfo, of: Callable[[WorkerInfo], bool]) -> bool:
-    """Return whether a worker is in no partition, and belongs to a pool."""
+    """Return whether a worker has no partition and satisfies the predicate of a pool."""
     return not worker.partitions and of(worker)
 
 
 def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tuple[str, ...]]:
-    """Return the GPUs of workers by address, without workers that do not answer.
+    """Return the GPUs of workers by address, omitting workers that do not respond.
 
-    Raises PoolError if a worker cannot describe its machine.
+    Raises
+    ------
+    PoolError
+        If a worker cannot report its GPUs.
     """
-    answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
+    answers = run_on_workers(client, worker_gpus, [worker.address for worker in workers])
     for worker in workers:
         if isinstance(error := answers.get(worker.address), BaseException):
             raise PoolError(

@@ -1,4 +1,4 @@
-"""Facts about a worker's machine, found by functions that run on the workers."""
+"""Functions that run on a worker to find out about its machine."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-# Asks the driver itself, in CUDA's order of the devices (nvidia-smi's order may be another) and
-# with CUDA_VISIBLE_DEVICES applied. In a separate process: cuInit would fix the visible devices of
-# the worker for good. Version 2 tells the instances of a divided (MIG) device apart; drivers before
-# CUDA 11.4 have only the first.
+# The script queries the driver, which lists the devices in CUDA's order (the order of nvidia-smi
+# may differ) and respects CUDA_VISIBLE_DEVICES. It runs in a separate process, because cuInit would
+# fix the visible devices of the worker permanently. Version 2 of the function distinguishes the
+# instances of a MIG device, but drivers older than CUDA 11.4 only provide version 1.
 CUDA_DRIVER = "libcuda.so.1"
 _LIST_GPUS = """
 import ctypes, sys
@@ -31,11 +31,14 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 """
 
 
-@cache  # it takes up to a second; an error is not kept
+@cache  # a call takes up to a second; errors are not cached
 def list_gpus() -> tuple[str, ...]:
-    """Return the UUIDs of the CUDA devices of this process, by ordinal, or () without a driver.
+    """Return the UUIDs of the CUDA devices of this process by ordinal, or () if there is no driver.
 
-    CalledProcessError or TimeoutExpired if the driver fails.
+    Raises
+    ------
+    subprocess.CalledProcessError, subprocess.TimeoutExpired
+        If the driver fails.
     """
     try:
         ctypes.CDLL(CUDA_DRIVER)
@@ -47,9 +50,9 @@ def list_gpus() -> tuple[str, ...]:
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """UUIDs of the CUDA devices this process may use, by ordinal, or () without a driver.
+    """Return the UUIDs of the CUDA devices of this process by ordinal, or () if there are none.
 
-    A driver that fails counts as none, with a warning in the log.
+    Unlike `list_gpus`, this function logs a warning and returns () if the driver fails.
     """
     try:
         return list_gpus()
@@ -61,6 +64,6 @@ def visible_gpus() -> tuple[str, ...]:
 
 
 async def worker_gpus(dask_worker: Any = None) -> tuple[str, ...]:
-    """CUDA devices of a worker, as `visible_gpus` finds them."""
-    # In a thread, to keep the worker's event loop free.
+    """Return the CUDA devices of a worker, as `visible_gpus` finds them."""
+    # Run in a thread to avoid blocking the worker's event loop.
     return await asyncio.to_thread(visible_gpus)

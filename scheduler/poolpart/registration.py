@@ -1,7 +1,8 @@
-"""Partitions for which the clients of this process are registered with their scheduler.
+"""Record of the partitions for which this process has registered its clients with the scheduler.
 
-A client registers once for each partition (`membership.py`); afterwards it submits without a
-request. The registration ends with the connection of the client, and with the partition.
+A client registers once per partition (see `membership.py`) and then submits tasks without a further
+request. The registration ends when the client loses its connection, or when the partition is
+dissolved.
 """
 
 from __future__ import annotations
@@ -11,24 +12,24 @@ from weakref import WeakKeyDictionary
 
 from distributed import Client
 
-# {client: {partition: connection to the scheduler on which the client registered}}. A client
-# that was cut off from its scheduler connects again, and the scheduler has forgotten the client.
+# {client: {partition: scheduler connection on which the client registered}}. The connection is
+# stored because a client that reconnects is unknown to the scheduler and must register again.
 _connections: WeakKeyDictionary[Client, dict[str, Any]] = WeakKeyDictionary()
 
 
 def is_registered(client: Client, name: str) -> bool:
-    """Return whether a client is registered for a partition."""
+    """Return whether a client has registered for a partition on its current connection."""
     connection = client.scheduler_comm
     return connection is not None and _connections.get(client, {}).get(name) is connection
 
 
-def note_registration(client: Client, name: str, connection: Any) -> None:
-    """Note that a client has registered for a partition by a connection to its scheduler."""
+def record_registration(client: Client, name: str, connection: Any) -> None:
+    """Record that a client has registered for a partition on the given connection."""
     _connections.setdefault(client, {})[name] = connection
 
 
 def forget_registrations(name: str | None = None) -> None:
-    """Let the clients of this process register again for a partition, or for all with None."""
+    """Make the clients of this process register again for a partition, or for all if it is None."""
     for connections in _connections.values():
         if name is None:
             connections.clear()

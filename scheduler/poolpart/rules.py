@@ -1,4 +1,4 @@
-"""Rules that choose the workers of a partition, at its division and when workers join later."""
+"""Rules that select the workers of a partition, when it is created and when workers join later."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class Rule:
         """
         return []
 
-    def wants(
+    def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether to add a worker to the members, given all workers (`everyone`)."""
+        """Return whether to add a worker to the members, given all workers of the cluster."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     @property
@@ -82,12 +82,12 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers that share the GPUs evenly."""
+        """Select workers so that they share the GPUs evenly."""
         if not any(worker.gpus for worker in free):
             return per_host(self.max_workers).choose(free)
         workers_of_gpu: Counter[str] = Counter()
         chosen = []
-        # Workers that see the fewest GPUs come first: the others have more choice.
+        # Workers that see the fewest GPUs come first, because they have the fewest alternatives.
         for worker in sorted(free, key=lambda worker: len(worker.gpus)):
             if worker.gpus:
                 gpu = min(worker.gpus, key=lambda gpu: workers_of_gpu[gpu])
@@ -96,14 +96,14 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
                     chosen.append(worker)
         return chosen
 
-    def wants(
+    def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
         """Return whether to add a worker, which must have a GPU if any worker has one."""
         if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
         same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
-        return super().wants(worker, same_kind, everyone)
+        return super().accepts(worker, same_kind, everyone)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class per_host(Rule):  # noqa: N801
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers of each host."""
+        """Select the first workers on each host."""
         workers_of_host: Counter[str] = Counter()
         chosen = []
         for worker in free:
@@ -144,7 +144,7 @@ class n_workers(Rule):  # noqa: N801
     workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers."""
+        """Select the first workers of the list."""
         return list(free[: self.workers])
 
     @property
@@ -154,22 +154,22 @@ class n_workers(Rule):  # noqa: N801
 
 
 @dataclass(frozen=True)
-class Named(Rule):
-    """The workers of a list of names or addresses, as `named` makes it."""
+class NamedWorkers(Rule):
+    """Rule that selects workers by name or address, created by `named`."""
 
     names: tuple[str, ...]
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose the named workers that are available."""
+        """Select the named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
     @property
     def target(self) -> int:
-        """Number of names."""
+        """Number of names in the rule."""
         return len(self.names)
 
-    def missing(self, members: Sequence[WorkerInfo]) -> list[str]:
-        """Return the names that none of the members has."""
+    def missing_names(self, members: Sequence[WorkerInfo]) -> list[str]:
+        """Return the names that do not belong to any of the members."""
         present = {name for worker in members for name in (worker.name, worker.address)}
         return [name for name in self.names if name not in present]
 
@@ -193,7 +193,7 @@ class rest(Rule):  # noqa: N801
         return list(free)
 
 
-def named(*names: str | int, **common: Any) -> Named:
+def named(*names: str | int, **common: Any) -> NamedWorkers:
     """Return a rule that selects workers by name or address, including those that join later.
 
     Raises
@@ -213,29 +213,29 @@ def named(*names: str | int, **common: Any) -> Named:
             f"The rule `named` was called with {problem}. Pass the name or address of each worker "
             'as a separate argument, for example `named("0", "1")`.'
         )
-    return Named(tuple(map(str, names)), **common)
+    return NamedWorkers(tuple(map(str, names)), **common)
 
 
-def divide(
+def divide_workers(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
-    """Divide workers by rules, in order: each rule takes workers that earlier rules have left.
+    """Divide workers by rules, each of which selects from the workers that earlier rules have left.
 
-    Workers that a rule names are kept for that rule. Present members of a partition come first, so
-    that repeating the rules gives the same partitions. Workers that declare another resource are
-    not taken.
+    Workers that a rule names are reserved for that rule. Current members of a partition are
+    preferred, so repeating the same rules results in the same partitions. Workers that declare
+    another resource are never selected.
 
     Returns
     -------
     chosen
-        {partition: workers}.
+        Selected workers by partition.
     notes
-        {partition: what a user should know of the choice}.
+        Notes for users about the selection, by partition.
 
     Raises
     ------
     PoolError
-        If a partition would have fewer workers than its minimum, or two rules take the rest.
+        If a partition would have fewer workers than its minimum, or if two rules are `rest`.
     """
     takers_of_rest = [name for name, rule in rules.items() if isinstance(rule, rest)]
     if len(takers_of_rest) > 1:
@@ -252,7 +252,7 @@ def divide(
         earlier_rules = len(chosen) - 1
         if len(workers) < rule.minimum:
             raise PoolError(
-                f"Partition {name!r} requires at least {workers_in_words(rule.minimum)}, but its "
+                f"Partition {name!r} requires at least {format_workers(rule.minimum)}, but its "
                 f"rule selects {len(workers)}. {_advice(rule, free, pool, earlier_rules)}"
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
@@ -261,35 +261,37 @@ def divide(
             source = _largest_partition(worker for worker in pool if worker not in free)
             move = f", and `resize(…, source={source!r})` moves existing workers into it"
             notes[name] = (
-                f"The partition has {len(workers)} of the {workers_in_words(rule.workers)} that "
+                f"The partition has {len(workers)} of the {format_workers(rule.workers)} that "
                 f"its rule requests. Workers that join the cluster later are added to it"
                 f"{move if source else ''}."
             )
-        if isinstance(rule, Named) and (missing := rule.missing(workers)):
+        if isinstance(rule, NamedWorkers) and (missing := rule.missing_names(workers)):
             notes[name] = (
                 "The partition does not have all workers that its rule names. "
-                f"{_whereabouts(missing, pool)}"
+                f"{_explain_missing(missing, pool)}"
             )
     return chosen, notes
 
 
 class _Choice(NamedTuple):
-    """What a rule chooses."""
+    """Selection of workers by one rule."""
 
     rule: Rule
-    free: list[WorkerInfo]  # workers that the rule may take
-    workers: list[WorkerInfo]  # those that it takes
+    free: list[WorkerInfo]  # workers that the rule can select from
+    workers: list[WorkerInfo]  # workers that the rule selects
 
 
 def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str, _Choice]:
-    """Return the choice of each rule, by partition, even of fewer workers than its minimum."""
+    """Apply all rules in order, and return their selections without checking the minimum."""
     choices: dict[str, _Choice] = {}
-    chosen_addresses: set[str] = set()  # not names, which may repeat
-    named_by_rules = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
+    chosen_addresses: set[str] = set()  # addresses are unique, unlike names
+    named_by_rules = {
+        n for rule in rules.values() if isinstance(rule, NamedWorkers) for n in rule.names
+    }
     for name, rule in rules.items():
         declaring = [worker for worker in pool if worker.partitions == {name}]
         free = [w for w in pool if not w.partitions and w.address not in chosen_addresses]
-        if not isinstance(rule, Named):
+        if not isinstance(rule, NamedWorkers):
             free = [w for w in free if not named_by_rules & {w.name, w.address}]
         free = [*declaring, *free]
         choices[name] = _Choice(rule, free, rule.choose(free))
@@ -297,7 +299,7 @@ def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str,
     return choices
 
 
-def shortfalls(
+def find_shortfalls(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo], pool_as_seen: Sequence[WorkerInfo]
 ) -> dict[str, str]:
     """Return a note for each partition that gets fewer workers than the client could expect.
@@ -305,26 +307,27 @@ def shortfalls(
     Parameters
     ----------
     rules
-        Rules that choose the workers, by partition.
+        Rules that select the workers, by partition.
     pool, pool_as_seen
-        The workers with the resources that they declare now, and with those that the client saw.
+        Workers with the resources that they declare now, and with the resources that the client
+        saw.
     """
     now = _choices(rules, pool)
     expected = _choices(rules, pool_as_seen)
     return {
         name: f"The partition has {len(now[name].workers)} of the "
-        f"{workers_in_words(len(choice.workers))} that its rule would have selected when the pool "
+        f"{format_workers(len(choice.workers))} that its rule would have selected when the pool "
         "was created. The other workers have been assigned to other partitions since then."
         for name, choice in expected.items()
         if len(now[name].workers) < len(choice.workers)
     }
 
 
-def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
-    """Return why the named workers cannot be selected: they are elsewhere, or do not exist."""
+def _explain_missing(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
+    """Return sentences that explain why the named workers cannot be selected."""
     by_name = {name: worker for worker in pool for name in (worker.name, worker.address)}
     absent = [name for name in missing if name not in by_name]
-    # {names of partitions, or "" for a worker that an earlier rule has selected: workers}
+    # {partition names of a worker, or "" if an earlier rule has selected it: names of workers}
     elsewhere: dict[str, list[str]] = {}
     for name in missing:
         if name in by_name:
@@ -337,41 +340,45 @@ def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
         place = f"already {verb} to partition {partitions}"
         if not partitions:
             place = f"{'is' if is_one else 'are'} selected by another rule"
-        sentences.append(f"{'Worker' if is_one else 'Workers'} {_listed(names)} {place}.")
+        sentences.append(f"{'Worker' if is_one else 'Workers'} {_format_names(names)} {place}.")
     if absent:
         present = sorted((worker.name for worker in pool), key=lambda name: (len(name), name))
         sentences.append(
-            f"The pool has no worker named {_listed(absent)}. Existing workers: "
-            f"{_listed(present) or 'none'}."
+            f"The pool has no worker named {_format_names(absent)}. Existing workers: "
+            f"{_format_names(present) or 'none'}."
         )
     return " ".join(sentences)
 
 
 def _largest_partition(workers: Iterable[WorkerInfo]) -> str:
-    """Return the partition that most of the workers belong to, or "" if they belong to none."""
+    """Return the partition to which most of the workers belong, or "" if they belong to none."""
     sizes = Counter(name for worker in workers for name in sorted(worker.partitions))
     return max(sizes, key=sizes.__getitem__, default="")
 
 
-def _listed(names: Sequence[str]) -> str:
-    """Return up to nine names for a message."""
+def _format_names(names: Sequence[str]) -> str:
+    """Format up to nine names for a message."""
     return ", ".join(map(repr, names[:9])) + (", …" if len(names) > 9 else "")
 
 
 def _advice(
     rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo], earlier_rules: int
 ) -> str:
-    """Return advice about a rule that has too few workers, with the number of rules before it."""
+    """Return advice about a rule that selects too few workers.
+
+    `free` contains the workers that the rule can select from, and `earlier_rules` is the number of
+    rules before it.
+    """
     if isinstance(rule, n_workers) and rule.workers < rule.minimum:
         return (
-            f"The rule allows at most {workers_in_words(rule.workers)}. Increase this number, or "
+            f"The rule allows at most {format_workers(rule.workers)}. Increase this number, or "
             f"pass `minimum={rule.workers}`."
         )
     elsewhere = [worker for worker in pool if worker.partitions and worker not in free]
     sentences = []
-    if isinstance(rule, Named):
+    if isinstance(rule, NamedWorkers):
         elsewhere = [w for w in elsewhere if {w.name, w.address} & {*rule.names}]
-        sentences.append(_whereabouts(rule.missing(rule.choose(free)), pool))
+        sentences.append(_explain_missing(rule.missing_names(rule.choose(free)), pool))
     else:
         verb = "is" if len(free) == 1 else "are"
         reorder = ", or place this partition before the others" if earlier_rules else ""
@@ -381,12 +388,12 @@ def _advice(
         )
     if elsewhere:
         source = _largest_partition(elsewhere)
-        if not isinstance(rule, Named):
+        if not isinstance(rule, NamedWorkers):
             names = sorted({name for worker in elsewhere for name in worker.partitions})
             verb = "declares" if len(elsewhere) == 1 else "declare"
             sentences.append(
-                f"{workers_in_words(len(elsewhere))} already {verb} the "
-                f"resource{'s' if len(names) > 1 else ''} {_listed(names)}."
+                f"{format_workers(len(elsewhere))} already {verb} the "
+                f"resource{'s' if len(names) > 1 else ''} {_format_names(names)}."
             )
         sentences.append(
             "A worker can belong to only one partition. To divide these workers again, dissolve "
@@ -402,35 +409,37 @@ def partition_for(
     rules: Mapping[str, Rule],
     members: Mapping[str, Sequence[WorkerInfo]],
 ) -> str | None:
-    """Return the partition of a worker that joins, or None.
+    """Return the partition that a joining worker is assigned to, or None.
 
-    A rule that names the worker comes first, then partitions with fewer workers than their
-    minimum or with none, then the order of the rules.
+    Rules that name the worker have priority, followed by partitions without workers or with fewer
+    workers than their minimum, and then by the order of the rules.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
-    willing = [name for name, rule in rules.items() if rule.wants(worker, members[name], everyone)]
+    willing = [
+        name for name, rule in rules.items() if rule.accepts(worker, members[name], everyone)
+    ]
     short = [
         name
         for name in willing
         if len(members[name]) < max(rules[name].minimum, not isinstance(rules[name], rest))
     ]
-    by_name = [name for name in willing if isinstance(rules[name], Named)]
+    by_name = [name for name in willing if isinstance(rules[name], NamedWorkers)]
     return next(iter([*by_name, *short, *willing]), None)
 
 
-def workers_in_words(count: int) -> str:
-    """Return a number of workers for a message, such as "1 worker"."""
+def format_workers(count: int) -> str:
+    """Format a number of workers for a message, for example "1 worker"."""
     return f"{count} {'worker' if count == 1 else 'workers'}"
 
 
 def check_name(partition: object) -> None:
-    """Raise a PoolError unless a value can be the name of a partition."""
+    """Raise PoolError unless the value is a valid partition name."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"Invalid partition name {partition!r}. Expected a string such as 'GPU'.")
 
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
-    """Raise a PoolError unless a count is a whole number of at least `minimum`."""
+    """Raise PoolError unless the value is an integer of at least `minimum`."""
     if not isinstance(count, Integral) or count < minimum:
         raise PoolError(
             f"Invalid value {count!r} for {name}. Expected an integer of at least {minimum}."

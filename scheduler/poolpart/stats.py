@@ -1,9 +1,8 @@
-"""Load and finished tasks of a partition.
+"""Statistics of tasks by partition and stage.
 
-A plugin of the scheduler counts tasks that have ended, by partition and stage. A task's partition
-is the resource that it asks for, or ""; its stage is the prefix of its key, for most tasks the
-function's name; there are as many stages as Dask itself keeps. Tasks under way are counted on
-request.
+A scheduler plugin counts finished tasks. The partition of a task is the resource that it requests,
+or "". Its stage is the prefix of its key, which is the name of the function for most tasks.
+Unfinished tasks are counted on request.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .features import FEATURES
-from .fence import fences_of
-from .partition_stats import PartitionStats, StageStats, size_in_words
+from .fence import fence_names
+from .partition_stats import PartitionStats, StageStats, describe_size
 from .steward import target_of
-from .task_table import KEPT, TaskRow, moment
+from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
 NAME = "poolpart-stats"
-_ERROR_LETTERS = 200  # letters kept of the error of a task
-_LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
-_RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are there
-# {Dask's state of a task: how the task is counted}; some assigned tasks run, some are queued
+_ERROR_LETTERS = 200  # maximum length of the error of a task
+_MAX_EXAMINED = 1000  # number of tasks per worker that are searched for running tasks
+_RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are available
+# Our state of a task by Dask's state. "assigned" tasks are either running or queued.
 _WAITING = {
     "waiting": "waiting",
     "queued": "queued",
@@ -35,29 +34,29 @@ _WAITING = {
 }
 
 
-class Statistics(SchedulerPlugin):
-    """Counts the scheduler's tasks that end, from its creation on."""
+class TaskStatistics(SchedulerPlugin):
+    """Scheduler plugin that counts finished tasks, beginning with its creation."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.since = time.time()  # when counting began
-        # Whether the counts outlive the clients that submit to partitions.
+        self.since = time.time()  # time when counting began
+        # Whether the counts are kept after the last client of a partition has closed.
         self.is_kept = False
-        # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
+        # {(partition, stage): totals of finished tasks, by field of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-        # {partition: its tasks that have ended, newest first}
-        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=KEPT))
-        self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
-        self._deaths: dict[Any, int] = {}  # {key of a task: workers that died while they ran it}
+        # {partition: finished tasks, newest first}
+        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=MAX_ENDED_TASKS))
+        self._runnable: dict[Any, float] = {}  # {task key: time when its inputs were available}
+        self._deaths: dict[Any, int] = {}  # {task key: workers that died while it was assigned}
         for feature in FEATURES:
             feature.begin_counting(self)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
     ) -> None:
-        """Count a task that has ended, and note when a task could run."""
+        """Count a finished task, or record when a task became ready to run."""
         if start == "waiting" and finish in _RUNNABLE:
             self._runnable[key] = time.time()
         if finish in _RUNNABLE:
@@ -68,7 +67,7 @@ class Statistics(SchedulerPlugin):
         if start != "processing" or finish not in ("memory", "erred", "released"):
             return
         task = self.scheduler.tasks[key]
-        if finish == "released":  # its worker has died, or it was cancelled or rescheduled
+        if finish == "released":  # its worker has died, or it was canceled or rescheduled
             if task.suspicious > self._deaths.get(key, 0):
                 self._deaths[key] = task.suspicious
                 self.ended[partition_of(task), task.prefix.name]["lost"] += 1
@@ -78,11 +77,11 @@ class Statistics(SchedulerPlugin):
         computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
         counts["seconds"] += sum(span["stop"] - span["start"] for span in computing)
         self._keep(task, finish, runnable, computing, kwargs)
-        if computing and runnable is not None:  # both by the scheduler's clock: Dask corrects them
+        if computing and runnable is not None:  # Dask converts both to the scheduler's clock
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
     def queued_since(self, key: Any) -> float | None:
-        """Return the time since when a task could run, seconds since 1970, or None if unknown."""
+        """Return when a task became ready to run in seconds since 1970, or None if unknown."""
         return self._runnable.get(key)
 
     def _keep(
@@ -93,11 +92,11 @@ class Statistics(SchedulerPlugin):
         computing: list[Any],
         report: Mapping[str, Any],
     ) -> None:
-        """Keep a task that has ended: `report` is what its worker told of it."""
+        """Add a row for a finished task, where `report` is the message of its worker."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
-        started = moment(computing[0]["start"] if computing else None)
-        finished = moment(computing[-1]["stop"] if computing else None)
+        started = to_datetime(computing[0]["start"] if computing else None)
+        finished = to_datetime(computing[-1]["stop"] if computing else None)
         seconds = (finished - started).total_seconds() if started and finished else None
         self.recent[partition].appendleft(
             TaskRow(
@@ -106,7 +105,7 @@ class Statistics(SchedulerPlugin):
                 function=task.prefix.name,
                 worker="" if worker is None else str(worker.name),
                 slots=_slots_taken(task, partition),
-                queued=moment(runnable),
+                queued=to_datetime(runnable),
                 started=started,
                 finished=finished,
                 error=" ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
@@ -115,30 +114,30 @@ class Statistics(SchedulerPlugin):
         )
 
     def all_stats(self) -> list[PartitionStats]:
-        """Return the statistics of each partition, and of tasks without a partition."""
+        """Return the statistics of all partitions, and of the tasks without a partition."""
         names = {name for name, _ in self.ended}
         for worker in self.scheduler.workers.values():
             names.update(name for name, slots in worker.resources.items() if slots)
         return stats_of(sorted(names | {""}), self.scheduler)
 
     def stop(self) -> None:
-        """End what features do with the counts."""
+        """Notify all features that counting stops."""
         for feature in FEATURES:
             feature.end_counting(self)
 
     async def close(self) -> None:
-        """Stop with the scheduler."""
+        """Stop when the scheduler closes."""
         self.stop()
 
 
 def partition_of(task: Any) -> str:
-    """Return the resource that a task asks for, or ""."""
+    """Return the first resource that a task requests, or ""."""
     resources = task.resource_restrictions
     return next(iter(resources)) if resources else ""
 
 
-def members(scheduler: Any, partition: str) -> list[Any]:
-    """Return the states of the workers of a partition or, for "", of workers without resources."""
+def workers_of(scheduler: Any, partition: str) -> list[Any]:
+    """Return the states of the workers of a partition, or of workers without resources for ""."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -146,15 +145,16 @@ def members(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Return the slots of a worker for a partition or, for "", the threads of the worker."""
+    """Return the number of slots of a worker in a partition, or its number of threads for ""."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
 def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
-    """Return the tasks of a partition that a worker runs, by stage, and their slots.
+    """Return the running tasks of a partition on a worker, counted by stage, and their slots.
 
-    The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
-    has slots. So of a task that waits and the nested tasks in its slots, some do not count.
+    The scheduler does not know which assigned tasks are running, so it assumes that as many of them
+    run as the worker has slots. Therefore, if nested tasks run in the slots of a waiting task, some
+    of these tasks are not counted as running.
     """
     held = 0
     stages: Counter[str] = Counter()
@@ -165,28 +165,26 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 
 def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
-    """Yield the tasks of a partition that a worker runs."""
     free = slots_of(worker, partition)
-    for task in islice(worker.processing, _LOOK_AT_MOST):
+    for task in islice(worker.processing, _MAX_EXAMINED):
         if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
             free -= takes
             yield task
 
 
 def _slots_taken(task: Any, partition: str) -> int:
-    """Return the slots of a partition that a task holds while it runs."""
     return int(task.resource_restrictions[partition]) if partition else 1
 
 
 def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], float]:
-    """Return the unfinished tasks of a partition, and the ended tasks that are kept.
+    """Return the rows of all unfinished tasks and the last finished tasks of a partition.
 
-    Also returns when counting began, in seconds since 1970. Runs on the scheduler.
+    The second value is the time when counting began, in seconds since 1970. Runs on the scheduler.
     """
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     running = {
-        task.key for worker in members(scheduler, name) for task in _running_tasks(worker, name)
+        task.key for worker in workers_of(scheduler, name) for task in _running_tasks(worker, name)
     }
     rows = []
     for task in scheduler.tasks.values():
@@ -204,8 +202,8 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
                 function=task.prefix.name,
                 worker="" if worker is None else str(worker.name),
                 slots=_slots_taken(task, name),
-                queued=moment(statistics.queued_since(task.key)),
-                started=moment(started),
+                queued=to_datetime(statistics.queued_since(task.key)),
+                started=to_datetime(started),
                 seconds=seconds,
             )
         )
@@ -213,10 +211,10 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
 
 
 def _times_of_running(task: Any) -> tuple[float | None, float | None]:
-    """Return when a running task started, in seconds since 1970, and for how long it has run.
+    """Return when a running task started and how long it has been running, in seconds.
 
-    A worker reports the running time of its tasks with each heartbeat. Both are None before the
-    first heartbeat after the start.
+    The start is in seconds since 1970. Both values are None until the first heartbeat after the
+    start, because workers report running times with their heartbeats.
     """
     worker = task.processing_on
     reported_s = worker.executing.get(task)
@@ -227,41 +225,38 @@ def _times_of_running(task: Any) -> tuple[float | None, float | None]:
 
 
 def size_of(name: str, dask_scheduler: Any = None) -> str:
-    """Return the number of workers and slots of a partition in words, without counting its tasks.
+    """Describe the number of workers and slots of a partition, without counting its tasks.
 
     Runs on the scheduler.
     """
-    workers = members(dask_scheduler, name)
+    workers = workers_of(dask_scheduler, name)
     slots = sum(slots_of(worker, name) for worker in workers)
-    return size_in_words(len(workers), target_of(dask_scheduler, name), slots)
+    return describe_size(len(workers), target_of(dask_scheduler, name), slots)
 
 
-def statistics_of(scheduler: Any, keep: bool = True) -> Statistics:
-    """Find the scheduler's statistics, or start counting.
+def statistics_of(scheduler: Any, keep: bool = True) -> TaskStatistics:
+    """Return the scheduler's statistics, and start counting if necessary.
 
-    With `keep`, the counts outlive the clients that submit to partitions.
+    If `keep` is true, the counts are kept after the last client of a partition has closed.
     """
-    statistics: Statistics | None = scheduler.plugins.get(NAME)
+    statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is None:
-        statistics = Statistics(scheduler)
+        statistics = TaskStatistics(scheduler)
         scheduler.add_plugin(statistics)
     statistics.is_kept |= keep
     return statistics
 
 
 def forget_statistics(scheduler: Any) -> None:
-    """Stop counting, and delete the counts."""
-    statistics: Statistics | None = scheduler.plugins.get(NAME)
+    """Stop counting and delete the counts."""
+    statistics: TaskStatistics | None = scheduler.plugins.get(NAME)
     if statistics is not None:
         statistics.stop()
         scheduler.remove_plugin(NAME)
 
 
 def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
-    """Return the statistics of partitions.
-
-    Runs on the scheduler.
-    """
+    """Return the statistics of the named partitions. Runs on the scheduler."""
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
@@ -271,7 +266,7 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
     all_stages = sorted(under_way.keys() | statistics.ended.keys())
     answers = []
     for name in names:
-        workers = members(scheduler, name)
+        workers = workers_of(scheduler, name)
         by_worker = [running_on(worker, name) for worker in workers]
         running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
         stages = {}
@@ -292,8 +287,8 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 workers=len(workers),
                 slots=sum(slots_of(worker, name) for worker in workers),
                 busy=sum(held for _, held in by_worker),
-                exclusive=name in fences_of(scheduler),
-                since=moment(statistics.since),
+                exclusive=name in fence_names(scheduler),
+                since=to_datetime(statistics.since),
                 target=target_of(scheduler, name),
                 stages=stages,
                 **sums,

@@ -1,17 +1,19 @@
-"""Membership of workers in partitions: the only record of it, a plugin of the scheduler.
+"""Membership of workers in partitions, stored in a scheduler plugin.
 
-The steward has the rules by partition, and a seat for each worker with the worker's partition.
-Requests of clients (`division.py`) and workers that join and leave change it. After any change,
-one loop for each worker (`Steward._settle`) synchronizes three things with the seat:
+The steward stores the rule of each partition and a record of each worker with its partition.
+Requests of clients (see `division.py`) and workers that join or leave change the records. After any
+change, a reconciliation loop for each affected worker (`Steward._reconcile`) brings the following
+in line with its record:
 
-1. the resources that the worker declares, which its tasks must find there;
-2. the resources that the scheduler places tasks by: removed before a worker leaves a partition,
-   so that it gets no more of its tasks, and added only when the worker has declared them;
-3. the workers behind a fence, from the moment of the change. A fence keeps all tasks that do not
-   ask for an exclusive partition off the partition's workers (`fence.py`).
+1. The resources that the worker declares, which its tasks must find there.
+2. The resources that the scheduler uses to place tasks. They are removed before a worker leaves a
+   partition, so that it receives no more tasks of it, and added once the worker has declared them.
+3. The workers behind a fence, immediately after the change. A fence keeps all tasks that do not
+   request an exclusive partition off its workers (see `fence.py`).
 
-Nannies are not modified: a restarted worker declares its original resources, joins, and is settled
-again. So the loop may be interrupted anywhere, and dissolving leaves nothing behind.
+Nannies are not modified. A restarted worker declares its original resources, joins, and is
+reconciled again. Therefore, the loop can be interrupted at any point, and dissolving a partition
+leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -27,11 +29,19 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .choosing import note_change
+from .choosing import invalidate_groups
 from .errors import PoolError
-from .fence import expect
-from .internals.names import DIVIDING, require
-from .internals.scheduler import Resources, call, hand_off, held_by, recount, show, wake
+from .fence import set_expected_partition
+from .internals.names import DIVIDING, require_feature
+from .internals.scheduler import (
+    Resources,
+    call_worker,
+    hand_off_tasks,
+    keys_held_by,
+    recount_used_resources,
+    send_waiting_tasks,
+    set_visible_resources,
+)
 from .internals.worker import declare_on_worker
 from .probe import worker_gpus
 from .rules import Rule, n_workers, partition_for, per_gpu, rest
@@ -40,121 +50,129 @@ from .workers import WorkerInfo
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-steward"
-HOLD_S = 30.0  # time in seconds for which the seat of a worker that its nanny restarts is kept
-LOOK_EVERY_S = 0.01
-_ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
+HOLD_S = 30.0  # time for which the record of a worker is kept while its nanny restarts it
+CHECK_EVERY_S = 0.01  # interval between attempts to reconcile a worker
+_ASSIGN_EVERY_S = 0.1  # about the time that applying all rules to a thousand workers takes
 
 
 @dataclass(eq=False)
-class Seat:
-    """Partition and state of a worker, also while the worker's nanny restarts the process."""
+class WorkerRecord:
+    """Partition and state of a worker, kept while a nanny restarts the worker process."""
 
-    key: Hashable  # identifies the worker (`seat_key`)
+    key: Hashable  # identifies the worker (`worker_key`)
     info: WorkerInfo
-    nanny: str | None = None  # its address
+    nanny: str | None = None  # address of the nanny
     original: Resources = field(default_factory=dict)  # resources that the worker was started with
     declared: Resources = field(default_factory=dict)  # resources at the worker's last reply
-    is_declaring: bool = False  # a request to declare resources is under way
+    is_declaring: bool = False  # whether a request to declare resources is in flight
     partition: str | None = None
-    # Partition that the worker was started in or that a rule chose for it. Moving a worker does not
-    # change its home: another partition has only borrowed it.
+    # Partition that the worker was started in, or that a rule has selected for it. The home does
+    # not change when the worker is moved, because the other partition only borrows the worker.
     home: str | None = None
-    slots: float = 0  # slots for the partition
-    # It joined after the division, and the rules are to choose its partition: for the first time,
-    # or again if it is in the remainder.
-    unplaced: bool = False
-    by_rule: bool = False  # it joined after the division, and the rules chose its partition
-    away: bool = False  # it has left, and its nanny may be restarting it
-    removed: bool = False  # it is no longer expected
-    reconciler: asyncio.Task[None] | None = None  # loop `Steward._settle` of this worker
-    giving_up: asyncio.TimerHandle | None = None  # removes the seat, while the worker is away
+    slots: float = 0  # number of slots in the partition
+    # Whether the rules still have to select a partition for the worker, which has joined after the
+    # division. Members of the remainder can be selected again by another rule.
+    is_unassigned: bool = False
+    # Whether the worker has joined after the division and was assigned to its partition by a rule.
+    assigned_by_rule: bool = False
+    is_absent: bool = False  # whether the worker has left, possibly because its nanny restarts it
+    is_removed: bool = False  # whether the worker is no longer expected to return
+    reconciliation: asyncio.Task[None] | None = None  # running `Steward._reconcile` loop
+    removal_timer: asyncio.TimerHandle | None = None  # removes the record of an absent worker
 
 
 class Steward(SchedulerPlugin):
-    """Keeps workers in their partitions, also when the client has gone."""
+    """Scheduler plugin that assigns workers to partitions, even after the client has closed."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.rules: dict[str, Rule] = {}  # {partition: its rule}, in the order of choosing
-        self.seats: dict[Hashable, Seat] = {}  # {key: its seat}
-        self.open_requests = 0  # requests of clients that are under way
-        self._names: set[str] = set()  # all partitions so far, dissolved ones included
-        self._assigning: asyncio.TimerHandle | None = None
+        self.rules: dict[str, Rule] = {}  # {partition: rule}, in the order in which they apply
+        self.records: dict[Hashable, WorkerRecord] = {}  # {worker key: record}
+        self.open_requests = 0  # number of client requests in progress
+        self._names: set[str] = set()  # names of all partitions so far, including dissolved ones
+        self._assignment_timer: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
-            self._seat(worker)
+            self._add_record(worker)
 
     # -- membership --------------------------------------------------------------------
 
-    def members(self, name: str, present: bool = False) -> list[Seat]:
-        """Return the seats of a partition, or only the seats of present workers if `present`."""
-        members = (seat for seat in self.seats.values() if seat.partition == name)
-        return [seat for seat in members if not (present and seat.away)]
+    def members(self, name: str, present: bool = False) -> list[WorkerRecord]:
+        """Return the records of the members of a partition.
 
-    def free(self) -> list[Seat]:
-        """Return the seats of present workers without a partition or another resource."""
+        If `present` is true, members that are absent are omitted.
+        """
+        members = (record for record in self.records.values() if record.partition == name)
+        return [record for record in members if not (present and record.is_absent)]
+
+    def free_records(self) -> list[WorkerRecord]:
+        """Return the records of present workers without a partition or another resource."""
         return [
-            seat
-            for seat in self.seats.values()
-            if not seat.away
-            and not seat.partition
-            and not any(self.target_resources(seat).values())
+            record
+            for record in self.records.values()
+            if not record.is_absent
+            and not record.partition
+            and not any(self.target_resources(record).values())
         ]
 
-    def remainder(self) -> str | None:
-        """Return the partition with the rule `rest`, or None."""
+    def remainder_name(self) -> str | None:
+        """Return the name of the partition with the rule `rest`, or None."""
         return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
-    def target_resources(self, seat: Seat) -> Resources:
+    def target_resources(self, record: WorkerRecord) -> Resources:
         """Return the resources that a worker should declare.
 
-        A worker without a partition declares what it was started with, except the resources of the
-        present partitions: it is in none of these. A member of a partition declares the slots of
-        this partition, and what it was started with, except the resource of any partition that
-        there is or was: it is in a single partition.
+        A worker without a partition declares the resources that it was started with, except those
+        of existing partitions, because it does not belong to them. A member of a partition declares
+        its slots in this partition and the resources that it was started with, except those of any
+        other existing or dissolved partition, because a worker belongs to only one partition.
         """
-        if seat.partition is None:
-            return {r: slots for r, slots in seat.original.items() if r not in self.rules}
-        original = {r: slots for r, slots in seat.original.items() if r not in self._names}
-        return {**original, seat.partition: seat.slots}
+        if record.partition is None:
+            return {r: slots for r, slots in record.original.items() if r not in self.rules}
+        original = {r: slots for r, slots in record.original.items() if r not in self._names}
+        return {**original, record.partition: record.slots}
 
-    def home(self, seat: Seat) -> str | None:
-        """Return the existing partition that a worker goes back to, or None."""
-        started_in = (name for name, slots in seat.original.items() if slots)
-        return next((name for name in (seat.home, *started_in) if name in self.rules), None)
+    def home_of(self, record: WorkerRecord) -> str | None:
+        """Return the existing partition that a worker returns to, or None."""
+        started_in = (name for name, slots in record.original.items() if slots)
+        return next((name for name in (record.home, *started_in) if name in self.rules), None)
 
-    def assign(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
-        """Put a worker into the partition that is its home from now on."""
-        seat.home = name
-        self.put(seat, name, slots)
+    def set_home(self, record: WorkerRecord, name: str | None, slots: float | None = None) -> None:
+        """Assign a worker to a partition and make this partition its home."""
+        record.home = name
+        self.set_partition(record, name, slots)
 
-    def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
-        """Record the partition of a worker or, with None, that the worker is in no partition.
+    def set_partition(
+        self, record: WorkerRecord, name: str | None, slots: float | None = None
+    ) -> None:
+        """Record the partition of a worker, or that it has no partition if `name` is None.
 
-        The worker is behind the fence of the partition, if any, from now on; `settle` does the
-        rest. The number of slots is the first of these: `slots`, the slots of the rule, the slots
-        of the partition that the worker was started with, the worker's threads.
+        The worker is behind the fence of the partition immediately. `reconcile` makes all other
+        changes. If `slots` is not given, the number of slots is that of the rule, that of the
+        resource which the worker was started with, or the number of threads.
         """
-        seat.partition = name
-        seat.slots = 0
-        seat.unplaced = False
-        seat.by_rule = False
+        record.partition = name
+        record.slots = 0
+        record.is_unassigned = False
+        record.assigned_by_rule = False
         if name is not None:
             rule = self.rules[name]
-            seat.slots = slots or rule.slots or seat.original.get(name) or rule.slots_of(seat.info)
-        if worker := self.scheduler.workers.get(seat.info.address):
-            expect(self.scheduler, worker, name)
+            record.slots = (
+                slots or rule.slots or record.original.get(name) or rule.slots_of(record.info)
+            )
+        if worker := self.scheduler.workers.get(record.info.address):
+            set_expected_partition(self.scheduler, worker, name)
         self._assign_soon()
 
-    def enter(self, name: str, rule: Rule) -> None:
-        """Add a partition or change its rule, and keep the partition with the rule `rest` last."""
+    def set_rule(self, name: str, rule: Rule) -> None:
+        """Add a partition or change its rule, keeping the partition with the rule `rest` last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
 
-    def adopt(self, name: str) -> None:
-        """Add a partition whose workers declared its resource before this division.
+    def adopt_partition(self, name: str) -> None:
+        """Add a partition whose workers were started with its resource, if it is not known yet.
 
         Raises
         ------
@@ -163,20 +181,20 @@ class Steward(SchedulerPlugin):
         """
         if name in self.rules:
             return
-        members = [s for s in self.seats.values() if s.partition is None and s.original.get(name)]
+        members = [s for s in self.records.values() if s.partition is None and s.original.get(name)]
         if not members:
             raise PoolError(
                 f"There is no partition {name!r}. No worker declares this resource, and the "
                 "partition was not created with `Pool.partition` or `Pool.divide`."
             )
-        self.enter(name, Rule(minimum=0))
-        for seat in members:
-            self.assign(seat, name, seat.original[name])
+        self.set_rule(name, Rule(minimum=0))
+        for record in members:
+            self.set_home(record, name, record.original[name])
 
-    def resize(self, name: str | None, change: int) -> None:
-        """Change the number of workers that the rule `n_workers` of a partition asks for.
+    def change_target(self, name: str | None, change: int) -> None:
+        """Change the number of workers that an `n_workers` rule requests.
 
-        Partitions with another rule have no such number, and nothing is done.
+        Other rules are not changed.
         """
         if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
@@ -184,69 +202,72 @@ class Steward(SchedulerPlugin):
 
     # -- joining and leaving -----------------------------------------------------------
 
-    def _seat(self, worker: Any) -> Seat:
-        """Return the seat of a worker that has joined or returned, with the worker's new address.
-
-        A new worker gets a new seat, without a partition.
-        """
-        key = seat_key(worker.name, worker.address, worker.nanny)
+    def _add_record(self, worker: Any) -> WorkerRecord:
+        """Create or update the record of a worker that has joined or returned."""
+        key = worker_key(worker.name, worker.address, worker.nanny)
         info = WorkerInfo.from_identity(worker.address, worker.identity())
-        seat = self.seats.setdefault(key, Seat(key, info))
-        seat.info = info.with_gpus(seat.info.gpus)
-        seat.nanny = worker.nanny
-        seat.original = dict(worker.resources)
-        seat.declared = dict(worker.resources)
-        seat.away = False
-        if seat.giving_up:
-            seat.giving_up.cancel()
-        return seat
+        record = self.records.setdefault(key, WorkerRecord(key, info))
+        record.info = info.with_gpus(record.info.gpus)
+        record.nanny = worker.nanny
+        record.original = dict(worker.resources)
+        record.declared = dict(worker.resources)
+        record.is_absent = False
+        if record.removal_timer:
+            record.removal_timer.cancel()
+        return record
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Assign a joining worker: to its former partition, a declared partition, or by rule."""
-        former_keys = set(self.seats)
-        seat = self._seat(scheduler.workers[worker])
-        declared = [name for name in self.rules if seat.original.get(name)]
-        if seat.key in former_keys:
-            expect(scheduler, scheduler.workers[worker], seat.partition)
+        """Assign a joining worker to its former partition, to a declared partition, or by rule."""
+        former_keys = set(self.records)
+        record = self._add_record(scheduler.workers[worker])
+        declared = [name for name in self.rules if record.original.get(name)]
+        if record.key in former_keys:
+            set_expected_partition(scheduler, scheduler.workers[worker], record.partition)
         elif declared:
-            self.assign(seat, declared[0], seat.original[declared[0]])
+            self.set_home(record, declared[0], record.original[declared[0]])
         else:
-            seat.unplaced = not any(seat.original.values())
-        self.settle([seat])
+            record.is_unassigned = not any(record.original.values())
+        self.reconcile([record])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Record that a worker has left, and keep the seat of a worker with a nanny for a while."""
-        for seat in list(self.seats.values()):
-            if seat.info.address == worker and not seat.away:
-                seat.away = True
-                if seat.reconciler:
-                    seat.reconciler.cancel()
-                    seat.reconciler = None
-                loop = asyncio.get_running_loop()
-                seat.giving_up = loop.call_later(HOLD_S if seat.nanny else 0, self._give_up, seat)
+        """Mark a worker as absent, and schedule the removal of its record.
 
-    def _give_up(self, seat: Seat) -> None:
-        """Remove the seat of a worker that has not returned in time, and fill its place by rule.
-
-        Also of a present worker that cannot declare resources. Members of the remainder that joined
-        by rule are assigned again.
+        The record of a worker with a nanny is kept for a while, because the nanny may restart the
+        worker.
         """
-        seat.removed = True
-        del self.seats[seat.key]
-        # A worker that was started as a replacement has joined before, and went to the rest.
-        if remainder := self.remainder():
+        for record in list(self.records.values()):
+            if record.info.address == worker and not record.is_absent:
+                record.is_absent = True
+                if record.reconciliation:
+                    record.reconciliation.cancel()
+                    record.reconciliation = None
+                loop = asyncio.get_running_loop()
+                record.removal_timer = loop.call_later(
+                    HOLD_S if record.nanny else 0, self._remove_record, record
+                )
+
+    def _remove_record(self, record: WorkerRecord) -> None:
+        """Remove the record of a worker, and fill its place according to the rules.
+
+        The worker has not returned in time, or cannot declare resources. Members of the remainder
+        that have joined after the division can be assigned again to fill the place.
+        """
+        record.is_removed = True
+        del self.records[record.key]
+        # A worker that was started as a replacement may already have joined the remainder.
+        if remainder := self.remainder_name():
             for member in self.members(remainder):
-                member.unplaced = member.by_rule
+                member.is_unassigned = member.assigned_by_rule
         self._assign_soon()
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
-        """Choose workers that an adaptive cluster may stop: each partition keeps its minimum."""
+        """Select the workers that an adaptive cluster may stop without violating a minimum."""
         may_stop = {worker.address: worker for worker in workers}
         for name, rule in self.rules.items():
             members = self.members(name, present=True)
             offered = [m.info.address for m in members if m.info.address in may_stop]
-            # The busiest stay.
+            # The busiest workers are kept.
             offered.sort(key=lambda address: -len(may_stop[address].processing))
             for address in offered[: max(0, rule.minimum - (len(members) - len(offered)))]:
                 del may_stop[address]
@@ -255,195 +276,211 @@ class Steward(SchedulerPlugin):
     # -- assigning workers that join ---------------------------------------------------
 
     def _assign_soon(self) -> None:
-        """Assign unplaced workers in `_ASSIGN_EVERY_S`: rules or members have changed."""
-        if self._assigning is None:
+        """Schedule the assignment of unassigned workers after rules or members have changed."""
+        if self._assignment_timer is None:
             loop = asyncio.get_running_loop()
-            self._assigning = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
+            self._assignment_timer = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
     def _assign_waiting(self) -> None:
-        """Assign all present unplaced workers that have listed their GPUs."""
-        self._assigning = None
-        waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
-        # Other workers are still asked for their GPUs, and are assigned after their answer.
-        ready = [s for s in waiting if s.reconciler and s.reconciler.done()]
-        self.settle([seat for seat in ready if self._assign(seat)])
+        """Assign all present unassigned workers that have reported their GPUs."""
+        self._assignment_timer = None
+        waiting = [s for s in self.records.values() if s.is_unassigned and not s.is_absent]
+        # Workers that have not reported their GPUs yet are assigned by their reconciliation loop.
+        ready = [s for s in waiting if s.reconciliation and s.reconciliation.done()]
+        self.reconcile([record for record in ready if self._assign(record)])
 
-    def _assign(self, seat: Seat) -> bool:
-        """Assign an unplaced worker by the rules, and return whether its partition changes."""
+    def _assign(self, record: WorkerRecord) -> bool:
+        """Assign an unassigned worker by the rules, and return whether its partition changed."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
-        name = partition_for(seat.info, self.rules, groups)
-        if moves := name not in (None, seat.partition):
-            self.assign(seat, name)
-            seat.by_rule = True
-        seat.unplaced = name is None
+        name = partition_for(record.info, self.rules, groups)
+        if moves := name not in (None, record.partition):
+            self.set_home(record, name)
+            record.assigned_by_rule = True
+        record.is_unassigned = name is None
         return moves
 
-    async def _ask_for_gpus(self, seat: Seat) -> None:
-        """Record the GPUs of a worker, if a rule depends on GPUs."""
+    async def _ask_for_gpus(self, record: WorkerRecord) -> None:
+        """Request the GPUs of a worker if a rule depends on them."""
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
-            gpus = await call(self.scheduler, seat.info.address, worker_gpus)
+            gpus = await call_worker(self.scheduler, record.info.address, worker_gpus)
         except OSError as error:
-            logger.warning("Worker %s cannot list its GPUs: %s", seat.info.name, error)
+            logger.warning("Worker %s cannot list its GPUs: %s", record.info.name, error)
             return
-        seat.info = seat.info.with_gpus(gpus)
+        record.info = record.info.with_gpus(gpus)
 
     # -- reconciling workers --------------------------------------------------------------
 
-    def settled(self, seat: Seat) -> bool:
-        """Return whether a worker declares its target resources and the scheduler knows."""
-        worker = self.scheduler.workers.get(seat.info.address)
-        if worker is None or seat.is_declaring:
+    def is_settled(self, record: WorkerRecord) -> bool:
+        """Return whether a worker declares its target resources and the scheduler knows them."""
+        worker = self.scheduler.workers.get(record.info.address)
+        if worker is None or record.is_declaring:
             return False
-        return bool(worker.resources == seat.declared == self.target_resources(seat))
+        return bool(worker.resources == record.declared == self.target_resources(record))
 
-    def settle(self, seats: Iterable[Seat]) -> None:
-        """Have workers declare their target resources, until `settled` is True for them."""
-        for seat in seats:
-            # A running loop checks the seat again before it ends.
-            if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
-                seat.reconciler = asyncio.ensure_future(self._settle(seat, seat.info.address))
-                seat.reconciler.add_done_callback(partial(self._ended, seat))
+    def reconcile(self, records: Iterable[WorkerRecord]) -> None:
+        """Start the loops that make workers declare their target resources."""
+        for record in records:
+            # A running loop checks the record again before it ends.
+            if not record.is_absent and (
+                record.reconciliation is None or record.reconciliation.done()
+            ):
+                record.reconciliation = asyncio.ensure_future(
+                    self._reconcile(record, record.info.address)
+                )
+                record.reconciliation.add_done_callback(partial(self._on_reconciled, record))
 
-    def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
-        """Remove the seat of a worker that cannot declare resources, and leave if all is done."""
-        if not (task.cancelled() or seat.away) and (error := task.exception()):
-            logger.error("Worker %s cannot be assigned to a partition: %r", seat.info.name, error)
-            self.put(seat, None)
-            self._give_up(seat)  # the worker may lack this package; absent workers keep their seat
+    def _on_reconciled(self, record: WorkerRecord, task: asyncio.Task[None]) -> None:
+        """Remove the record of a worker that cannot declare resources.
+
+        This is the callback at the end of a reconciliation loop. The steward is removed if nothing
+        is left to do.
+        """
+        if not (task.cancelled() or record.is_absent) and (error := task.exception()):
+            logger.error("Worker %s cannot be assigned to a partition: %r", record.info.name, error)
+            self.set_partition(record, None)
+            self._remove_record(record)  # for example, poolpart is not installed on the worker
         self.remove_if_done()
 
-    async def _settle(self, seat: Seat, address: str) -> None:
-        """Have a worker declare its target resources, in as many steps as its tasks require."""
-        if seat.unplaced:
-            await self._ask_for_gpus(seat)
-            if seat.unplaced:
-                self._assign(seat)
+    async def _reconcile(self, record: WorkerRecord, address: str) -> None:
+        """Make a worker declare its target resources, in as many steps as its tasks require."""
+        if record.is_unassigned:
+            await self._ask_for_gpus(record)
+            if record.is_unassigned:
+                self._assign(record)
         requested_moves: set[Any] = set()  # tasks that the worker was asked to give up
-        while (worker := self.scheduler.workers.get(address)) and not self.settled(seat):
+        while (worker := self.scheduler.workers.get(address)) and not self.is_settled(record):
             try:
-                if not await self._step(seat, worker, requested_moves):
-                    await asyncio.sleep(LOOK_EVERY_S)
-            except OSError as error:  # the worker is leaving, or the connection was bad
+                if not await self._step(record, worker, requested_moves):
+                    await asyncio.sleep(CHECK_EVERY_S)
+            except OSError as error:  # the worker is leaving, or the connection failed
                 logger.info("The worker at %s does not respond: %s", address, error)
-                await asyncio.sleep(10 * LOOK_EVERY_S)
-        # `show` does not start the tasks that have waited for a worker with these resources.
+                await asyncio.sleep(10 * CHECK_EVERY_S)
+        # `set_visible_resources` does not start the tasks that wait for these resources.
         if worker:
-            wake(self.scheduler, worker)
+            send_waiting_tasks(self.scheduler, worker)
 
-    async def _step(self, seat: Seat, worker: Any, requested_moves: set[Any]) -> bool:
-        """Let a worker declare its target resources, or return False if its tasks must end first.
+    async def _step(self, record: WorkerRecord, worker: Any, requested_moves: set[Any]) -> bool:
+        """Request a worker to declare its target resources, and return whether it did.
 
-        The worker refuses while it runs a task that holds a resource to be removed, also a task
-        that the scheduler has forgotten.
+        The worker refuses while it runs a task that holds a resource to be removed, even if the
+        scheduler has already forgotten the task.
         """
-        target = self.target_resources(seat)
-        leaving = {name for name, slots in seat.declared.items() if slots and name not in target}
-        if leaving and not self._has_released(seat, worker, leaving, requested_moves):
+        target = self.target_resources(record)
+        leaving = {name for name, slots in record.declared.items() if slots and name not in target}
+        if leaving and not self._has_released(record, worker, leaving, requested_moves):
             return False
-        seat.is_declaring = True
+        record.is_declaring = True
         try:
-            accepted = await call(
+            accepted = await call_worker(
                 self.scheduler, worker.address, declare_on_worker, resources=target
             )
         finally:
-            seat.is_declaring = False
+            record.is_declaring = False
         if not accepted:
             return False
         if self.scheduler.workers.get(worker.address) is worker:
-            seat.declared = target
-            if self.target_resources(seat) == target:
-                self._show(seat, worker, target)
-                # Other members may have taken over tasks, whose slots Dask counts wrongly.
+            record.declared = target
+            if self.target_resources(record) == target:
+                self._set_visible_resources(record, worker, target)
+                # Dask miscounts the slots of tasks that were moved to other members.
                 for name in leaving:
                     for address in self.scheduler.resources.get(name, ()):
-                        recount(self.scheduler.workers[address])
+                        recount_used_resources(self.scheduler.workers[address])
         return True
 
     def _has_released(
-        self, seat: Seat, worker: Any, leaving: Collection[str], requested_moves: set[Any]
+        self, record: WorkerRecord, worker: Any, leaving: Collection[str], requested_moves: set[Any]
     ) -> bool:
-        """Move the tasks of partitions that a worker leaves, and return whether none is left.
+        """Move away the tasks of partitions that a worker leaves, and return whether none is left.
 
-        The worker gets no new tasks of these partitions. Tasks that run end on the worker, which
-        keeps the resource until then.
+        The worker receives no new tasks of these partitions. Tasks that are already running finish
+        on the worker, which keeps the resource until then.
         """
-        remaining = {name: slots for name, slots in seat.declared.items() if name not in leaving}
-        self._show(seat, worker, remaining)
-        hand_off(self.scheduler, worker, leaving, requested_moves)
-        return not held_by(self.scheduler, worker, leaving)
+        remaining = {name: slots for name, slots in record.declared.items() if name not in leaving}
+        self._set_visible_resources(record, worker, remaining)
+        hand_off_tasks(self.scheduler, worker, leaving, requested_moves)
+        return not keys_held_by(self.scheduler, worker, leaving)
 
-    def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
-        """Let the scheduler place tasks by the given resources of a worker only.
+    def _set_visible_resources(
+        self, record: WorkerRecord, worker: Any, resources: Resources
+    ) -> None:
+        """Make the scheduler place tasks on a worker only according to the given resources.
 
-        Also renew the group of workers that `choosing.py` compares, and the worker's fence.
+        This also invalidates the worker groups of `choosing.py` and updates the fence of the
+        worker.
         """
-        show(self.scheduler, worker, resources)
-        note_change(self.scheduler)
-        expect(self.scheduler, worker, seat.partition)
+        set_visible_resources(self.scheduler, worker, resources)
+        invalidate_groups(self.scheduler)
+        set_expected_partition(self.scheduler, worker, record.partition)
 
-    async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
+    async def wait_until_settled(
+        self, records: Collection[WorkerRecord], timeout_s: float
+    ) -> list[WorkerRecord]:
         """Wait until workers declare their target resources, and return the late workers.
 
-        Restarting workers are waited for; workers that have left for good are not.
+        This includes workers that are being restarted, but not workers that were removed.
         """
-        self.settle(seats)
+        self.reconcile(records)
         deadline = time.monotonic() + timeout_s
-        while late := [seat for seat in seats if not seat.removed and not self.settled(seat)]:
+        while late := [
+            record for record in records if not record.is_removed and not self.is_settled(record)
+        ]:
             if time.monotonic() >= deadline:
                 break
-            await asyncio.sleep(LOOK_EVERY_S)
+            await asyncio.sleep(CHECK_EVERY_S)
         return late
 
-    # -- the end -----------------------------------------------------------------------
+    # -- stopping ----------------------------------------------------------------------
 
     async def close(self) -> None:
-        """Stop with the scheduler."""
+        """Stop when the scheduler closes."""
         self._stop()
 
     def _stop(self) -> None:
-        """Cancel all timers and loops."""
-        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assigning]
-        for seat in self.seats.values():
-            scheduled += [seat.reconciler, seat.giving_up]
+        """Cancel all timers and reconciliation loops."""
+        scheduled: list[asyncio.TimerHandle | asyncio.Task[None] | None] = [self._assignment_timer]
+        for record in self.records.values():
+            scheduled += [record.reconciliation, record.removal_timer]
         for task in scheduled:
             if task is not None:
                 task.cancel()
 
     def remove_if_done(self) -> None:
-        """Leave the scheduler after the last partition, once all workers are restored."""
-        present = [seat for seat in self.seats.values() if not seat.away]
-        if not self.rules and not self.open_requests and all(map(self.settled, present)):
+        """Remove the plugin if there are no partitions and all workers are restored."""
+        present = [record for record in self.records.values() if not record.is_absent]
+        if not self.rules and not self.open_requests and all(map(self.is_settled, present)):
             self._stop()
             if self.scheduler.plugins.get(NAME) is self:
                 self.scheduler.remove_plugin(NAME)
 
 
-def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
-    """Return a key of a worker that outlives restarts: its name or else its nanny's address.
+def worker_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
+    """Return a key that identifies a worker across restarts: its name, or its nanny's address.
 
-    The default name is the address, which changes with a restart. Names are not converted: to
-    Dask 0, from `LocalCluster`, and "0", from a command line, are two workers.
+    The nanny's address is used for default names, which are derived from the worker's address and
+    change with a restart. Names are not converted to strings, because for Dask, the name 0 from
+    `LocalCluster` and the name "0" from a command line belong to different workers.
     """
     return name if name != address else nanny or address
 
 
-def names_of(seats: Iterable[Seat]) -> str:
-    """Return the names of workers, for messages."""
-    return ", ".join(sorted(seat.info.name for seat in seats))
+def join_names(records: Iterable[WorkerRecord]) -> str:
+    """Format the names of workers for a message."""
+    return ", ".join(sorted(record.info.name for record in records))
 
 
 def names_with_rule(scheduler: Any) -> frozenset[str]:
-    """Return the names of the partitions that a division has made."""
+    """Return the names of the partitions that were created by a division of the pool."""
     steward: Steward | None = scheduler.plugins.get(NAME)
     return frozenset() if steward is None else frozenset(steward.rules)
 
 
 def target_of(scheduler: Any, name: str) -> int | None:
-    """Return the number of workers that the rule of a partition asks for.
+    """Return the number of workers that the rule of a partition requests.
 
-    None if it has no rule, or its rule has no such number.
+    The result is None if the partition has no rule, or if its rule does not request a number.
     """
     steward: Steward | None = scheduler.plugins.get(NAME)
     rule = steward.rules.get(name) if steward is not None else None
@@ -452,8 +489,11 @@ def target_of(scheduler: Any, name: str) -> int | None:
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Yield the scheduler's steward, which leaves after the block if it has no partitions."""
-    require(DIVIDING)
+    """Yield the scheduler's steward, which is created for the block if necessary.
+
+    After the block, the steward is removed if it has no partitions.
+    """
+    require_feature(DIVIDING)
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:
         steward = Steward(scheduler)

@@ -1,4 +1,4 @@
-"""The context of a task: its worker's client, and whether the worker is leaving."""
+"""Context of the current task: the client of its worker, and errors if the worker is leaving."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ _one_at_a_time = threading.Lock()
 
 
 def own_client() -> Client:
-    """Return the client of this task's worker or, outside tasks, the current client.
+    """Return the client of the current task's worker or, outside of tasks, the current client.
 
-    `distributed.get_client` makes the worker's client on first use. That fails, with an
-    AssertionError without a message, if the scheduler broadcasts to all clients while it registers
-    the new one, for example that a worker has died. The unconnected client stays the default, and
-    every later task gets it. Besides, several tasks that ask at once may make a client each.
+    This function works around two problems of `distributed.get_client`, which creates the worker's
+    client when it is first called. If the scheduler sends a message to all clients while it
+    registers the new client, for example because a worker has died, the creation fails with an
+    AssertionError without a message, and later tasks receive the unconnected client. If several
+    tasks call it at the same time, each of them may create a client.
 
-    A coroutine in the worker's event loop must not wait for a thread that makes the client, which
-    needs the loop: both would wait for ever.
+    In an event loop, `get_client` is called directly. A coroutine in the worker's event loop must
+    not wait for a thread that creates the client, because the thread needs the event loop, which
+    would be a deadlock.
     """
     if in_event_loop():
         return get_client()
@@ -33,14 +35,14 @@ def own_client() -> Client:
             try:
                 return get_client()
             except AssertionError:
-                with suppress(ValueError):  # it was not made at all
+                with suppress(ValueError):  # no client was created
                     if (client := default_client()).status != "running":
                         client.close(timeout=_CLOSE_S)
         return get_client()
 
 
 def in_event_loop() -> bool:
-    """Whether this runs in an event loop, which must not block, and not in a thread."""
+    """Return whether the caller runs in an event loop, which it must not block."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:
@@ -51,34 +53,31 @@ def in_event_loop() -> bool:
 _LEAVING = (Status.closing, Status.closed, Status.failed)
 
 
-class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
-    """A long task has ended because its worker is leaving.
-
-    Submit the task again.
-    """
+class WorkerLeavingError(RuntimeError):
+    """Raised if a task has failed because its worker is leaving. Submit the task again."""
 
 
 @contextmanager
-def telling_departure() -> Iterator[None]:
-    """Raise `WorkerLeft` instead of any error while the worker is leaving.
+def translate_leaving_errors() -> Iterator[None]:
+    """Replace any error by `WorkerLeavingError` if the worker is leaving.
 
-    A worker that is retired or restarted closes its client under the tasks that still run. They
-    fail with CommClosedError, CancelledError, an AttributeError from within Dask and others,
-    sometimes early enough for the scheduler to record the error as theirs.
-
-    Use it as a decorator of the task, or around its body.
+    Use it as a decorator of a task, or as a context manager around its body. A worker that is
+    retired or restarted closes its client while tasks are still running. These tasks fail with
+    various errors, such as CommClosedError, CancelledError or an AttributeError inside Dask, and
+    sometimes early enough for the scheduler to attribute the error to the task.
 
     Raises
     ------
-    WorkerLeft
-        If the worker is leaving; otherwise, and outside of a worker, errors pass unchanged.
+    WorkerLeavingError
+        If an error occurs while the worker is leaving. In all other cases, including code outside
+        of workers, errors are not changed.
     """
     try:
         yield
     except (Exception, asyncio.CancelledError) as error:
         with suppress(ValueError):  # not in a task
             if get_worker().status in _LEAVING:
-                # Without the cause, which may not be picklable.
+                # The cause is omitted because it may not be picklable.
                 message = f"The worker has left the cluster ({type(error).__name__}: {error})"
-                raise WorkerLeft(message) from None
+                raise WorkerLeavingError(message) from None
         raise

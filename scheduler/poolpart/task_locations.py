@@ -1,4 +1,4 @@
-"""Current state of a partition on the scheduler: free slots, tasks and silent workers."""
+"""Snapshot of the slots, unresponsive workers and selected tasks of a partition."""
 
 from __future__ import annotations
 
@@ -9,62 +9,67 @@ from typing import Any
 from distributed import Client
 
 from .adapting import max_slots, queued_jobs_of
-from .workers import on_scheduler, silent_workers
+from .workers import run_on_scheduler, silent_workers
 
 
 @dataclass(frozen=True)
-class TaskPlace:
-    """One task on the scheduler."""
+class TaskLocation:
+    """State and workers of one task, as the scheduler knows them."""
 
-    state: str  # Dask's name of its state: waiting, no-worker, queued, processing, memory, erred, …
-    workers: tuple[str, ...]  # addresses of workers that run it, or have its result
-    deaths: int  # workers that died, unexpectedly, while the task was assigned to them
-    long_running: bool = False  # it runs and has seceded
-    started: bool = False  # a worker runs it, as of the worker's last heartbeat
+    state: str  # Dask's name, for example waiting, no-worker, queued, processing, memory or erred
+    workers: tuple[str, ...]  # addresses of the workers that run the task or hold its result
+    deaths: int  # number of workers that died unexpectedly while the task was assigned to them
+    long_running: bool = False  # whether the task is running and has seceded
+    started: bool = False  # whether the worker's last heartbeat listed the task as running
 
 
 @dataclass(frozen=True)
-class TaskLocations:
-    """Members of a partition, their slots, and tasks, at a moment.
+class PartitionSnapshot:
+    """Members, slots and requested tasks of a partition at one point in time.
 
-    Workers that take no tasks at the moment, because Dask has paused them for their memory or they
-    are leaving, and silent ones have neither `free` nor `slots`.
+    `free` and `slots` do not include workers that currently accept no tasks: workers that Dask has
+    paused because of their memory, workers that are leaving, and silent workers.
     """
 
     members: frozenset[str] = frozenset()  # addresses of all workers of the partition
-    # Members without a recent heartbeat: stopped, cut off or stuck. The scheduler itself considers
-    # a worker dead after its ``worker-ttl``, five minutes.
+    # Members without a recent heartbeat, because they are stopped, disconnected or stuck. The
+    # scheduler itself only considers a worker dead after ``worker-ttl``, which is five minutes.
     silent: frozenset[str] = frozenset()
-    # {address: slots that no task holds or waits for}; below 0 with more tasks than slots.
+    # {address: number of free slots}. The number is negative if there are more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
-    slots: int = 0  # free or not
-    most_slots: int = 0  # slots, with the workers that `Partition.adapt` may start
-    coming: int = 0  # jobs of such workers that wait in a queue, or start
-    tasks: dict[str, TaskPlace] = field(default_factory=dict)  # {requested key: its known task}
+    slots: int = 0  # total number of slots
+    max_slots: int = 0  # total number of slots once all adaptive jobs have started
+    queued_jobs: int = 0  # number of adaptive jobs that are queued or starting
+    tasks: dict[str, TaskLocation] = field(default_factory=dict)  # requested tasks that exist
 
-    def out_of_reach(self, key: str) -> bool:
-        """Return whether a task or its result is on silent workers only."""
+    def is_unreachable(self, key: str) -> bool:
+        """Return whether a task is assigned to, or has its result on, silent workers only."""
         task = self.tasks.get(key)
         return task is not None and bool(task.workers) and self.silent.issuperset(task.workers)
 
-    def runs_for_long(self, key: str) -> bool:
-        """Return whether a task runs and has seceded."""
+    def is_long_running(self, key: str) -> bool:
+        """Return whether a task is running and has seceded."""
         return key in self.tasks and self.tasks[key].long_running
 
 
-def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> TaskLocations:
-    """Ask the scheduler about the slots of a partition and about tasks.
+def take_snapshot(client: Client, partition: str, keys: Collection[str] = ()) -> PartitionSnapshot:
+    """Request the current slots of a partition, and the locations of the given tasks.
 
-    Dask places a task by a worker's total resources, not by the free ones, and prefers the
-    worker with the least work ahead; a worker whose only slot is held by a seceded task looks
-    idle. A second long-running task there waits as long as the first runs. So choose the
-    workers of long-running tasks yourself.
+    Programs that run several long-running tasks need this to select workers themselves. Dask places
+    a task according to the total resources of the workers, not the free ones, and prefers the
+    worker with the least pending work. A worker whose only slot is occupied by a seceded task
+    appears to be idle, and a second long-running task that is placed on it waits until the first
+    one has finished.
     """
-    locations: TaskLocations = on_scheduler(client, _look, partition=partition, keys=list(keys))
+    locations: PartitionSnapshot = run_on_scheduler(
+        client, _take_snapshot, partition=partition, keys=list(keys)
+    )
     return locations
 
 
-def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLocations:
+def _take_snapshot(
+    partition: str, keys: list[str], dask_scheduler: Any = None
+) -> PartitionSnapshot:
     workers = dask_scheduler.workers.values()
     members = [ws for ws in workers if ws.resources.get(partition)]
     addresses = frozenset(ws.address for ws in members)
@@ -72,27 +77,27 @@ def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLo
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
     tasks = dask_scheduler.tasks
     slots = sum(int(ws.resources[partition]) for ws in usable)
-    return TaskLocations(
+    return PartitionSnapshot(
         members=addresses,
         silent=silent,
         free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
         slots=slots,
-        most_slots=max(slots, max_slots(dask_scheduler, partition)),
-        coming=queued_jobs_of(dask_scheduler, partition),
+        max_slots=max(slots, max_slots(dask_scheduler, partition)),
+        queued_jobs=queued_jobs_of(dask_scheduler, partition),
         tasks={key: _task_place(tasks[key]) for key in keys if key in tasks},
     )
 
 
-def _task_place(task: Any) -> TaskPlace:
+def _task_place(task: Any) -> TaskLocation:
     worker = task.processing_on
     holders = task.who_has or ([worker] if worker else [])
     long_running = worker is not None and task in worker.long_running
     addresses = tuple(holder.address for holder in holders)
     started = worker is not None and task in worker.executing
-    return TaskPlace(task.state, addresses, task.suspicious, long_running, started)
+    return TaskLocation(task.state, addresses, task.suspicious, long_running, started)
 
 
 def _in_use(worker: Any, resource: str) -> float:
-    """Count the resources held on a worker: Dask's own count is wrong after stealing."""
+    """Return how much of a resource is in use, which Dask itself miscounts after work stealing."""
     held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
     return float(sum(held))

@@ -1,4 +1,4 @@
-"""Tasks of a partition one by one, as `Partition.tasks` returns them."""
+"""Table of the individual tasks of a partition, as returned by `Partition.tasks`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple, SupportsIndex, overload
 
 from .errors import PoolError
-from .html_table import html_paragraph, html_table, shown_seconds, text_table
+from .html_table import format_seconds, html_paragraph, html_table, text_table
 
-KEPT = 1_000  # tasks of a partition that have ended
-_SHOWN = 20  # rows of a table that is printed
+MAX_ENDED_TASKS = 1_000  # number of finished tasks that are kept per partition
+_SHOWN = 20  # number of rows that a printed table shows
 STATES = ("waiting", "queued", "running", "done", "failed")
 _ENDED = STATES.index("done")  # this and later states have ended
 _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "seconds", "error")
@@ -103,13 +103,12 @@ class TaskTable(tuple[TaskRow, ...]):
         return "\n".join(filter(None, (table, self._omission)))
 
     def _repr_html_(self) -> str:
-        """Return the table that notebooks show."""
         table = html_table("Tasks", _HEAD, [_cells(row) for row in self[:_SHOWN]])
         return table + (html_paragraph(self._omission) if self._omission else "")
 
     @property
     def _omission(self) -> str:
-        """What follows a table of the first tasks, or "" if these are all."""
+        """Note below a truncated table that counts all tasks by state, otherwise ""."""
         if len(self) <= _SHOWN:
             return ""
         counts = Counter(row.state for row in self)
@@ -136,8 +135,8 @@ class TaskTable(tuple[TaskRow, ...]):
 
 
 def _cells(row: TaskRow) -> tuple[str, ...]:
-    """Return the cells of a row, with times of the day in UTC."""
-    seconds = "" if row.seconds is None else shown_seconds(row.seconds)
+    """Return the cells of a row, with times of day in UTC."""
+    seconds = "" if row.seconds is None else format_seconds(row.seconds)
     times = [_time(row.queued), _time(row.started)]
     return (
         row.state,
@@ -155,6 +154,6 @@ def _time(moment: datetime | None) -> str:
     return "" if moment is None else f"{moment:%H:%M:%S}"
 
 
-def moment(seconds: float | None) -> datetime | None:
-    """Return a time in seconds since 1970 as a date in UTC."""
+def to_datetime(seconds: float | None) -> datetime | None:
+    """Convert seconds since 1970 to a datetime in UTC."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

@@ -1,4 +1,4 @@
-"""How long tasks wait for a partition that has lost all its workers."""
+"""Time limit for tasks that wait because their partition has lost all of its workers."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ import math
 import time
 
 from .errors import PoolError
-from .membership import Prospects
+from .membership import PartitionCapacity
 
 logger = logging.getLogger(__name__)
 
-WAIT_S = 300.0  # a machine may be restarted, or replaced, in this time
+WAIT_S = 300.0  # long enough to restart or replace a machine
 
 
 class WorkerWait:
-    """Wait of a map, or the like, for the workers of a partition.
+    """Timer for a map or `for_each` call whose partition has no workers.
 
     Parameters
     ----------
     partition
         Name of the partition.
     waiting
-        What waits, as the beginning of a sentence, such as "The map".
+        Subject of the messages, for example "The map".
     seconds
-        Longest wait while no worker is there, and none is expected; `math.inf` for ever.
+        Maximum time to wait while the partition has no workers and none are expected. `math.inf`
+        means no limit.
     """
 
     def __init__(self, partition: str, waiting: str, seconds: float) -> None:
@@ -33,16 +34,16 @@ class WorkerWait:
         self._seconds = seconds
         self._since: float | None = None  # time.monotonic()
 
-    def check(self, prospects: Prospects) -> None:
-        """Note the present state of the partition, and warn at the beginning of a wait.
+    def check(self, prospects: PartitionCapacity) -> None:
+        """Update the timer from the current state of the partition, and warn when a wait begins.
 
         Raises
         ------
         PoolError
-            If the tasks could never run, or the wait has been too long.
+            If the tasks can never run, or if the wait has exceeded its limit.
         """
-        if prospects.objection:
-            raise PoolError(prospects.objection)
+        if prospects.rejection:
+            raise PoolError(prospects.rejection)
         if prospects.has_workers:
             self._since = None
             return
@@ -63,15 +64,15 @@ class WorkerWait:
                 "a longer `empty_s`."
             )
 
-    def until_next_check(self, longest_s: float) -> float:
-        """Return after how many seconds to check again, at most `longest_s`."""
+    def seconds_until_check(self, longest_s: float) -> float:
+        """Return the time until the next check in seconds, at most `longest_s`."""
         if self._since is None:
             return longest_s
         return max(0.0, min(longest_s, self._since + self._seconds - time.monotonic()))
 
 
-def check_wait(seconds: object) -> None:
-    """Raise ValueError unless a value is a number of seconds for `WorkerWait`."""
+def check_wait_s(seconds: object) -> None:
+    """Raise ValueError unless the value of `empty_s` is a nonnegative number."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
         raise ValueError(
             f"Invalid value {seconds!r} for `empty_s`. Expected a number of seconds, for example "

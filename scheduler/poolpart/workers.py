@@ -1,4 +1,4 @@
-"""Descriptions of workers, and running functions on workers and scheduler."""
+"""Descriptions of workers, and functions that run code on the workers and the scheduler."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from distributed import Client
 from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
-from .internals.client import answer_of_scheduler, ask
-from .internals.worker import resources_here as resources_here  # records of tasks use it
+from .internals.client import await_scheduler, send_request
+from .internals.worker import declared_resources as declared_resources
 
-SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
-MISSED_BEATS = 3  # heartbeats that a worker may miss at least
-_REPR_S = 2.0  # longest wait of a `repr` for the scheduler
-_LOOK_S = 2.0  # between looks for silent workers
+SILENT_S = 20.0  # time without a heartbeat after which a worker is considered silent
+MISSED_BEATS = 3  # number of heartbeats that a worker must miss to be considered silent
+_REPR_S = 2.0  # maximum time that a `repr` waits for the scheduler
+_CHECK_S = 2.0  # interval between checks for silent workers
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class WorkerInfo:
         )
 
 
-def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
-    """Return a note on a worker whose slots of a partition differ from its threads, or ""."""
+def slots_note(name: str, workers: Iterable[WorkerInfo]) -> str:
+    """Return a note about the first worker whose slots differ from its threads, or ""."""
     for worker in workers:
         slots = worker.resources.get(name, 0)
         if not slots or slots == worker.nthreads:
@@ -85,27 +85,37 @@ def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
     return ""
 
 
-def on_scheduler(
+def run_on_scheduler(
     client: Client, function: Callable[..., Any], *, answer_s: float | None = None, **kwargs: Any
 ) -> Any:
     """Call `function(**kwargs, dask_scheduler=…)` in the scheduler's event loop.
 
-    `answer_s` is the longest wait for the answer in seconds, by default that of
-    `answer_of_scheduler`.
+    Parameters
+    ----------
+    client, function
+        Client of the scheduler, and the function to run there.
+    answer_s
+        Maximum time to wait for a response in seconds. By default, the limit of `await_scheduler`.
+    kwargs
+        Keyword arguments of the function.
+
+    Returns
+    -------
+    Any
+        Return value of the function.
 
     Raises
     ------
     PoolError
-        If the scheduler's environment lacks this package, or the client cannot be asked.
+        If poolpart is not installed in the scheduler's environment, or if the client is closed or
+        asynchronous.
     OSError
-        If the scheduler is gone, or does not answer in time.
+        If the connection to the scheduler is lost, or if it does not respond in time.
     """
     check_client(client)
 
     async def request() -> Any:
-        return await answer_of_scheduler(
-            client, client.run_on_scheduler(function, **kwargs), answer_s
-        )
+        return await await_scheduler(client, client.run_on_scheduler(function, **kwargs), answer_s)
 
     try:
         return client.sync(request)
@@ -116,27 +126,28 @@ def on_scheduler(
         ) from error
 
 
-def ask_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
-    """Call a function on the scheduler for a `repr`.
+def query_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
+    """Call a function on the scheduler for a `repr`, or return None if it is unavailable.
 
-    Returns None if there is no answer in 2 s, or if waiting for one would block an event loop.
+    The result is None if there is no response within 2 s, or if waiting would block an event loop.
     """
-    # A task that has not used its partition or pipe yet has no client.
+    # A partition or pipe that a task has received but not used yet has no client.
     if client is None or client.asynchronous or client.status != "running":
         return None
-    with suppress(RuntimeError):  # no event loop runs in this thread
+    with suppress(RuntimeError):  # this thread has no running event loop
         if asyncio.get_running_loop() is client.loop.asyncio_loop:
             return None
     try:
-        return on_scheduler(client, function, answer_s=_REPR_S, **kwargs)
+        return run_on_scheduler(client, function, answer_s=_REPR_S, **kwargs)
     except (PoolError, OSError):
         return None
 
 
 def check_client(client: Client) -> None:
-    """Raise PoolError if a client cannot be used.
+    """Raise PoolError if a client is closed or asynchronous.
 
-    Otherwise the result would be a coroutine that nobody awaits, or an AttributeError.
+    Without this check, callers would receive a coroutine that is never awaited, or an
+    AttributeError.
     """
     if client.asynchronous:
         raise PoolError(
@@ -149,51 +160,53 @@ def check_client(client: Client) -> None:
 
 
 def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
-    """Ask the scheduler for all its workers, by address.
+    """Request Dask's descriptions of all workers from the scheduler, by address.
 
     Raises
     ------
     PoolError
-        If the client is closed, or asynchronous.
+        If the client is closed or asynchronous.
     """
     check_client(client)
-    # `Client.scheduler_info(n_workers=-1)` asks too, but returns an attribute, into which the
-    # client puts an answer without workers every two seconds: on a busy machine a cluster of
-    # hundreds looks empty now and then.
-    identity = client.sync(ask, client, None, "identity", n_workers=-1)
+    # `Client.scheduler_info(n_workers=-1)` sends the same request but returns an attribute, which
+    # the client overwrites every two seconds with a response without workers. On a busy machine, a
+    # cluster with hundreds of workers sometimes appeared to be empty.
+    identity = client.sync(send_request, client, None, "identity", n_workers=-1)
     workers: dict[str, dict[str, Any]] = identity["workers"]
     return workers
 
 
 def all_workers(client: Client) -> list[WorkerInfo]:
-    """Ask the scheduler for all its workers, without their GPUs."""
+    """Request descriptions of all workers from the scheduler, without their GPUs."""
     return [WorkerInfo.from_identity(a, i) for a, i in worker_identities(client).items()]
 
 
-def ask_workers(
-    client: Client, question: Callable[..., Any], addresses: Sequence[str]
+def run_on_workers(
+    client: Client, function: Callable[..., Any], addresses: Sequence[str]
 ) -> dict[str, Any]:
-    """Run a function on workers, outside their tasks, by `Client.run`.
+    """Run a function on workers, outside of tasks, and return the results by address.
 
-    Returns, by address, the result, or the exception raised there. Workers that died before they
-    answered, and silent ones, are left out.
+    If the function raises an exception on a worker, the exception takes the place of the result.
+    Silent workers, and workers that die before they respond, are omitted.
     """
 
     async def run() -> dict[str, Any]:
         silent: set[str] = set()
         remaining = list(addresses)
-        while remaining:  # an empty list would mean all workers to Client.run
-            request = client.run(question, workers=remaining, on_error="return")
+        while remaining:  # Client.run would interpret an empty list as all workers
+            request = client.run(function, workers=remaining, on_error="return")
             answers = asyncio.ensure_future(request)
             try:
                 while silent.isdisjoint(remaining):
-                    finished, _ = await asyncio.wait([answers], timeout=_LOOK_S)
+                    finished, _ = await asyncio.wait([answers], timeout=_CHECK_S)
                     if finished:
                         return dict(answers.result())
-                    present = (await ask(client, None, "identity", n_workers=-1))["workers"]
+                    present = (await send_request(client, None, "identity", n_workers=-1))[
+                        "workers"
+                    ]
                     silent = silent_workers({a: w["last_seen"] for a, w in present.items()})
             finally:
-                answers.cancel()  # also the answers of the workers that are not silent
+                answers.cancel()  # if a worker is silent, the remaining workers are asked again
             remaining = [address for address in remaining if address not in silent]
         return {}
 
@@ -201,7 +214,7 @@ def ask_workers(
     if not any(isinstance(answer, OSError) for answer in answers.values()):
         return answers
     present = worker_identities(client)
-    # A worker that is still present may have raised an OSError itself.
+    # If a worker is still present, the function may have raised an OSError itself.
     lost = {a: CommClosedError if a in present else OSError for a in answers}
     return {a: answer for a, answer in answers.items() if not isinstance(answer, lost[a])}
 
@@ -209,10 +222,11 @@ def ask_workers(
 def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
     """Return the addresses of workers without a recent heartbeat.
 
-    `last_seen` is {address: time of the last heartbeat, seconds}. Times are compared with the
-    latest heartbeat: if all workers have been silent, the scheduler itself was stopped or busy.
+    `last_seen` contains the time of the last heartbeat of each worker in seconds, by address. The
+    times are compared with the latest heartbeat of all workers, because if all workers are silent,
+    the scheduler itself was stopped or busy.
     """
     latest = max(last_seen.values(), default=0.0)
-    # Dask's interval, which is long in large clusters.
+    # Dask's heartbeat interval increases with the size of the cluster.
     patience_s = max(SILENT_S, MISSED_BEATS * (1 + len(last_seen) / 100))
     return {address for address, heartbeat in last_seen.items() if latest - heartbeat > patience_s}

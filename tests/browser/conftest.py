@@ -26,7 +26,7 @@ from lidarpool.showing.pages.downloads import downloads
 from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.live_page import LivePage, live_page
 from lidarview.viewer.server import page_server
-from lidarview.viewer.sharing import page_of
+from lidarview.viewer.sharing import render_page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Pictures are drawn by the processor, and nothing is asked of the network on its own account.
@@ -244,7 +244,7 @@ def own_pages(tmp_path_factory):
     """Serve one page of each kind, {name: address}: of a result, of jobs, live, and exported."""
     folder = tmp_path_factory.mktemp("pages")
     view = replace(spiral_view(spiral(folder / "cloud.ply", WET)), note="A note of its own.")
-    (folder / "page.html").write_bytes(page_of(view))
+    (folder / "page.html").write_bytes(render_page(view))
     scene = the_scene()
     write_set(folder / "set", "kitti", scene, the_sweeps(scene))
     view.downloads = downloads()

@@ -20,7 +20,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.result_views import open_results
 from lidarview.viewer.server import page_server
-from lidarview.viewer.sharing import page_of
+from lidarview.viewer.sharing import render_page
 from lidarview.viewer.view import View
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -711,7 +711,7 @@ def test_actors_deform_with_the_time(view, new_tab, tmp_path):
     scene = replace(view.pictured.scene, actors=actors)
     cloud = CloudFile(spiral(tmp_path / "objects.ply", OBJECT))
     view = replace(view, points=cloud, pictured=replace(view.pictured, scene=scene))
-    (tmp_path / "page.html").write_bytes(page_of(view))
+    (tmp_path / "page.html").write_bytes(render_page(view))
     with page_server(view.answer, port=0) as page:
         for url in (page.url, (tmp_path / "page.html").as_uri()):
             tab = opened(new_tab, SimpleNamespace(url=url))
@@ -770,7 +770,7 @@ def test_no_page_of_another_server_frames_it_and_it_frames_no_other(served, fore
 
 def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_path):
     path = tmp_path / "page.html"
-    path.write_bytes(page_of(view))
+    path.write_bytes(render_page(view))
     file = SimpleNamespace(url=path.as_uri())
     tab = opened(new_tab, file)
     tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)

@@ -446,7 +446,7 @@ def test_a_function_makes_jobs():
         (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
         (
             lambda number, rng: job(keep_every=0),
-            "job 1: keep_every must be from 1 to 1000000, but is 0",
+            "job 1: keep_every must be a whole number from 1 to 1000000, but is 0",
         ),
         (
             lambda number, rng: job(*[3] * number),

@@ -16,13 +16,13 @@ from lidarpool.columns.parts import pack
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim.simulator.rig import Rig
-from poolpart.task_context import WorkerLeft
+from poolpart.task_context import WorkerLeavingError
 
 
 def test_a_worker_that_leaves_is_not_a_failure_of_its_scans():
     """The driver casts those elsewhere, and would end the run at any other error."""
-    with pytest.raises(WorkerLeft), naming_scans(3, 5):
-        raise WorkerLeft("the worker has left")
+    with pytest.raises(WorkerLeavingError), naming_scans(3, 5):
+        raise WorkerLeavingError("the worker has left")
 
 
 def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):

@@ -23,9 +23,9 @@ from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
-from lidarscenes.procedural.floor import room_at
+from lidarscenes.procedural.floor import floor_and_ceiling
 from lidarscenes.procedural.plants import SPECIES, tree
-from lidarscenes.procedural.surroundings import Surroundings, in_the_way
+from lidarscenes.procedural.surroundings import PlacementChecker, is_obstructed
 from lidarscenes.procedural.terrain import terrain
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.transform import Transform
@@ -87,7 +87,7 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     # No pose sees the underside.
     assert ((high - low)[:2] > 0.9 * sides[:2]).all()
     assert high[2] > scene.bounds[1, 2] - 0.1 * sides[2]
-    assert not Surroundings(scene).views(poses).back.any()
+    assert not PlacementChecker(scene).cast_around(poses).back.any()
 
 
 LONG = creation.cylinder(0.01, 6.0)
@@ -197,11 +197,11 @@ def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
         placed = place_sensor(scene, GRID)
         at = np.array([pose.position for pose in placed.poses]) - scene.origin
         assert not placed.surrounds_object and not placed.note
-        assert not in_the_way(scene, at)
+        assert not is_obstructed(scene, at)
         assert 1.9 < np.linalg.norm(at[0, :2] + scene.origin[:2] - far) < 8.1
         assert at[:, 2] + scene.origin[2] - far == pytest.approx([1, 2, 3])
     middle = np.array([[0, 0, 1.0]]) + far - scene.origin
-    assert in_the_way(scene, middle)
+    assert is_obstructed(scene, middle)
 
 
 def test_a_narrow_sensor_is_farther_away_and_tilted():
@@ -233,10 +233,10 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
 @pytest.mark.parametrize("far", [0.2, 5.0])
 def test_a_card_seen_from_behind_is_no_body(far):
     fence = Scene.from_meshes([wall("Fence", 0, (-5, 5), (0, 2))])
-    surroundings = Surroundings(fence)
-    views = surroundings.views([[-far, 0, 1]])
+    surroundings = PlacementChecker(fence)
+    views = surroundings.cast_around([[-far, 0, 1]])
     assert views.back[views.hit].all() and views.hit.any()
-    assert not surroundings.in_a_body([-far, 0, 1])
+    assert not surroundings.is_inside_body([-far, 0, 1])
 
 
 @pytest.mark.parametrize(
@@ -318,7 +318,7 @@ def boxes(*sizes_and_heights):
 
 def test_on_the_ground_of_a_terrain():
     scene = terrain(2000, 3, 100)
-    floor = room_at(scene, 0, 0)[0]
+    floor = floor_and_ceiling(scene, 0, 0)[0]
     assert floor > scene.bounds[0, 2] + 0.1
     nearest = np.hypot(*scene.vertices[:, :2].T).argmin()
     assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
@@ -331,22 +331,22 @@ def test_on_the_ground_of_a_terrain():
 
 def test_on_a_slab_and_not_on_the_roof():
     floor_and_roof = boxes(((8, 6, 0.2), -0.1), ((8, 6, 0.2), 3))
-    assert room_at(floor_and_roof, 0, 0)[0] == pytest.approx(0)
+    assert floor_and_ceiling(floor_and_roof, 0, 0)[0] == pytest.approx(0)
 
 
 def test_the_ceiling_is_above_the_furniture():
     room = (((8, 6, 0.2), -0.1), ((1, 1, 0.1), 0.75), ((8, 6, 0.2), 2.6), ((8, 6, 0.2), 5.6))
-    assert room_at(boxes(*room), 0, 0) == pytest.approx((0, 2.5))
-    assert room_at(boxes(*room[:2]), 0, 0) == (pytest.approx(0), np.inf)
+    assert floor_and_ceiling(boxes(*room), 0, 0) == pytest.approx((0, 2.5))
+    assert floor_and_ceiling(boxes(*room[:2]), 0, 0) == (pytest.approx(0), np.inf)
 
 
 def test_within_a_hall_that_is_one_box():
-    assert room_at(boxes(((8, 6, 3), 1.5)), 0, 0)[0] == 0
+    assert floor_and_ceiling(boxes(((8, 6, 3), 1.5)), 0, 0)[0] == 0
 
 
 def test_in_world_coordinates():
     shift = np.array([500_000.0, 4_000_000.0, 20_000.0])
     ground = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 3.6], [-9, 9, 3.6]])
     scene = Scene.from_meshes([quad("g", *(ground + shift))])
-    assert room_at(scene, 500_001, 4_000_000)[0] == pytest.approx(20_001.8)
-    assert room_at(scene, 500_001, 4_000_005)[0] == pytest.approx(20_002.8)
+    assert floor_and_ceiling(scene, 500_001, 4_000_000)[0] == pytest.approx(20_001.8)
+    assert floor_and_ceiling(scene, 500_001, 4_000_005)[0] == pytest.approx(20_002.8)

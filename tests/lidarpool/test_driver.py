@@ -35,7 +35,7 @@ from lidarpool.run.pipeline.stage_messages import (
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.store.database import RunDatabase
 from lidarsim.base.storage import Storage
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 SCANS = 60
 SURVEY = Survey(Sensor.grid(rays_per_revolution=SCANS, layers=1, step_deg=6), [(0, 0, 1)], SCANS)
@@ -68,7 +68,7 @@ class Workers:
     @property
     def seen(self):
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
-        return TaskLocations(frozenset(self.slots), frozenset(self.silent), free)
+        return PartitionSnapshot(frozenset(self.slots), frozenset(self.silent), free)
 
     def refresh(self):
         return self.seen

@@ -36,7 +36,7 @@ from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.viewer.sharing import page_of
+from lidarview.viewer.sharing import render_page
 from lidarview.viewer.view import IN_SENSOR_AXES, View
 
 FORMATS = (
@@ -180,14 +180,14 @@ def test_more_points_of_a_large_cloud_are_shown_while_it_is_read(exported, monke
     monkeypatch.setattr(las, "CHUNK_POINTS", -(-len(cloud) // 2))
     view = growing_view(folder / "cloud.las")
     seen = []
-    show = View.show
+    replace_points = View.replace_points
 
     def record(self, points, **options):
-        show(self, points, **options)
+        replace_points(self, points, **options)
         growth, _ = view.answer("growth", {}, bool)
         seen.append((growth["share"], len(points)))
 
-    monkeypatch.setattr(View, "show", record)
+    monkeypatch.setattr(View, "replace_points", record)
     view.answer("points", {"color": "z", "most": "100000"}, bool)
     assert growth_of(view)["version"] > 1
     half = -(-len(cloud) // 2)
@@ -273,7 +273,7 @@ actors: [{name: Van, box: [1, 1, 1], at: [3, 1, 0.5]}]
     assert len(view.sweeps) > 10, "all sweeps can be played"
     mesh = open_view(tmp_path / "wall.obj")
     assert state_of(mesh)["preview"] and len(mesh.pictured.scene.faces) == 2
-    assert len(page_of(mesh)) > 10_000  # in all colors, also of hits, of which there are none
+    assert len(render_page(mesh)) > 10_000  # in all colors, also of hits, of which there are none
     (tmp_path / "campaign.yaml").write_text(
         """base: drive.yaml
 count: 3

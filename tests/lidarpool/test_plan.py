@@ -185,9 +185,9 @@ BAD = {
     "no way to go": ({"start": (1, 2), "target": (1, 2)}, "Move one of them"),
     "start not finite": (
         {"start": (np.nan, 0)},
-        "start\\[0\\] must be a finite number, but is nan",
+        "start must be a list of 2 finite numbers, but is .nan, 0",
     ),
-    "target in space": ({"target": (0, 0, 0)}, "target must have at most 2 items"),
+    "target in space": ({"target": (0, 0, 0)}, "target must be a list of 2 finite numbers"),
     "centers not finite": ({"centers": [(0, np.inf)], "radii": 1}, "centers` is .*inf"),
     "centers in space": ({"centers": [(0, 0, 0)], "radii": 1}, r"centers` is .*\(m, 2\)"),
     "radii too many": ({"centers": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
@@ -196,7 +196,7 @@ BAD = {
         {"centers": [(0, 0)], "radii": np.inf},
         "radii` is inf; it must be positive fin",
     ),
-    "no trials": ({"trials": 0}, "trials must be from 1 to"),
+    "no trials": ({"trials": 0}, "trials must be a whole number from 1 to"),
 }
 
 

@@ -19,7 +19,7 @@ from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
-from lidarscenes.procedural.paint import painted
+from lidarscenes.procedural.paint import paint_scene
 from lidarscenes.writers.scene_file import write_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -282,7 +282,7 @@ def with_city(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
     for path in EXAMPLES.iterdir():
         (folder / path.name).symlink_to(path)
-    write_scene(folder / "city.glb", painted(city(100_000)))
+    write_scene(folder / "city.glb", paint_scene(city(100_000)))
     return folder
 
 

@@ -25,7 +25,7 @@ from lidarpool.run.pipeline.policies import (
 from lidarpool.run.pipeline.stage_names import INTERSECT
 from lidarpool.run.pipeline.task_book import MAX_MISPLACED, MAX_RECORDS, StageTotals, TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
-from poolpart.task_locations import TaskLocations, TaskPlace
+from poolpart.task_locations import PartitionSnapshot, TaskLocation
 
 A = "tcp://a:1"
 B = "tcp://b:1"
@@ -157,11 +157,11 @@ def test_a_suspect_is_collected_alone():
 
 # -- again ---------------------------------------------------------------------------------------
 
-HERE = TaskLocations(frozenset({A, B}), frozenset(), {A: 1, B: 1})
+HERE = PartitionSnapshot(frozenset({A, B}), frozenset(), {A: 1, B: 1})
 
 
 def test_a_silent_worker_is_left_if_there_is_another():
-    seen = TaskLocations(frozenset({A, B}), frozenset({A}), {B: 1})
+    seen = PartitionSnapshot(frozenset({A, B}), frozenset({A}), {B: 1})
     for place in (BatchState.CASTING, BatchState.CAST):
         assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
         assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
@@ -170,15 +170,15 @@ def test_a_silent_worker_is_left_if_there_is_another():
 @pytest.mark.parametrize(
     ("task", "reason"),
     [
-        (TaskPlace("no-worker", (), 0), Outcome.REFUSED),
-        (TaskPlace("processing", (A,), 0), Outcome.REFUSED),
-        (TaskPlace("processing", (A,), 0, started=True), None),
-        (TaskPlace("memory", (A,), 0), None),
+        (TaskLocation("no-worker", (), 0), Outcome.REFUSED),
+        (TaskLocation("processing", (A,), 0), Outcome.REFUSED),
+        (TaskLocation("processing", (A,), 0, started=True), None),
+        (TaskLocation("memory", (A,), 0), None),
         (None, None),
     ],
 )
 def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
-    seen = TaskLocations(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
+    seen = PartitionSnapshot(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
     assert loss(casting(0, A), seen, 1, 0.0, LATE_S) is reason
 
 

@@ -113,7 +113,7 @@ def test_faults_are_one_line(hall):
     assert "iframe" not in view._repr_html_()
     with pytest.raises(LidarError, match=r"different names, such as .*are '', ''"):
         show([scanner, scanner])
-    with pytest.raises(LidarError, match=r"scanner must be a Scanner or a list, but is 'vlp16'"):
+    with pytest.raises(LidarError, match=r"scanner must be a list, but is 'vlp16'"):
         show("vlp16")
 
 

@@ -157,10 +157,10 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
             r"no completed job 4 in split 'train' \(3 jobs: 0 to 2\)",
         ),
         ({"jobs": ["4"]}, r"no completed job '4' \(5 jobs: 00 to 05\)"),
-        ({"jobs": "04"}, "jobs must be a list of whole numbers or None, but is '04'"),
-        ({"shuffle": True}, "shuffle must be a whole number or None, but is True"),
-        ({"shuffle": -1}, "shuffle must be at least 0 or None, but is -1"),
-        ({"sensors": "front"}, "sensors must be a list of text or None, but is 'front'"),
+        ({"jobs": "04"}, "jobs must be a list, but is '04'"),
+        ({"shuffle": True}, "shuffle must be a whole number at least 0, but is True"),
+        ({"shuffle": -1}, "shuffle must be a whole number at least 0, but is -1"),
+        ({"sensors": "front"}, "sensors must be a list, but is 'front'"),
     ):
         with pytest.raises(LidarError, match=words) as told:
             lidarpool.sweeps(place, **options)

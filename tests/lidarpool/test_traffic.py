@@ -30,7 +30,7 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base import allowance
-from lidarsim.simulator.casting.surfaces import Surfaces
+from lidarsim.simulator.casting.surfaces import SceneSurfaces
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
@@ -423,7 +423,7 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
     job = prepare(read).job
     names = job.scene.object_names
     assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
-    table = Surfaces(job.scene, tuple(job.survey.materials)).materials
+    table = SceneSurfaces(job.scene, tuple(job.survey.materials)).materials
     assert table.semantic_class.tolist() == [2, 2, 10, 2, 10]
     np.testing.assert_allclose(table.reflectance, [0.3, 0.3, 0.1, 0.3, 0.3])
 

@@ -7,7 +7,7 @@ import pytest
 from lidarpool import LidarError
 from lidarpool.run.cluster import watch
 from lidarpool.run.cluster.watch import Watch
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def look(monkeypatch):
             for number, (name, status) in enumerate(workers)
         }
         monkeypatch.setattr(watch, "worker_identities", lambda client: identities)
-        there = TaskLocations(coming=look.coming)
-        monkeypatch.setattr(watch, "look_for_tasks", lambda client, name: there)
+        there = PartitionSnapshot(queued_jobs=look.coming)
+        monkeypatch.setattr(watch, "take_snapshot", lambda client, name: there)
         clock.now = seconds
         watching.look()
 

@@ -15,7 +15,7 @@ from lidarpool.cli.scenario_commands import import_
 from lidarpool.scenario.point_scene import surfels
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarscenes.helios import Imported, import_survey
+from lidarscenes.helios import ImportedSurvey, import_survey
 from lidarsim.media.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster
@@ -48,14 +48,14 @@ def legs(settings, *places, platform='movePerSec_m="10"'):
     )
 
 
-def import_checked(survey: Path, out: Path) -> Imported:
+def import_checked(survey: Path, out: Path) -> ImportedSurvey:
     """Import a survey as the command does."""
     return import_survey(
         survey, out, check=lambda file: prepare(Scenario.load(file)), surfels=surfels
     )
 
 
-def scenario_of(imported: Imported) -> Scenario:
+def scenario_of(imported: ImportedSurvey) -> Scenario:
     return Scenario.load(imported.path)
 
 
@@ -286,7 +286,7 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     inside = '<FWFSettings beamSampleQuality="2"/><detectorSettings accuracy_m="0"/>' + inside
     made, scene, of = imported(device, inside, around=template)
     assert scenario_of(made).returns.subrays == 7 and scenario_of(made).noise.range_m == 0
-    assert made.left_out == ["maxNOR=3 of S/1 (all returns of a pulse are kept)"]
+    assert made.unsupported == ["maxNOR=3 of S/1 (all returns of a pulse are kept)"]
     (batch,) = Rig(scene, of, "numpy").cast(0, 3)
     columns = {column.name: column.make(batch) for column in of.stored_columns}
     assert np.ptp(columns["z"]) <= 1 and len(columns["z"]) == 300
@@ -311,7 +311,7 @@ def test_waveform_settings_become_those_of_returns(imported):
         "peaks",
         0.6,
     )
-    assert made.left_out == ["maxFullwaveRange_ns (waveforms are as long as their echoes)"]
+    assert made.unsupported == ["maxFullwaveRange_ns (waveforms are as long as their echoes)"]
     assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
     assert of.visibility_km == pytest.approx(10 * np.log(20) / 3.91)
     nm = of.carried[0].sensor.optics.wavelength_nm
@@ -388,7 +388,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
     assert [m.reflectance for m in scenario_of(made).materials] == [0.3, None] * known
-    assert ("the spectrum 'loam', which is missing" in " ".join(made.left_out)) != known
+    assert ("the spectrum 'loam', which is missing" in " ".join(made.unsupported)) != known
 
 
 def test_a_trajectory_of_its_own_is_followed(imported):
@@ -520,7 +520,7 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
     table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     assert table.reflectance.tolist() == [0.3, 0.5]
-    assert made.left_out[-2:] == [
+    assert made.unsupported[-2:] == [
         "ladlut in part 1 (leaf angles are spherical)",
         "part 2, detailedvoxels of parts/crown.vox with intersectionMode scaled (skipped)",
     ]
@@ -544,7 +544,7 @@ def test_points_become_surfels_a_cell_of_voxel_size(survey, tmp_path, separator,
     made = import_checked(path, tmp_path / "out")
     assert {p.name for p in made.path.parent.glob("*.glb")} == {"scan-1.glb"}
     scene = prepare(scenario_of(made)).scene
-    assert scene.names == ("ground", "scan") and not made.left_out
+    assert scene.names == ("ground", "scan") and not made.unsupported
     low, high = scene.object_bounds[1] + scene.origin
     assert np.allclose([low, high], [[10, 20, 2], [14, 23, 6]], atol=0.25)
     here = np.array([[12, 21.5, 4]] * 2) - scene.origin
@@ -590,7 +590,7 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
 </part></scene>"""
     inside = legs('pulseFreq_hz="1000"', (115, 15), (120, 15), platform='onGround="true"')
     made, built, of = imported(LASER, inside, scene)
-    assert not made.left_out and built.names == ("hill",)
+    assert not made.unsupported and built.names == ("hill",)
     bounds = built.object_bounds[0] + built.origin
     assert np.allclose(bounds, [[105, 5, 8], [125, 25, 12]])  # middles of the pixels
     assert built.triangles == 6  # of cells whose corners all have heights

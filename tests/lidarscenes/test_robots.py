@@ -17,7 +17,7 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import Mounted, box
-from lidarsim.base.vectors import into_axes
+from lidarsim.base.vectors import rotate_into_frames
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.simulator.rig import Rig
 
@@ -476,7 +476,7 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
         # Where the sensor was when the ray was fired, with poses made here.
         place, rotation = DRIVE.poses(0, batch.time.astype(np.float64))
         starts = sensor.beams.origin[batch.channel] @ mount.rotation.T + mount.position
-        origins = place + into_axes(starts, rotation.transpose(0, 2, 1))
+        origins = place + rotate_into_frames(starts, rotation.transpose(0, 2, 1))
         ranges = np.linalg.norm(batch.positions - origins, axis=1)
         assert np.allclose(ranges, batch.range, atol=2e-5)  # straight between firings
         for number, actor in enumerate(actors, 1):

@@ -369,13 +369,13 @@ def test_returns_go_before_what_the_sensor_states():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Returns(divergence_mrad=[1, 2, 3]), "or two such"),
-        (lambda: Returns(divergence_mrad=[1, -2]), "must be from 0 to 1000"),
+        (lambda: Returns(divergence_mrad=[1, 2, 3]), "or a list of 2 numbers from 0 to 1000"),
+        (lambda: Returns(divergence_mrad=[1, -2]), "must be a number from 0 to 1000"),
         (lambda: Optics(divergence_mrad="wide"), "divergence_mrad must .* but is 'wide'"),
         (lambda: Returns(beam_profile="round"), "must be 'even', 'gaussian' or None"),
         (
             lambda: Optics(exit_diameter_m=-0.1),
-            "exit_diameter_m must be from 0 to 10.* but is -0.1",
+            "exit_diameter_m must be a number from 0 to 10.* but is -0.1",
         ),
     ],
 )

@@ -17,7 +17,7 @@ def test_a_file_that_does_not_exist(load, name, tmp_path):
 
 def test_an_argument_that_does_not_fit():
     with pytest.raises(
-        ValueError, match="position must be a list of numbers, but is 'a'"
+        ValueError, match="position must be a list of 3 finite numbers, but is 'a'"
     ) as raised:
         Pose("a")
     assert isinstance(raised.value, LidarError)

@@ -468,7 +468,7 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         ),
         ({"reflectance": "texture", "transparent": "pass"}, "set reflectance to a number"),
         ({"scale": 2.0}, "requires reflectance: texture"),
-        ({"reflectance": "textures"}, "must be from 0 to 1, or texture"),
+        ({"reflectance": "textures"}, "must be a number from 0 to 1, 'texture' or None"),
     ):
         with pytest.raises(LidarError, match=why):
             Material("*", **arguments)

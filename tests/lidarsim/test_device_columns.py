@@ -162,7 +162,9 @@ def test_columns_after_instances_have_moved(scene, scenes, backend):
     for yaw in (40, 80):
         pose = Pose((1.0, 2.0, 0.1), yaw)
         positions = np.array([pose.position])
-        rigs = [rig.moved(owners, positions, pose.rotation_matrix[None]) for rig in rigs]
+        rigs = [
+            rig.with_moved_instances(owners, positions, pose.rotation_matrix[None]) for rig in rigs
+        ]
         got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
         assert got == want
     assert isinstance(next(rigs[0].cast(0, 1)), DevicePoints)

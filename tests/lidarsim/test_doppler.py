@@ -28,7 +28,7 @@ from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
 from lidarsim.simulator.steps.particles import AIR
-from lidarsim.simulator.steps.separation import separated
+from lidarsim.simulator.steps.separation import separate_hits
 
 # of the train
 SPEED = 25.0
@@ -257,7 +257,7 @@ def test_drops_in_an_open_sky_have_a_velocity():
     air = air._replace(cause=np.full(5, AIR, np.uint8))
     none = np.zeros(0)
     hits = PulseReturns(np.zeros(0, int), none, np.zeros(0, np.int32), none, velocity=none)
-    assert separated(hits, 0.5, air=air).velocity.tolist() == [-2.0] * 5
+    assert separate_hits(hits, 0.5, air=air).velocity.tolist() == [-2.0] * 5
 
 
 def test_false_alarms_have_no_velocity():

@@ -46,7 +46,7 @@ from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.angle_noise import ACROSS
 from lidarsim.simulator.steps.range_noise import RANGE
-from lidarsim.simulator.steps.separation import chosen, separated
+from lidarsim.simulator.steps.separation import reported_mask, separate_hits
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -146,19 +146,19 @@ def test_modes(mode):
         np.arange(5, dtype=np.int32),
         np.array([1.0, 1.0, 2.0, 4.0, 3.0]),
     )
-    returns = separated(hits, 0.5)
-    found = returns.take(chosen(returns, mode))
+    returns = separate_hits(hits, 0.5)
+    found = returns.take(reported_mask(returns, mode))
     assert found.ray.tolist() == [1] + [4] * len(MODES[mode])
     assert found.distance.tolist() == [2.0, *MODES[mode]]
     # Where the strongest is the last, the next strongest is the other one.
-    swapped = separated(hits._replace(energy=np.array([1.0, 9.0, 2.0, 4.0, 3.0])), 0.5)
-    dual = swapped.take(chosen(swapped, "dual"))
+    swapped = separate_hits(hits._replace(energy=np.array([1.0, 9.0, 2.0, 4.0, 3.0])), 0.5)
+    dual = swapped.take(reported_mask(swapped, "dual"))
     assert dual.distance.tolist() == [2.0, 7.0, 9.0]
 
 
 def test_a_surface_that_continues_takes_hits_between_its_hits():
     """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
-    from lidarsim.simulator.steps.pulse_loops import Neighbors
+    from lidarsim.simulator.steps.pulse_loops import SubrayNeighbors
     from lidarsim.simulator.steps.random_loops import RandomKeys
     from lidarsim.simulator.steps.separation_loops import (
         ALL,
@@ -181,7 +181,7 @@ def test_a_surface_that_continues_takes_hits_between_its_hits():
         air=SubrayHits(
             np.zeros(1, np.int64), np.array([8.0]), np.array([0.4]), np.zeros(0), np.zeros(0, bool)
         ),
-        neighbors=Neighbors(4, pairs, normals.T.copy(), directions.T.copy()),
+        neighbors=SubrayNeighbors(4, pairs, normals.T.copy(), directions.T.copy()),
         receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
         keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
         output=found,
@@ -376,7 +376,7 @@ def test_one_subray_without_noise_is_the_plain_ray():
         (lambda: Material("*", float("nan")), "reflectance must .* but is nan"),
         (lambda: Material([]), "objects must .* but is"),
         (lambda: Returns(subrays=8), "must be 1, 7, 19, 37"),
-        (lambda: Noise(dropout=2), "dropout must be from 0 to 1, but is 2"),
+        (lambda: Noise(dropout=2), "dropout must be a number from 0 to 1, but is 2"),
         (
             lambda: Survey(poses=[(0, 0, 1)], returns=Returns(subrays=7)),
             "beam divergence of the sensor is unknown",

@@ -130,7 +130,7 @@ def test_ghosts_of_textures_take_what_the_colors_leave():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"specular_reflectance": 1.5}, "0 to 1, or fresnel"),
+        ({"specular_reflectance": 1.5}, "0 to 1, 'fresnel' or None"),
         (
             {"specular_reflectance": "fresnel"},
             ("must be fresnel with transparent: pass, and a number otherwise"),

@@ -23,7 +23,7 @@ from lidarpool import (
 )
 from lidarpool.run.job_source import identity_of
 from lidarsim import Actor, Returns, box
-from lidarsim.base.vectors import into_axes
+from lidarsim.base.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweep_motion import poses_at
 from raybeam import moving_loops
@@ -149,12 +149,14 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     for batch in batches:
         on = batch.object == 2
         positions, rotations = CAR.trajectory.poses(0, batch.time[on].astype(np.float64))
-        own = into_axes(batch.positions[on] - positions, rotations) - [0, 0, SIZE[2] / 2]
+        own = rotate_into_frames(batch.positions[on] - positions, rotations) - [0, 0, SIZE[2] / 2]
         off = np.abs(np.abs(own) - SIZE / 2)
         if "several" not in name:  # whose range is the mean of several rays
             assert off.min(axis=1).max(initial=0) < 1e-6
             face = off.argmin(axis=1)
-            cosines = np.abs(into_axes(batch.directions[on], rotations))[np.arange(on.sum()), face]
+            cosines = np.abs(rotate_into_frames(batch.directions[on], rotations))[
+                np.arange(on.sum()), face
+            ]
             assert np.allclose(batch.cosine[on], cosines, atol=1e-6)
             assert (np.abs(own) <= SIZE / 2 + 1e-6).all()
         assert (batch.triangle[on] >= 4).all()
@@ -227,8 +229,8 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     def every_ray(rays, reaches, pairs, *_):
         asked.append(1)
         cell = pairs.cell
-        row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
-        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
+        row = (cell[:, None] * moving_loops.CELL_RAYS + np.arange(moving_loops.CELL_RAYS)).ravel()
+        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL_RAYS)
         return row[row < len(reaches)], pair[row < len(reaches)]
 
     def every_cell(wide_cells, cells, samples, reach):
@@ -236,7 +238,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
         return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
 
     monkeypatch.setattr(moving_loops, "rays_through_boxes", every_ray)
-    monkeypatch.setattr(moving_loops, "cells_near_bodies", every_cell)
+    monkeypatch.setattr(moving_loops, "pair_cells_with_bodies", every_cell)
     every = made(survey, scene)
     assert asked
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)

@@ -30,8 +30,7 @@ from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Weather, rain, snow
 from lidarsim.motion.navigation import fixes, imu_samples
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps import particle_loops as air_loops
-from lidarsim.simulator.steps import pulse_loops, random_loops, spray_loops
+from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
 from lidarsim.simulator.steps.losses import PACKET
 from lidarsim.simulator.steps.range_noise import CHANNEL
 from lidarsim.simulator.steps.waveform_samples import SAMPLE, SAMPLES
@@ -120,7 +119,7 @@ def watch_loops(monkeypatch, draws):
     """Have the loops that draw random numbers run in plain Python, and draw by `draws`."""
     # Some are private: every function is replaced by which a random number reaches a loop.
     sampling = {
-        air_loops: ["write_particle", "sample_particles", "sample_fog"],
+        particle_loops: ["write_particle", "sample_particles", "sample_fog"],
         spray_loops: ["write_particle", "_column", "_guide", "sample_clumps"],
     }
     for loops, names in sampling.items():

@@ -205,7 +205,7 @@ def still(model, profile, columns=512):
 
 def encoded(cloud, sweeps):
     """Groups of datagrams, and the metadata."""
-    encoder = encoder_of(PacketSource.of_sensor(sweeps, 0))
+    encoder = encoder_of(PacketSource.for_sensor(sweeps, 0))
     groups = []
     for sweep, points in enumerate(sweeps.points(cloud)):
         groups += encoder.encode(Shots.from_points(sweeps, sweep, points, encoder.columns))

@@ -126,7 +126,7 @@ def test_firings_that_fill_no_packet_are_carried_over():
     carry = CarryOver(24)
     parts = [carry.whole_packets(part) for part in (shots[:10], shots[10:80], shots[80:])]
     assert [len(part) for part in parts] == [0, 72, 24]
-    joined = Shots.joined(parts)
+    joined = Shots.concatenate(parts)
     assert (joined.firings == np.arange(96)).all()
     assert np.array_equal(joined.range_m, shots.range_m[:, :96], equal_nan=True)
     assert carry.rest().firings.tolist() == [96, 97, 98, 99, 100] and carry.rest() is None
@@ -175,7 +175,7 @@ def test_results_without_all_rays_are_refused():
     thinned = vlp16_survey(keep_every=2)
     cloud, sweeps = points_of(thinned, room())
     with pytest.raises(LidarError, match=r"all rays and returns .* keep_every 1") as raised:
-        PacketSource.of_sensor(sweeps, 0)
+        PacketSource.for_sensor(sweeps, 0)
     assert one_line(raised)
     cloud, sweeps = points_of(vlp16_survey(columns=("ray", "range")), room())
     (points,) = sweeps.points(cloud)
@@ -246,7 +246,7 @@ def test_position_packets_state_the_time_and_the_last_fix(tmp_path):
     )  # fmt: skip
     packets = PositionPackets(source, 8308)
     due_ns = np.arange(1, 2000) * 1_327_104
-    groups = [packets.beside(part, part + 5_000) for part in np.split(due_ns, [10, 900])]
+    groups = [packets.following(part, part + 5_000) for part in np.split(due_ns, [10, 900])]
     payloads = np.concatenate([group.payloads for group in groups])
     assert payloads.shape == (1999 // 14, 512)  # a packet for every 14 data packets
     assert (np.concatenate([group.due_ns for group in groups]) == due_ns[13::14]).all()
@@ -260,7 +260,7 @@ def test_position_packets_state_the_time_and_the_last_fix(tmp_path):
         "221322", "A", "4800.00600", "N", "01130.00000", "W", "021.6", "000.0", "141123", "", "",
         "A",
     ]  # fmt: skip
-    undated = PositionPackets(replace(source, dated=False), 8308).beside(due_ns, due_ns).payloads
+    undated = PositionPackets(replace(source, dated=False), 8308).following(due_ns, due_ns).payloads
     assert not undated[:, 202:].any()
 
 
@@ -268,7 +268,7 @@ def test_velodyne_decoder_reads_position_packets():
     decoder = pytest.importorskip("velodyne_decoder")
     source = PacketSource(load_sensor("vlp16"), "strongest", "", START_NS, dated=True)
     due_ns = np.arange(14) * 1_327_104
-    (payload,) = PositionPackets(source, 8308).beside(due_ns, due_ns).payloads
+    (payload,) = PositionPackets(source, 8308).following(due_ns, due_ns).payloads
     packet = decoder.TelemetryPacket(payload.tolist())
     time = packet.parse_nmea()
     assert packet.pps_status == decoder.TelemetryPacket.PpsStatus.LOCKED

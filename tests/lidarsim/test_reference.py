@@ -15,16 +15,21 @@ from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Air, spray
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
-from lidarsim.simulator.casting.surfaces import SensorLight, Surfaces
+from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
 from lidarsim.simulator.steps.detection import detected
-from lidarsim.simulator.steps.particles import AIR, WeatherStep, exponential, seen_by_range
+from lidarsim.simulator.steps.particles import (
+    AIR,
+    WeatherStep,
+    exponential_quantiles,
+    seen_by_range,
+)
 from lidarsim.simulator.steps.pulse_loops import SampledHits
 from lidarsim.simulator.steps.random_loops import RandomKeys
 from lidarsim.simulator.steps.range_noise import noisy_ranges
-from lidarsim.simulator.steps.saturation import saturated
-from lidarsim.simulator.steps.separation import Reporting, separated
+from lidarsim.simulator.steps.saturation import apply_saturation
+from lidarsim.simulator.steps.separation import Reporting, separate_hits
 from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
@@ -144,12 +149,12 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     flies = hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
     air = flies._replace(cause=np.full(len(flies.ray), AIR)) if airy else None
-    found = separated(ground, GAP, each, given, air)
+    found = separate_hits(ground, GAP, each, given, air)
     expected = {k: reference.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
     assert {0, 1, 2} <= {*counts.tolist()}
     if planes and each > 1:  # surfaces that continue are a part of what is compared
-        assert counts.sum() < 0.95 * len(separated(ground, GAP, each, None, air).ray)
+        assert counts.sum() < 0.95 * len(separate_hits(ground, GAP, each, None, air).ray)
     if airy:
         assert np.array_equal(found.cause == AIR, found.triangle == NO_SURFACE)
 
@@ -174,9 +179,9 @@ def test_saturation_is_that_of_the_twin(full, waves):
         ground = tuple(one[solid] for one in planes)
         flies = hits.take(~solid)
         flies = flies._replace(cause=np.full(len(flies.ray), AIR))
-        returns = separated(hits.take(solid), GAP, 7, ground, flies)
+        returns = separate_hits(hits.take(solid), GAP, 7, ground, flies)
         given = {k: reference.separated(own, GAP, 7, True) for k, own in pulses.items()}
-    found = saturated(returns, full, width_ns)
+    found = apply_saturation(returns, full, width_ns)
     length = width_ns * LIGHT_M_NS / 2
     expected = {k: reference.saturated(own, full, length, waves) for k, own in given.items()}
     found = found._replace(width=found.width / width_ns, velocity=None)
@@ -194,7 +199,7 @@ def test_reported_returns_are_those_of_the_twin(mode, losses):
     pulses = pulses_of(2, 7)
     noise = Noise(**losses, seed=5)
     hits, planes = columns_of(pulses, 7)
-    found = separated(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
+    found = separate_hits(hits, GAP, 7, planes, reporting=Reporting(mode, noise, KEYS, FIRST))
     expected = {}
     for pulse, own in pulses.items():
         key = key_of(FIRST + pulse)
@@ -241,7 +246,7 @@ def test_energies_are_those_of_the_twin(extinction):
     corners = rng.normal(size=(2, 3, 3))
     materials = (Material("0", 0.3), RETRO)
     meshes = [quad(f"{k}", a, b, c, c + a - b) for k, (a, b, c) in enumerate(corners)]
-    surfaces = Surfaces(Scene.from_meshes(meshes), materials)
+    surfaces = SceneSurfaces(Scene.from_meshes(meshes), materials)
     light = SensorLight(905.0, extinction)
     wall = rng.integers(0, 2, 1000)
     distance = rng.uniform(0.5, 200, 1000)
@@ -249,7 +254,7 @@ def test_energies_are_those_of_the_twin(extinction):
     normals = np.cross(*np.diff(corners, axis=1).swapaxes(0, 1))
     ahead, normals = (v / np.linalg.norm(v, axis=1)[:, None] for v in (ahead, normals))
     triangle = (2 * wall + rng.integers(0, 2, 1000)).astype(np.int32)
-    lit = surfaces.lit(triangle, ahead, distance, light, np.zeros(1000), ())
+    lit = surfaces.illuminate(triangle, ahead, distance, light, np.zeros(1000), ())
     assert lit.kinds.tolist() == wall.tolist()
     assert np.allclose(lit.cosines, (normals[wall] * ahead).sum(axis=1), 0, 1e-6)
     cosine = np.abs(lit.cosines)
@@ -273,7 +278,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
-    surfaces = Surfaces(scene, survey.materials)
+    surfaces = SceneSurfaces(scene, survey.materials)
     caster = WeatherStep(setup_of(scene, survey, 0), None, surfaces)
     # Sub-rays hit nothing, a wall, a pane, or a pane a meter before a wall.
     rng = np.random.default_rng(7)
@@ -330,7 +335,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     hits = np.flatnonzero(far < np.inf)
     place = far[hits]
     light = np.ones(len(hits))
-    crossings = spray_loops.Crossings(beam, crossed)
+    crossings = spray_loops.BoxCrossings(beam, crossed)
     spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
     begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
     keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
@@ -338,7 +343,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     clumps = []
     left = []
     precipitation = reference.Precipitation(kind, air, noise.threshold)
-    table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential())
+    table = spray_loops.ClumpTables(mean, tables, 1 / kind.slope, exponential_quantiles())
     stop, many = spray_loops.sample_clumps(0, crossings, each, table, keys, far, out)
     assert stop == len(beam) and many > 300
     for pulse in range(count):

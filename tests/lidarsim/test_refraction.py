@@ -190,7 +190,7 @@ def test_what_is_refused():
     with pytest.raises(LidarError, match="requires refractive_index"):
         Material("*", transparent="pass", attenuation_per_m=0.1)
     with pytest.raises(
-        LidarError, match=r"refractive_index must be from 1 to 4 or None, but is 0\.9"
+        LidarError, match=r"refractive_index must be a number from 1 to 4 or None, but is 0\.9"
     ):
         Material("*", transparent="pass", refractive_index=0.9)
 

@@ -537,7 +537,7 @@ WRONG = {
     ),
     "largest": (lambda s: s.sweep((0, 0, 1), number=2**2000), "below 2147483648"),
     "remote": (lambda s: s.sweep((0, 0, 1), start_s=1e300), "start_s must … but is 1e+300"),
-    "lost": (lambda s: s.sweep((0, float("nan"), 1)), "pose must … but is (0, nan, 1)"),
+    "lost": (lambda s: s.sweep((0, float("nan"), 1)), "but is (0.0, nan, 1.0)"),
     "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s must … but is nan"),
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
     "actor": (

@@ -18,7 +18,7 @@ import pytest
 from lidarsim import LidarError
 from lidarsim.packets import sender_process
 from lidarsim.packets.encoders import Datagrams
-from lidarsim.packets.send import Address, Sender, check_reachable
+from lidarsim.packets.send import ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination
 
 
@@ -213,14 +213,14 @@ def test_the_process_imports_nothing_that_takes_time_to_start():
 )
 def test_an_address_that_packets_cannot_go_to_is_refused_in_a_line(text, words):
     with pytest.raises(LidarError, match=words) as raised:
-        Address.parse(text)
+        ReceiverAddress.parse(text)
     assert "\n" not in str(raised.value)
     assert len(str(raised.value)) < 250
 
 
 def test_addresses_are_parsed():
-    assert Address.parse("127.0.0.1") == Address("127.0.0.1")
-    assert str(Address.parse("localhost:2370")) == "127.0.0.1:2370"
+    assert ReceiverAddress.parse("127.0.0.1") == ReceiverAddress("127.0.0.1")
+    assert str(ReceiverAddress.parse("localhost:2370")) == "127.0.0.1:2370"
 
 
 def test_an_unreachable_address_is_refused(monkeypatch):
@@ -229,4 +229,4 @@ def test_an_unreachable_address_is_refused(monkeypatch):
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     with pytest.raises(LidarError, match="cannot be reached from this machine: Network is unreach"):
-        check_reachable(Address("10.1.2.3", 2368))
+        check_reachable(ReceiverAddress("10.1.2.3", 2368))

@@ -377,7 +377,7 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
     assert len(rays) == 720 and rays.cycle_ns == 1e8 and rays.range_m == (0, 60)
     assert rays.times_ns[:4].tolist() == [0, 500, 277_778, 278_278]
     assert np.allclose(rays.azimuths_deg[:4], [0, 1, -1, 0], atol=1e-5), "clockwise"
-    assert sensor.left_out[0] == "the emitter attributes vertOffsetM"
+    assert sensor.unsupported[0] == "the emitter attributes vertOffsetM"
     path.write_text(ROTARY.format(f"float[] {CORE}emitterState:s002:azimuthDeg = [0, 1]"))
     with pytest.raises(LidarError, match="emitterState:s002 has no elevationDeg, fireTimeNs"):
         read_omnilidar(path)
@@ -406,7 +406,7 @@ def test_rotary_omnilidars_return_within_a_window(window, lowest_deg, highest_de
     azimuths_deg = np.where(azimuths_deg > 180, azimuths_deg - 360, azimuths_deg)
     assert (azimuths_deg.min(), azimuths_deg.max()) == (lowest_deg, highest_deg)
     assert len(sensor.rays) == rays and sensor.rays.cycle_ns == 1e8
-    assert sensor.left_out == ["channels (a ray list has one channel)"]
+    assert sensor.unsupported == ["channels (a ray list has one channel)"]
 
 
 def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
@@ -430,12 +430,12 @@ def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
     ]  # fmt: skip
     path.write_text(ROTARY.format(lines))
     sensor = read_omnilidar(path)
-    assert sorted(sensor.left_out[1:]) == sorted(listed)
+    assert sorted(sensor.unsupported[1:]) == sorted(listed)
     assert sensor.rays.azimuths_deg[0] == pytest.approx(90)
     solid = ROTARY.replace('"ROTARY"', '"SOLID_STATE"')
     path.write_text(solid.format(f"{lines} float {CORE}validEndAzimuthDeg = 180"))
     more = ["startAzimuthOffsetDeg = 90", "validEndAzimuthDeg = 180"]
-    assert sorted(read_omnilidar(path).left_out[1:]) == sorted([*listed, *more])
+    assert sorted(read_omnilidar(path).unsupported[1:]) == sorted([*listed, *more])
     window = f"float {CORE}validStartAzimuthDeg = 0.2 \n float {CORE}validEndAzimuthDeg = 0.7"
     path.write_text(ROTARY.format(window))
     with pytest.raises(LidarError, match=r"no ray has an azimuth from 0\.2 to 0\.7 degrees"):
@@ -770,7 +770,7 @@ def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
         ({"path": "rays.npz", "seconds": -1}, "seconds"),
         (
             {"path": "rays.npz", "sensor": "vlp16"},
-            "sensor must be a Sensor, but is a str. Load one with load_sensor",
+            "sensor must be a Sensor, but is 'vlp16'. Load one with load_sensor",
         ),
     ],
 )

@@ -27,7 +27,7 @@ from lidarsim.columns.table import OPTIONAL
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.casting import static_bodies
-from lidarsim.simulator.casting.clipping import box_planes, cut
+from lidarsim.simulator.casting.clipping import box_planes, clip_triangles
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
@@ -167,7 +167,7 @@ def test_parts_of_triangles_cover_the_box_and_share_corners():
     vertices = np.concatenate([shifted, [[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
     faces = np.concatenate([ground.faces, [[4, 5, 6]], ground.faces])
     region = np.array([[-100.0, -50, -10], [100, 70, 10]])
-    parts = cut(vertices, faces, box_planes(region))
+    parts = clip_triangles(vertices, faces, box_planes(region))
     assert {*parts.origin.tolist()} == {*range(5)} and (np.diff(parts.origin) >= 0).all()
     corners = parts.vertices[parts.faces]
     assert (corners >= region[0] - 1e-9).all() and (corners <= region[1] + 1e-9).all()
@@ -180,7 +180,7 @@ def test_parts_of_triangles_cover_the_box_and_share_corners():
         np.unique(corners[on_diagonal & (parts.origin == face)[:, None]], axis=0) for face in (0, 1)
     )
     assert len(first) == 2 and np.array_equal(first, second)
-    assert cut(vertices[4:], faces[:1] * 0 + [0, 1, 2], box_planes(region)) is None
+    assert clip_triangles(vertices[4:], faces[:1] * 0 + [0, 1, 2], box_planes(region)) is None
 
 
 @pytest.mark.extended

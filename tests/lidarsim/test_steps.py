@@ -15,7 +15,7 @@ from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, l
 from lidarsim.base.random_numbers import Purpose
 from lidarsim.columns.table import CAUSES
 from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
-from lidarsim.simulator.returns import SURFACE, PulseReturns, merged, returns_without_surface
+from lidarsim.simulator.returns import SURFACE, PulseReturns, merge_returns, returns_without_surface
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.cast import CastStep
 from lidarsim.simulator.steps.doppler import VELOCITY
@@ -200,7 +200,7 @@ class Echo(Everywhere):
         rays = np.arange(batch.start, batch.stop)
         distance = np.full(len(rays), ADDED_M)
         energy = np.full(len(rays), 0.125)
-        return merged(returns, returns_without_surface(returns, rays, distance, energy, 2))
+        return merge_returns(returns, returns_without_surface(returns, rays, distance, energy, 2))
 
 
 class Aside(Everywhere):

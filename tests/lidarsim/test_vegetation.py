@@ -28,7 +28,7 @@ from lidarpool import (
 from lidarsim import SceneMesh
 from lidarsim.media.leaves import NAMES, brightness, density, projection
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.light_in_media import depths
+from lidarsim.simulator.steps.light_in_media import random_depths
 
 GROUND = Material("*", 0.3)
 cast = partial(shapes.cast, backend="tiles")
@@ -118,7 +118,7 @@ def test_depths_are_negative_logarithms_of_random_numbers():
     bits = np.concatenate([bits >> np.uint64(k) for k in (0, 1, 20)] + [[0], ~(bits >> 40)])
     bits = bits.astype(np.uint64)
     expected = -np.log(((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53)
-    assert np.abs(depths(bits) - expected).max() < 1.6e-5
+    assert np.abs(random_depths(bits) - expected).max() < 1.6e-5
 
 
 def test_leaves_of_crowns_that_overlap_are_met_in_proportion_to_their_density():
@@ -194,9 +194,9 @@ def test_a_surface_with_gaps_is_refused():
         ({"leaf_area_density": 1.0, "transparent": "pass"}, "cannot be combined with transparent"),
         (
             {"leaf_area_density": 1.0, "leaf_angle": "flat"},
-            "leaf_angle must be one of .* but is 'flat'",
+            "leaf_angle must be 'spherical', .* but is 'flat'",
         ),
-        ({"leaf_area_density": 0.0}, "leaf_area_density must be above 0 .* but is 0.0"),
+        ({"leaf_area_density": 0.0}, "leaf_area_density must be a number above 0 .* but is 0.0"),
     ],
 )
 def test_materials_that_mean_nothing_are_refused(fields, says):

@@ -31,7 +31,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
-from lidarsim.simulator.steps.waveform_samples import digitized
+from lidarsim.simulator.steps.waveform_samples import digitize
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -278,13 +278,13 @@ def test_samples_are_rounded_to_the_smallest_step_that_holds_them(power):
     random = np.random.default_rng(7)
     samples = np.ldexp(random.uniform(-0.02, 1, (20, 16)) * random.uniform(1, 4, (20, 1)), power)
     samples[:3] *= -1  # noise below zero decides
-    steps, exponents = digitized(samples)
+    steps, exponents = digitize(samples)
     step = np.ldexp(1.0, exponents.astype(int))[:, None]
     assert np.all(np.abs((steps - 2048.0) * step - samples) <= step / 2)
     halves = samples / (step / 2)
     outside = (halves.max(axis=1) >= 65_535 - 2048) | (halves.min(axis=1) <= -2048)
     assert np.all(outside | (exponents == -126))
-    assert digitized(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
+    assert digitize(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
 
 
 def test_chunks_of_rays_change_no_record(monkeypatch):

@@ -10,7 +10,7 @@ from lidarpool import Scene, SceneMesh, box
 from lidarscenes.procedural.plants import SPECIES, place_instances, tree
 from lidarsim.scene.scene_mesh import Cutout, triangle_areas
 from lidarsim.scene.simplified import MIN_PART_TRIANGLES, SimplifiedScene, cut_masks
-from lidarview.render.closeup import ShownPart, floor_and_cut
+from lidarview.render.closeup import ScenePart, floor_and_cut_heights
 from raybeam import RayCaster
 
 
@@ -104,7 +104,7 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
         block("hut", (4, 4, 3), (-10, 10, 1.5)),
         block("other hut", (4, 4, 3), (100, 10, 1.5)),
     ])  # fmt: skip
-    cut = ShownPart.from_scene(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
+    cut = ScenePart.from_scene(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
     part = cut.scene
     shares = cut.shares
     there = {scene.names[k] for k in np.unique(part.face_object)}
@@ -123,4 +123,4 @@ def test_a_roof_is_cut_open_and_a_crown_is_not():
     for over, height in ((box("hall", (20, 20, 7)), 4.0), (tree(SPECIES[0]), None)):
         scene = Scene.from_meshes([over])
         caster = RayCaster(scene.vertices, scene.faces, "numpy")
-        assert floor_and_cut(scene, caster, places)[1] == (height and pytest.approx(height))
+        assert floor_and_cut_heights(scene, caster, places)[1] == (height and pytest.approx(height))

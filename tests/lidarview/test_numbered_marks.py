@@ -14,8 +14,10 @@ def test_numbers_lie_within_their_marks(count):
     page = Page((1600, 1000))
     axes = page.figure.add_axes((0, 0, 1, 1))
     pixels = np.zeros((count, 2))
-    shot = SimpleNamespace(sensors=pixels, visible=lambda points: (points, np.ones(count, bool)))
-    page.numbers(axes, shot)
+    shot = SimpleNamespace(
+        sensors=pixels, project_visible=lambda points: (points, np.ones(count, bool))
+    )
+    page.number_sensors(axes, shot)
     FigureCanvasAgg(page.figure).draw()
     (area,) = axes.collections[0].get_sizes()
     diameter = np.sqrt(area) * DPI / 72  # pixels

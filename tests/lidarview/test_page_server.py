@@ -17,8 +17,8 @@ import pytest
 from tests.pages import ask
 
 from lidarview.viewer.guarded_server import MAX_CONNECTIONS
-from lidarview.viewer.point_selection import Abandoned
-from lidarview.viewer.server import MAX_SLOW, MAX_WAITING, announced, page_server
+from lidarview.viewer.point_selection import ClientDisconnected
+from lidarview.viewer.server import MAX_SLOW, MAX_WAITING, announce_page, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
 STRANGER = """
@@ -47,7 +47,7 @@ class Secrets:
             while not abandoned():
                 time.sleep(0.01)
             self.abandoned.set()
-            raise Abandoned
+            raise ClientDisconnected
         if what == "wrong":
             raise ValueError(asked["number"])
         if what != "secret":
@@ -125,7 +125,7 @@ def stranger(asked):
 def test_what_a_browser_is_started_with_is_good_once(served):
     """Other users see it in the list of processes."""
     page, _ = served
-    once = page.once()
+    once = page.single_use_url()
     assert page.token not in once
     with urllib.request.urlopen(once, timeout=120) as answer:
         assert (answer.url, b"<!doctype html>" in answer.read()) == (page.url, True)
@@ -177,7 +177,7 @@ def test_other_websites_are_refused_whatever_they_know(served, headers):
         status, body = said(page, method, what, **headers)
         assert (status, b"secret" in body) == (403, False)
         assert said(page, method, what, "/wrong/", **headers)[0] == 404
-    once = page.once()
+    once = page.single_use_url()
     assert said(page, "GET", "", f"/{once.split('/')[-2]}/", **headers)[0] == 403
     assert source.ordered == []
 
@@ -410,7 +410,7 @@ def test_a_cell_shows_the_page_and_says_how_else_to_reach_it(served, monkeypatch
     if hub:
         monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
     page = served[0]
-    with announced(page, f"live page: {page.url}", browser=True):
+    with announce_page(page, f"live page: {page.url}", browser=True):
         (shown,) = cells
     assert cells == [shown, ""]
     proxied = f"/user/ada/proxy/{page.port}/{page.token}/"

@@ -40,22 +40,22 @@ from lidarview.picture_file import (
     PlanningPicture,
     SensorPositions,
 )
-from lidarview.render.coloring import colors_of as coloring_of
+from lidarview.render.coloring import make_coloring
 from lidarview.viewer import point_selection as points
-from lidarview.viewer.legends import legend_of
+from lidarview.viewer.display_mesh import DisplayMesh, available_colorings
+from lidarview.viewer.legends import make_legend
 from lidarview.viewer.point_selection import (
     TILES,
-    Abandoned,
-    Eye,
-    Filter,
-    HeldPoints,
+    BrowserCamera,
+    ClientDisconnected,
+    InMemoryPoints,
+    PointFilter,
     PointFinder,
-    read_scans,
+    parse_scans,
 )
 from lidarview.viewer.range_pictures import range_image
 from lidarview.viewer.result_views import open_result, open_results, show_view
-from lidarview.viewer.shown_surface import ShownSurface, colors_for
-from lidarview.viewer.view import Downloads, View
+from lidarview.viewer.view import DownloadFormats, View
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -346,7 +346,7 @@ def test_the_first_picture_of_a_cloud_has_its_sides_but_no_outliers():
     places = rng.uniform((-60, -20, 0), (60, 20, 8), (20_000, 3))
     places[0] = (-70, 0, 0)  # beyond most, but not an outlier
     places[1] = (0, 0, -500)
-    state, arrays = told(View(HeldPoints(Cloud(places, {}))), "state")
+    state, arrays = told(View(InMemoryPoints(Cloud(places, {}))), "state")
     inside = np.delete(places, 1, axis=0)
     assert np.allclose(state["box"], [inside.min(axis=0), inside.max(axis=0)])
     corners = arrays["corners"]
@@ -441,13 +441,13 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
 
 def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
     missing = Mock(side_effect=LidarError("it needs laspy"))
-    formats = Downloads(["ply", "las"], missing)
+    formats = DownloadFormats(["ply", "las"], missing)
     view = open_result(result_in(tmp_path / "one", spun), formats)
     with pytest.raises(KeyError):
         told(view, "export", format="exe")
     monkeypatch.setattr("lidarview.viewer.view.MAX_POINTS", 3)
     assert "20 points; the limit is 3" in told(view, "export", format="ply")[0]["error"]
-    held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})), downloads=formats)
+    held = View(InMemoryPoints(Cloud(np.zeros((1, 3)), {})), downloads=formats)
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
     monkeypatch.undo()
     assert told(view, "export", format="las")[0] == {"error": "it needs laspy"}
@@ -571,7 +571,7 @@ def test_normals_are_colors_of_points_and_of_the_scene(tmp_path, cloud, pictured
     names = ("normal_x", "normal_y", "normal_z")
     normals = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [np.nan] * 3]
     columns = dict(zip(names, np.array(normals, np.float32).T, strict=True))
-    view = View(HeldPoints(Cloud(np.zeros((4, 3)), columns)))
+    view = View(InMemoryPoints(Cloud(np.zeros((4, 3)), columns)))
     told, arrays = view.answer("points", {"color": "normals", "most": "9"}, bool)
     shown = arrays["colors"][:, :3].tolist()
     assert shown == [[255, 128, 128], [128, 0, 128], [128, 128, 255], [128, 128, 128]]
@@ -602,13 +602,13 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
 def test_many_triangles_become_few_that_keep_shape_and_hits():
     scene = Scene.seed()
-    surface = ShownSurface(scene, max_triangles=5000)
+    surface = DisplayMesh(scene, max_triangles=5000)
     corners = surface.corners.reshape(-1, 3)
     assert 500 < len(surface.corners) <= 5000
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
     assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
     first = scene.face_object == 0  # of six objects, far from each other
-    arrays, legend = surface.colored("hits", np.where(first, 3, 0), NOWHERE)
+    arrays, legend = surface.color_by("hits", np.where(first, 3, 0), NOWHERE)
     corners = arrays["corners"]
     colors = arrays["colors"]
     middles = corners.mean(axis=1)
@@ -618,7 +618,7 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert vivid[there].mean() > 0.9
     assert not vivid[~there].any()
     assert "hits per square meter" in legend["title"]
-    assert len(ShownSurface(scene).corners) == len(scene.faces)  # few enough
+    assert len(DisplayMesh(scene).corners) == len(scene.faces)  # few enough
 
 
 def test_a_scene_is_colored_by_the_materials_of_its_faces(tmp_path):
@@ -637,7 +637,7 @@ def test_a_scene_is_colored_by_the_materials_of_its_faces(tmp_path):
     content = replace(content, hit_counts=np.zeros(content.scene.triangles, np.int64))
     content.save(tmp_path / "pictures.npz")
     content = PictureContent.load(tmp_path / "pictures.npz")
-    view = View(HeldPoints(Cloud(np.ones((3, 3)), {})), content)
+    view = View(InMemoryPoints(Cloud(np.ones((3, 3)), {})), content)
     header, _ = view.answer("state", {}, bool)
     assert "material" in header["scene_colors"]
     header, arrays = view.answer("surface", {"color": "material"}, bool)
@@ -649,29 +649,31 @@ def test_a_scene_is_colored_by_the_materials_of_its_faces(tmp_path):
     plain = Scene.from_meshes([floor])
     content, _ = PictureContent.before_casting(plain, survey)
     assert content.face_materials is None
-    assert "material" not in colors_for(plain, None, content.face_materials)
+    assert "material" not in available_colorings(plain, None, content.face_materials)
 
 
 def test_a_scene_is_colored_by_the_reflectance_of_its_objects():
     scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
     share = np.array([1.0, 0.0])
-    assert colors_for(scene, share) == ("gray", "hits", "object", "normals", "reflectance")
-    assert colors_for(scene, np.array([0.5, 0.5])) == ("gray", "hits", "object", "normals")
-    arrays, legend = ShownSurface(scene, share).colored("reflectance", share, NOWHERE)
+    assert available_colorings(scene, share) == ("gray", "hits", "object", "normals", "reflectance")
+    assert available_colorings(scene, np.array([0.5, 0.5])) == ("gray", "hits", "object", "normals")
+    arrays, legend = DisplayMesh(scene, share).color_by("reflectance", share, NOWHERE)
     colors = arrays["colors"]
     assert np.unique(colors[scene.face_object == 0]).tolist() == [255]
     assert colors[scene.face_object == 1].max() < 40
     assert legend["title"] == "reflectance"
 
 
-def colors_of(*arguments):
+def coloring_and_legend(*arguments):
     """Colors (n, 3) as bytes, and the legend as JSON."""
-    colored = coloring_of(*arguments)
-    return as_bytes(colored.paint(arguments[0])), json.dumps(legend_of(colored), ensure_ascii=False)
+    colored = make_coloring(*arguments)
+    return as_bytes(colored.paint(arguments[0])), json.dumps(
+        make_legend(colored), ensure_ascii=False
+    )
 
 
 def test_the_middle_of_a_bar_about_zero_is_zero_without_a_sign():
-    legend = colors_of(np.linspace(-8, 7.98, 200), Z)[1]
+    legend = coloring_and_legend(np.linspace(-8, 7.98, 200), Z)[1]
     assert json.loads(legend)["marks"] == ["-8", "0", "8"]
 
 
@@ -679,36 +681,39 @@ def test_the_middle_of_a_bar_about_zero_is_zero_without_a_sign():
     ("span_ns", "told"), [(2e9, "time, s:"), (3e7, "time, ms:"), (50, "time, ns:")]
 )
 def test_times_are_told_in_a_unit_that_can_be_read(span_ns, told):
-    legend = colors_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
+    legend = coloring_and_legend(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
     assert told in legend
     assert ('"1.0"' in legend) == (span_ns == 2e9)
 
 
 def test_what_is_no_surface_is_gray_and_has_no_object_s_color():
     values = np.arange(200, dtype=np.int32) % 3 - 1
-    colors, legend = colors_of(values, OBJECT, ("Ball", "Box"))
+    colors, legend = coloring_and_legend(values, OBJECT, ("Ball", "Box"))
     assert (colors[values < 0] == 128).all()
     assert not (colors[values >= 0] == 128).all(axis=1).any()
     assert '["no surface", [128, 128, 128], -1]' in legend
     own = Column("zone", "int32", "", "zone", kind="label")
-    assert "no surface" not in colors_of(values, own)[1]
+    assert "no surface" not in coloring_and_legend(values, own)[1]
     many = tuple(f"thing {number}" for number in range(1100))
-    assert '"thing 99"' in colors_of(np.arange(100), OBJECT, many)[1]
-    assert '"more": 100' in colors_of(np.arange(1100), OBJECT, many)[1]
+    assert '"thing 99"' in coloring_and_legend(np.arange(100), OBJECT, many)[1]
+    assert '"more": 100' in coloring_and_legend(np.arange(1100), OBJECT, many)[1]
     often = np.append(np.arange(100), np.full(9, 73))
-    assert "thing 73" in colors_of(often, OBJECT, many)[1]
+    assert "thing 73" in coloring_and_legend(often, OBJECT, many)[1]
 
 
 @pytest.mark.extended(every=6)
 @pytest.mark.parametrize("column", TABLE.values(), ids=lambda column: column.name)
 def test_every_column_takes_no_points_equal_ones_and_its_largest(column):
     dtype = np.dtype(column.dtype)
-    assert colors_of(np.zeros(0, dtype), column)[0].shape == (0, 3)
-    same, legend = colors_of(np.ones(5, dtype), column, ("Ball",))
+    assert coloring_and_legend(np.zeros(0, dtype), column)[0].shape == (0, 3)
+    same, legend = coloring_and_legend(np.ones(5, dtype), column, ("Ball",))
     assert len(np.unique(same, axis=0)) == 1
     assert "nan" not in legend
     if dtype.kind in "iu":
-        assert colors_of(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (2, 3)
+        assert coloring_and_legend(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (
+            2,
+            3,
+        )
 
 
 ALL_ROWS = slice(None)
@@ -727,7 +732,7 @@ def along_y(y=0.0, parallel=False):
         lens[2, 3] = -2 * far * near / (far - near)
         lens[3, 2] = -1.0
     columns = (lens @ view).T.ravel()
-    return Eye.read(",".join(map(repr, columns.tolist())))
+    return BrowserCamera.parse(",".join(map(repr, columns.tolist())))
 
 
 EYE = along_y()
@@ -750,18 +755,18 @@ def test_a_filter_keeps_what_is_within_all_limits():
         np.arange(12.0).reshape(4, 3),
         {"range": np.float32([1, 2, np.nan, 4]), "class": np.uint16([0, 1, 1, 1])},
     )
-    held = HeldPoints(cloud)
-    wanted = Filter.read("class,1,1;range,0,9;nothing,1,2", ["class", "range"])
+    held = InMemoryPoints(cloud)
+    wanted = PointFilter.parse("class,1,1;range,0,9;nothing,1,2", ["class", "range"])
     assert wanted.limits == (("class", 1, 1), ("range", 0, 9))
-    assert wanted.keeps(held, ALL_ROWS).tolist() == [False, True, False, True]
-    assert Filter((("z", 3, 8),)).keeps(held, ALL_ROWS).tolist() == [False, True, True, False]
-    assert Filter().keeps(held, np.array([0, 3])).all()
+    assert wanted.mask(held, ALL_ROWS).tolist() == [False, True, False, True]
+    assert PointFilter((("z", 3, 8),)).mask(held, ALL_ROWS).tolist() == [False, True, True, False]
+    assert PointFilter().mask(held, np.array([0, 3])).all()
     text = ";".join(f"range,{n / 1e4},{9 - n / 1e4}" for n in range(5000))
-    assert Filter.read(text, ["range"]).limits == (("range", 0.4999, 8.5001),)
+    assert PointFilter.parse(text, ["range"]).limits == (("range", 0.4999, 8.5001),)
     for bad in ("range,nan,3", "range,1", "range,x,2"):
         with pytest.raises(ValueError, match=r"."):
-            Filter.read(bad, ["range"])
-    assert read_scans("4-6,0-1,5-9,,2-2,8-7") == ((0, 2), (4, 9))
+            PointFilter.parse(bad, ["range"])
+    assert parse_scans("4-6,0-1,5-9,,2-2,8-7") == ((0, 2), (4, 9))
 
 
 @pytest.fixture
@@ -808,32 +813,32 @@ def test_without_a_filter_an_even_choice_of_all_is_found(file):
 
 def test_all_points_that_a_filter_keeps_are_found_or_an_even_choice_of_them(file):
     finder = PointFinder(read := Read(file), np.zeros(3))
-    rows, count = finder.find(5000, Filter((("intensity", 7, 7),)))
+    rows, count = finder.find(5000, PointFilter((("intensity", 7, 7),)))
     assert len(rows) == count == 1000
     assert set(file.values("intensity", rows).tolist()) == {7}
     assert len(read.blocks) == 100
-    rows, count = finder.find(5000, Filter((("intensity", 0, 49),)))
+    rows, count = finder.find(5000, PointFilter((("intensity", 0, 49),)))
     assert count == 50_000
     assert 2000 < len(rows) <= 5000
     assert (np.diff(rows) > 0).all()
     assert np.histogram(rows, 10, (0, 100_000))[0].min() > 150
     read.blocks.clear()
-    rows, count = finder.find(5000, Filter((("intensity", 95, 99),)), ((995, 2000),))
+    rows, count = finder.find(5000, PointFilter((("intensity", 95, 99),)), ((995, 2000),))
     assert (len(rows), count, read.blocks) == (500, 500, {99})  # nothing else is read
-    assert len(finder.find(5000, Filter((("intensity", 200, 300),)))[0]) == 0
+    assert len(finder.find(5000, PointFilter((("intensity", 200, 300),)))[0]) == 0
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_camera_finds_what_is_before_it_and_reads_no_block_behind_it_again(file, parallel):
     finder = PointFinder(read := Read(file), np.zeros(3))
     eye = along_y(90.0, parallel)
-    rows, count = finder.find(20_000, eye=eye)
+    rows, count = finder.find(20_000, camera=eye)
     assert count == 100_000
     assert len(read.blocks) == 100
     assert file.values("y", rows).min() > 90
     assert 9000 < len(rows) < 10_200
     read.blocks.clear()
-    fewer, _ = finder.find(4000, eye=eye)
+    fewer, _ = finder.find(4000, camera=eye)
     assert len(read.blocks) < 12
     assert 2000 < len(fewer) <= 4000
 
@@ -841,8 +846,8 @@ def test_a_camera_finds_what_is_before_it_and_reads_no_block_behind_it_again(fil
 def test_a_search_that_nobody_waits_for_is_given_up(file):
     asked = iter([False] * 5 + [True])
     finder = PointFinder(read := Read(file), np.zeros(3))
-    with pytest.raises(Abandoned):
-        finder.find(5000, Filter((("intensity", 7, 7),)), abandoned=lambda: next(asked))
+    with pytest.raises(ClientDisconnected):
+        finder.find(5000, PointFilter((("intensity", 7, 7),)), is_disconnected=lambda: next(asked))
     assert len(read.blocks) == 5
 
 

@@ -25,7 +25,7 @@ from lidarview.render.film import ACTOR, SURFACE, Film
 from lidarview.render.theme import rgb
 from lidarview.viewer.packing import pack_column
 from lidarview.viewer.result_views import open_result
-from lidarview.viewer.sharing import film_of, page_of, share
+from lidarview.viewer.sharing import export_view, render_film, render_page
 
 COUNT = 3600
 SCANS = 360
@@ -99,7 +99,7 @@ def test_new_points_are_bright_and_old_ones_darker_unless_they_are_where_an_acto
 def test_actors_are_where_they_are_at_the_time_of_a_frame():
     way = Track([0, 1], [[-8, 0, 0], [8, 0, 0.0]])
     none = ([], RED)
-    frames = seen([none, none], [Actor(box("Van", (4, 4, 4)), way)], carrier_trajectory=None)
+    frames = seen([none, none], [Actor(box("Van", (4, 4, 4)), way)], platform_trajectory=None)
     warm = [frame[..., 0] - frame[..., 2] > 10 for frame in frames]
     assert all(mask.sum() > 30 for mask in warm) and not (warm[0] & warm[1]).all()
     absent = Track([5, 6], [[-8, 0, 0], [8, 0, 0.0]], start_s=0.0, beyond="absent")
@@ -110,7 +110,7 @@ def test_actors_are_where_they_are_at_the_time_of_a_frame():
 
 def test_the_camera_follows_a_carrier_whose_way_is_red():
     way = np.array([0, 1e9]), np.array([[0, -20, 2], [0, 20, 2.0]])
-    frames = seen([([], RED)] * 3, (), carrier_trajectory=way, range_m=8.0)
+    frames = seen([([], RED)] * 3, (), platform_trajectory=way, range_m=8.0)
     dot = rgb("#ff4d5e") * 255
     for frame in frames:  # in the middle, below
         row, column = (np.abs(frame - dot).sum(axis=2) < 60).nonzero()
@@ -144,13 +144,13 @@ def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):
         assert moving.n_frames == 30 and moving.info["duration"] == 100
         assert moving.size == (960, 540) and moving.info["loop"] == 0
     assert film.stat().st_size < 3_000_000
-    assert film_of(open_result(drive), suffix) == film.read_bytes()
+    assert render_film(open_result(drive), suffix) == film.read_bytes()
 
 
 @pytest.mark.extended
 def test_a_film_that_would_be_too_large_is_narrower(drive, monkeypatch):
     monkeypatch.setattr(lidarview.viewer.sharing, "FILM_BYTES", 400_000)
-    made = film_of(open_result(drive), ".gif")
+    made = render_film(open_result(drive), ".gif")
     assert len(made) < 400_000
     (drive / "a.gif").write_bytes(made)
     with Image.open(drive / "a.gif") as moving:
@@ -166,11 +166,11 @@ def test_each_point_of_a_drive_is_new_once_and_all_of_stations_are_there(drive, 
         return iter([np.zeros((54, 96, 3), np.uint8)] * len(counts))
 
     monkeypatch.setattr(Film, "frames", frames)
-    film_of(open_result(drive), ".gif")
+    render_film(open_result(drive), ".gif")
     assert len(counts) == 30 and sum(counts) == COUNT and min(counts) > 0
-    film_of(open_result(write(drive, moves=False)), ".gif")
+    render_film(open_result(write(drive, moves=False)), ".gif")
     assert counts == [COUNT] * 30
-    film_of(open_result(drive / "cloud.ply"), ".webp")  # nothing is known but points
+    render_film(open_result(drive / "cloud.ply"), ".webp")  # nothing is known but points
     assert counts == [COUNT] * 30
 
 
@@ -232,13 +232,13 @@ def test_a_page_holds_three_million_points(tmp_path):
     rows["intensity"] = random.random(count) / distance
     rows["time"] = steps * 600
     (tmp_path / "cloud.ply").write_bytes(header(rows.dtype, count) + rows.tobytes())
-    page = page_of(open_result(tmp_path / "cloud.ply"))
+    page = render_page(open_result(tmp_path / "cloud.ply"))
     assert len(page) < 25_000_000
     assert answers(page)["cloud?"]["count"] >= 3_000_000
 
 
 def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
-    page = page_of(open_result(drive))
+    page = render_page(open_result(drive))
     held = answers(page)
     assert held["state?"]["points"] == COUNT and held["state?"]["offline"]
     assert {"column?name=z", "column?name=channel", "surface?color=gray"} < {*held}
@@ -253,7 +253,7 @@ def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
         assert held["cloud?"]["legends"][name]
         assert {f"{name} scale", f"{name} palette"} & {*held["cloud?"]["arrays"]}
     assert not re.search(rb'(src|href)="(?!data:)', page) and b'from "./' not in page
-    assert page_of(open_result(drive)) == page
+    assert render_page(open_result(drive)) == page
 
 
 @pytest.mark.extended
@@ -263,9 +263,9 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
     for axis, name in enumerate("xyz"):
         rows[name] = dense[:, axis]
     (drive / "cloud.ply").write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
-    whole = len(page_of(open_result(drive)))
+    whole = len(render_page(open_result(drive)))
     monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", whole - 200_000)
-    page = page_of(open_result(drive))
+    page = render_page(open_result(drive))
     assert len(page) <= whole - 200_000
     cloud = answers(page)["cloud?"]
     places = np.stack([unpacked_column(cloud, axis) for axis in "xyz"], axis=1)
@@ -273,7 +273,7 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
     monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", 500_000)
     with pytest.raises(LidarError, match="even without points"):
-        page_of(open_result(drive))
+        render_page(open_result(drive))
 
 
 def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
@@ -282,13 +282,13 @@ def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
     with pytest.raises(
         LidarError, match=r"film.mp4 has an unsupported extension. Use .gif or .webp"
     ):
-        share(open_result(drive), film, None)
+        export_view(open_result(drive), film, None)
     with pytest.raises(LidarError, match=r"page.htm has an unsupported extension. Use .html"):
-        share(open_result(drive), None, page)
+        export_view(open_result(drive), None, page)
     with pytest.raises(LidarError, match="cannot be written"):
-        share(open_result(drive), None, tmp_path / "none" / "page.html")
+        export_view(open_result(drive), None, tmp_path / "none" / "page.html")
     rows = np.zeros(0, row_type(np.dtype(np.float32), (SCAN,)))
     (drive / "cloud.ply").write_bytes(header(rows.dtype, 0) + rows.tobytes())
     with pytest.raises(LidarError, match="no points to show"):
-        share(open_result(drive), tmp_path / "film.gif", None)
+        export_view(open_result(drive), tmp_path / "film.gif", None)
     assert not film.exists() and not page.exists()

@@ -23,9 +23,9 @@ from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
-from lidarview.render.coloring import TURBO, colors_of
+from lidarview.render.coloring import TURBO, make_coloring
 from lidarview.render.hit_density import hit_density
-from lidarview.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
+from lidarview.render.pictures import draw_cloud, draw_hits, draw_points, draw_scene
 from lidarview.render.shot import GROUND, SKY, take_shot
 from lidarview.render.stage import make_axis, nice_step
 from lidarview.render.surface import separate_objects
@@ -175,7 +175,7 @@ OF_FACTORS = np.geomspace(1, 1000, 999)  # most are small, and a few are large
 @pytest.mark.parametrize("column", [*TABLE.values(), Column("a", "float32", "", "")], ids=str)
 def test_only_energies_have_a_logarithmic_scale(column):
     values = OF_FACTORS.clip(max=255) if column.dtype == "uint8" else OF_FACTORS
-    coloring = colors_of(values.astype(column.dtype), column)
+    coloring = make_coloring(values.astype(column.dtype), column)
     assert coloring.logarithmic == (column.name in ENERGIES)
     assert coloring.logarithmic == (column.scale == "logarithmic")
 
@@ -183,7 +183,7 @@ def test_only_energies_have_a_logarithmic_scale(column):
 def test_half_of_the_colors_are_for_half_of_the_heights():
     heights = np.append(np.full(9000, 0.1), np.linspace(0.1, 20.1, 1001))
     for column in (Z, X, TABLE["origin_z"], TABLE["range"]):
-        coloring = colors_of(heights, column)
+        coloring = make_coloring(heights, column)
         lower, upper = coloring.limits
         (middle,) = coloring.paint(np.array([(lower + upper) / 2]))
         assert np.array_equal(middle, TURBO[127])
@@ -404,7 +404,7 @@ def test_each_pixel_shows_the_nearest_thing(row, row_shot):
 def test_points_behind_a_box_are_hidden_and_before_it_seen(row, row_shot):
     near = row.object_bounds[0].mean(axis=0)
     back = -row_shot.camera.axes[2]
-    _, seen = row_shot.visible(np.stack([near + 3 * back, near - 3 * back, near]))
+    _, seen = row_shot.project_visible(np.stack([near + 3 * back, near - 3 * back, near]))
     assert seen.tolist() == [True, False, False]
 
 
@@ -412,7 +412,7 @@ def drawn(row_shot, points):
     """Whether points, each by itself, leave something in the picture."""
     blank = np.ones((*SIZE[::-1], 4), np.float32)
     return np.array(
-        [(with_points(blank, row_shot, p[None], np.zeros((1, 3))) < 1).any() for p in points]
+        [(draw_points(blank, row_shot, p[None], np.zeros((1, 3))) < 1).any() for p in points]
     )
 
 
@@ -429,7 +429,7 @@ def test_the_inside_of_a_closed_hall_is_shown():
     scene = Scene.from_meshes(room())
     poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])
     row_shot = take_shot(scene, poses, size=SIZE, backend="numpy")
-    _, seen = row_shot.visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
+    _, seen = row_shot.project_visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
     assert seen.all(), "sensors, the crate's top and the floor"
     far_wall = row_shot.camera.axes[2] * 5
     near_wall = -row_shot.camera.axes[2] * 5
@@ -443,6 +443,6 @@ def test_the_inside_of_a_closed_hall_is_shown():
 def test_the_hall_stays_closed_where_the_sensor_is_outside():
     scene = Scene.from_meshes(room())
     row_shot = take_shot(scene, [[0, 30, 1.5]], size=SIZE, backend="numpy")
-    roof_seen = row_shot.visible([[0, 0, 4.0]])[1]
-    floor_seen = row_shot.visible([[-3, -5, 0.3]])[1]
+    roof_seen = row_shot.project_visible([[0, 0, 4.0]])[1]
+    floor_seen = row_shot.project_visible([[-3, -5, 0.3]])[1]
     assert roof_seen.all() and not floor_seen.any()

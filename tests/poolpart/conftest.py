@@ -173,7 +173,7 @@ def queue(monkeypatch):
     monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
     monkeypatch.setattr(jobs, "_close_job", lambda job, *arguments: queue.close(job, *arguments))
     monkeypatch.setattr("poolpart.deploy.clusters.ADAPT_EVERY_S", 0.05)
-    monkeypatch.setattr("poolpart.deploy.clusters.LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr("poolpart.deploy.clusters.CHECK_EVERY_S", 0.05)
     return queue
 
 

@@ -21,7 +21,7 @@ import poolpart.adapting
 import poolpart.deploy.clusters
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest
 from poolpart.deploy import start_partitions
-from poolpart.task_locations import look_for_tasks
+from poolpart.task_locations import take_snapshot
 
 IDLE_S = 0.2
 
@@ -159,15 +159,15 @@ def test_a_job_in_the_queue_is_cancelled_when_its_work_is_gone(queue, wait_until
     with cluster_of({"GPU": adaptive(0, 4)}) as client:
         gpu = Partition("GPU", client)
         tasks = [gpu.submit(worker_name) for _ in range(3)]
-        wait_until(lambda: look_for_tasks(client, "GPU").coming == 3)
-        seen = look_for_tasks(client, "GPU")
-        assert (len(queue.waiting), seen.slots, seen.most_slots) == (3, 0, 4)
+        wait_until(lambda: take_snapshot(client, "GPU").queued_jobs == 3)
+        seen = take_snapshot(client, "GPU")
+        assert (len(queue.waiting), seen.slots, seen.max_slots) == (3, 0, 4)
         tasks.pop().cancel()
         wait_until(lambda: queue.cancelled == ["GPU-2"])
         for task in tasks:
             task.cancel()
         wait_until(lambda: not queue.waiting)
-        wait_until(lambda: look_for_tasks(client, "GPU").coming == 0)
+        wait_until(lambda: take_snapshot(client, "GPU").queued_jobs == 0)
         wait_until(lambda: not client.cluster.worker_spec)
 
 
@@ -224,7 +224,7 @@ def test_a_lost_worker_is_replaced_while_there_is_work(queue, wait_until):
 def test_jobs_that_the_queue_refuses_are_tried_again_while_there_is_work(queue, wait_until):
     said: list[str] = []
     queue.full = True
-    with cluster_of({"GPU": adaptive(0, 2)}, tell=said.append) as client:
+    with cluster_of({"GPU": adaptive(0, 2)}, report=said.append) as client:
         gpu = Partition("GPU", client)
         task = gpu.submit(worker_name)
         wait_until(lambda: said)
@@ -261,15 +261,15 @@ def test_what_a_client_wants_ends_with_it(queue, wait_until):
     with cluster_of({"GPU": adaptive(0, 3, slots=2), "FIX": {}}) as client:
         with Client(client.cluster) as other:
             gpu = Partition("GPU", other)
-            assert gpu.want(3)
-            assert not Partition("FIX", other).want(3)
+            assert gpu.request_slots(3)
+            assert not Partition("FIX", other).request_slots(3)
             wait_until(lambda: len(gpu) == 2)
             time.sleep(4 * IDLE_S)
             assert len(gpu) == 2
-            gpu.want(1)
+            gpu.request_slots(1)
             wait_until(lambda: len(gpu) == 1)
             with pytest.raises(PoolError, match="value -1 for the number of requested slots"):
-                gpu.want(-1)
+                gpu.request_slots(-1)
         wait_until(lambda: len(Partition("GPU", client)) == 0)
 
 
@@ -368,7 +368,7 @@ def test_other_partitions_do_not_adapt(start):
         PoolError, match=r"'A' has no jobs .*start_partitions`.* `Partition\.resize"
     ):
         parts["A"].adapt(0, 2)
-    assert not parts["A"].want(2)
+    assert not parts["A"].request_slots(2)
 
 
 # -- adaptive clusters of Dask: the scheduler offers none to stop that a partition needs ----

@@ -202,7 +202,7 @@ def test_a_request_that_goes_on_after_its_cancellation_is_not_waited_for(client,
                 await asyncio.sleep(0.05)
 
     monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 0.05)
-    monkeypatch.setattr("poolpart.extras.cancelling.call", call)
+    monkeypatch.setattr("poolpart.extras.cancelling.call_worker", call)
     # If cancel waits for the request, the request ends at last, and an empty answer counts as load.
     timer = threading.Timer(5.0, ended.set)
     timer.start()

@@ -18,7 +18,7 @@ NAMES = [f"{letter}-{number}" for letter in "ab" for number in range(5)]
 @pytest.fixture
 def client(start, monkeypatch):
     """Client of ten workers; one worker is compared for a task, and none steals."""
-    monkeypatch.setattr("poolpart.choosing.COMPARED", 1)
+    monkeypatch.setattr("poolpart.choosing.MAX_COMPARED", 1)
     with dask.config.set({"distributed.scheduler.work-stealing": False}):
         client = start({name: {} for name in NAMES})
     client.cluster.scheduler.validate = True  # Dask checks itself after each step

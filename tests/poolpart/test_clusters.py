@@ -88,13 +88,13 @@ def test_the_end_of_a_log_is_reported_once_and_after_the_log_is_complete(tmp_pat
     log = tmp_path / "gpu-1.err"
     log.write_text("loading modules\n")
     (tmp_path / "deleted.err").write_text("no space left\n")
-    assert list(logs.endings()) == [], "the files may be incomplete"
+    assert list(logs.new_last_lines()) == [], "the files may be incomplete"
     (tmp_path / "deleted.err").unlink()
     log.write_text("loading modules\nno such file\n")
     os.utime(log, (1, 1))
-    assert list(logs.endings()) == [], "the log has changed"
-    assert list(logs.endings()) == [f"The last line of the log {log} is: no such file"]
-    assert list(logs.endings()) == []
+    assert list(logs.new_last_lines()) == [], "the log has changed"
+    assert list(logs.new_last_lines()) == [f"The last line of the log {log} is: no such file"]
+    assert list(logs.new_last_lines()) == []
 
 
 def test_a_job_that_is_refused(cluster, queue):

@@ -97,7 +97,7 @@ def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypat
     client = start({"a": {}})
     Pool.from_client(client).divide({"A": rest()})
     told = threading.Event()
-    call = steward.call
+    call = steward.call_worker
 
     async def call_and_linger(*args, **kwargs):
         answer = await call(*args, **kwargs)
@@ -106,7 +106,7 @@ def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypat
             await asyncio.sleep(0.5)
         return answer
 
-    monkeypatch.setattr(steward, "call", call_and_linger)
+    monkeypatch.setattr(steward, "call_worker", call_and_linger)
     join(client, "b")
     assert told.wait(LONG_S)
     Pool(client, []).dissolve()

@@ -13,7 +13,7 @@ from distributed.comm.addressing import parse_host_port
 from tests.poolpart.helpers import LONG_S, twice, wait_for
 
 from poolpart import Partition, fetch
-from poolpart.fetch import fetch_available, hold_for_driver, take_held
+from poolpart.fetch import fetch_available, fetch_held_bytes, hold_bytes
 from poolpart.workers import worker_identities
 
 
@@ -105,7 +105,7 @@ SIZE = 8 * 2**20
 def hold(name):
     """Hold bytes that do not compress, nor repeat; returns where."""
     data = np.random.default_rng(0).bytes(SIZE)
-    return hold_for_driver(name, data), os.getpid()
+    return hold_bytes(name, data), os.getpid()
 
 
 def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, received):
@@ -113,11 +113,11 @@ def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, re
     address, _ = Partition("GPU", processes).submit(hold, name).result(LONG_S)
     assert received.total() < SIZE / 8  # they have stayed where they were made
     other = Partition("OTHER", processes).workers[0].address
-    assert take_held(processes, other, name) is None
-    assert take_held(processes, address, "another") is None
-    data = take_held(processes, address, name)
+    assert fetch_held_bytes(processes, other, name) is None
+    assert fetch_held_bytes(processes, address, "another") is None
+    data = fetch_held_bytes(processes, address, name)
     assert bytes(data) == np.random.default_rng(0).bytes(SIZE)
-    assert take_held(processes, address, name) is None
+    assert fetch_held_bytes(processes, address, name) is None
     # The client connects to the worker's address; the scheduler is called from another port.
     worker = parse_host_port(address.removeprefix("tcp://"))
     assert received.pop(worker) >= SIZE
@@ -135,6 +135,6 @@ def test_what_a_dead_worker_had_is_given_up_soon(nannies):
         time.sleep(0.01)
     start = time.monotonic()
     with dask.config.set({"distributed.comm.timeouts.connect": "1h"}):
-        assert take_held(nannies, address, "part", patience_s=0.5) is None
+        assert fetch_held_bytes(nannies, address, "part", patience_s=0.5) is None
         assert fetch_available(nannies, [result.key], 0.5, holder=address) == {}
     assert time.monotonic() - start < LONG_S

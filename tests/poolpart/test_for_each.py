@@ -10,7 +10,7 @@ from distributed import Client, Event, Queue, as_completed, wait
 from tests.poolpart.helpers import LONG_S, join, leave, wait_for, worker_name
 
 from poolpart import Partition, Pipe, PipeClosed, PipeFailed, PoolError
-from poolpart.membership import prospects
+from poolpart.membership import request_capacity
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, cou
         in_flight.append(len(futures))
         wait(futures)
 
-    monkeypatch.setattr("poolpart.extras.for_each.wait", wait_for_all)
+    monkeypatch.setattr("poolpart.for_each.wait", wait_for_all)
     assert b.for_each(range(50), abs, window=window) == 50
     assert in_flight[: len(counts)] == counts
     # Tasks that end before the last items are submitted are not in flight at the last calls.
@@ -60,7 +60,7 @@ def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, cou
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
-    monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.05)
+    monkeypatch.setattr("poolpart.for_each.CHECK_S", 0.05)
     client = start({"a": {"resources": {"A": 1}}, "b": {}})
     leave(client, "a")
     pipe = Pipe("of-nobody", 3, client).create()
@@ -73,14 +73,14 @@ def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
 
 
 def test_of_a_partition_that_is_empty_for_a_while(start, monkeypatch, pool, wait_until):
-    monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.for_each.CHECK_S", 0.0)
     looks = []
 
     def look(*args):
         looks.append(args)
-        return prospects(*args)
+        return request_capacity(*args)
 
-    monkeypatch.setattr("poolpart.extras.for_each.prospects", look)
+    monkeypatch.setattr("poolpart.for_each.request_capacity", look)
     client = start({"b": {}})
     pipe = Pipe("of-nobody", 3, client).create()
     # Nothing waits for a worker before the first item.

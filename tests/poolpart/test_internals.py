@@ -222,12 +222,12 @@ def test_an_untested_version_is_warned_about(monkeypatch):
     with pytest.warns(
         UserWarning, match=r"tested with distributed .* installed version is 2031\.10\.0"
     ):
-        names.require(names.MAP)
+        names.require_feature(names.MAP)
     monkeypatch.setattr("distributed.__version__", f"{names.TESTED[1]}+3.gabcdef")
     names.warn_if_untested.cache_clear()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        names.require(names.MAP)
+        names.require_feature(names.MAP)
 
 
 def test_the_documentation_lists_the_private_names():

@@ -74,7 +74,7 @@ def sizes(client):
 def kill_when_told(process, monkeypatch):
     """Kill the driver when the scheduler, which is in this process, first tells a worker."""
     killed = []
-    call = steward.call
+    call = steward.call_worker
 
     async def kill_and_call(*args, **kwargs):
         if not killed:
@@ -83,7 +83,7 @@ def kill_when_told(process, monkeypatch):
             process.wait(LONG_S)
         return await call(*args, **kwargs)
 
-    monkeypatch.setattr(steward, "call", kill_and_call)
+    monkeypatch.setattr(steward, "call_worker", kill_and_call)
     return killed
 
 

@@ -28,7 +28,7 @@ from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, wait
 from poolpart import Partition, Pipe, Pool, PoolError, rest
 from poolpart.extras import inherit
 from poolpart.extras.lending import lending_plugin
-from poolpart.pipe import forget_pipes
+from poolpart.pipe import delete_pipes
 
 
 class Gauge:
@@ -514,7 +514,7 @@ def tree(request):
         branches = ["".join(path) for n in range(LEVELS + 1) for path in product("01", repeat=n)]
         pipes = [Pipe(root + branch, client=client).create() for branch in branches]
         if channel is Queue:
-            forget_pipes(client, [pipe.name for pipe in pipes])
+            delete_pipes(client, [pipe.name for pipe in pipes])
         part = Partition("A", client)
         assert part.submit(grow_tree, channel, root, LEVELS).result(LONG_S) == 2
         return channel(root, client=client).get(LONG_S)

@@ -8,7 +8,7 @@ import pytest
 from tests.poolpart.helpers import LONG_S, worker_name
 
 from poolpart import Pipe, Pool, PoolError
-from poolpart.workers import on_scheduler
+from poolpart.workers import run_on_scheduler
 
 
 def processes():
@@ -37,19 +37,19 @@ def fork_servers():
 
 
 def test_it_ends_when_it_is_idle_but_not_under_results_and_pipes(wait_until, caplog, monkeypatch):
-    monkeypatch.setattr("poolpart.deploy.local_pool.LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr("poolpart.deploy.local_pool.CHECK_EVERY_S", 0.01)
     looks = []
     begun = threading.Event()  # a busy machine takes longer than the idle time for the beginning
 
     def look(client, function):
-        answer = on_scheduler(client, function)
+        answer = run_on_scheduler(client, function)
         if answer is None:  # the beginning of counting
             return None
         looks.append(function)
         in_use, transitions = answer
         return in_use or not begun.is_set(), transitions
 
-    monkeypatch.setattr("poolpart.deploy.local_pool.on_scheduler", look)
+    monkeypatch.setattr("poolpart.deploy.local_pool.run_on_scheduler", look)
 
     def many_looks():  # which take longer than the idle time
         before = len(looks)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from poolpart import map_lead
-from poolpart.map_lead import Lead
+from poolpart.map_lead import LeadTime
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from poolpart.map_lead import Lead
 def test_it_doubles_if_slots_and_client_are_idle(monkeypatch, busy_s, waited_s, expected):
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(map_lead, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    lead = Lead()
+    lead = LeadTime()
     for _ in range(9):
         lead.count_task(busy_s)
     lead.count_wait(waited_s)

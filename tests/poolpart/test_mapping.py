@@ -347,7 +347,7 @@ def test_a_client_that_is_closed_ends_it(client, gate):
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("by_another", [False, True])
 def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, ordered):
-    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.05)
+    monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.05)
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
     results = part.map(twice, itertools.count(), ordered=ordered, chunk=1, window=4, empty_s=1.0)
@@ -360,7 +360,7 @@ def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, o
 
 
 def test_all_results_of_a_partition_that_was_dissolved_are_read(start, monkeypatch):
-    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.0)
     client = start({"a": {}})
     part = Pool.from_client(client).divide({"A": rest()})["A"]
     results = part.map(twice, range(4), chunk=1, window=4)
@@ -399,7 +399,7 @@ WAITED = (
 @pytest.mark.extended
 @pytest.mark.parametrize("by_rule", [False, True])
 def test_a_map_whose_only_worker_left_for_good_ends(start, monkeypatch, by_rule):
-    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.0)
     client = start({"a": {} if by_rule else {"resources": {"A": 1}}, "b": {"resources": {"B": 1}}})
     if by_rule:
         Pool.from_client(client).divide({"A": named("a")})
@@ -416,7 +416,7 @@ def test_a_map_whose_only_worker_left_for_good_ends(start, monkeypatch, by_rule)
 
 
 def test_a_map_waits_again_as_long_after_a_worker_has_come(start, monkeypatch, wait_until):
-    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.0)
     client = start({"b": {}})
     results = Partition("A", client).map(twice, [1, 2], chunk=1, empty_s=LONG_S)
     join(client, "a", resources={"A": 1})
@@ -429,12 +429,12 @@ def test_a_map_does_not_wait_for_workers_much_longer_than_its_limit(start):
     begun = time.monotonic()
     with pytest.raises(PoolError, match=WAITED.format("A", 0.5, "A")):
         list(results)
-    assert time.monotonic() - begun < mapping.LOOK_S
+    assert time.monotonic() - begun < mapping.CHECK_S
 
 
 @pytest.mark.extended
 def test_a_map_waits_while_the_nanny_starts_the_only_worker(nannies, monkeypatch):
-    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.0)
     part = Pool.from_client(nannies).divide({"A": n_workers(1)})["A"]
     results = part.map(slowly, range(9), chunk=1, window=2, empty_s=0.0)
     assert next(results) == 0

@@ -329,7 +329,7 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch
     tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
     pids = nannies.run(os.getpid)
     killed = []
-    declare = steward.call
+    declare = steward.call_worker
 
     async def kill_and_declare(scheduler, address, *args, **kwargs):
         if not killed:  # its tasks have ended, and it is about to be told
@@ -337,7 +337,7 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch
             os.kill(pids[address], signal.SIGKILL)
         return await declare(scheduler, address, *args, **kwargs)
 
-    monkeypatch.setattr(steward, "call", kill_and_declare)
+    monkeypatch.setattr(steward, "call_worker", kill_and_declare)
     assert parts["A"].grow(1, timeout_s=LONG_S) == [moving]
     wait_until(lambda: killed[0] not in worker_identities(nannies))
     wait_until(lambda: len(parts["A"]) == 2)

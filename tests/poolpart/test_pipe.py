@@ -18,17 +18,17 @@ from tests.poolpart.helpers import LONG_S
 
 from poolpart import Pipe, PipeClosed, PipeFailed, cancelled
 from poolpart import pipe as pipe_module
-from poolpart.pipe import advice_of, advise, take_beside, take_news
+from poolpart.pipe import exchange_items, get_advice, set_advice, take_items
 from poolpart.pipe_states import (
     CHANGE,
     PUT,
     TAKE,
     USES_PIPES,
     PipeState,
-    fail_pipes_of_killed,
-    no_pipes,
-    open_pipe,
+    create_pipe,
+    fail_pipes_of_killed_task,
     pipes_of,
+    reply_without_pipes,
 )
 
 
@@ -41,7 +41,9 @@ def known(client):
     """What the scheduler knows of pipes, and can be asked."""
     scheduler = client.cluster.scheduler
     handlers = {
-        name: answer for name, answer in scheduler.handlers.items() if answer is not no_pipes
+        name: answer
+        for name, answer in scheduler.handlers.items()
+        if answer is not reply_without_pipes
     }
     return set(pipes_of(scheduler)), set(scheduler.plugins), handlers
 
@@ -90,20 +92,20 @@ OPERATIONS = st.lists(
 def patient(monkeypatch):
     """Have all waits last long, so that only a notification ends them in time."""
     monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
-    monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
+    monkeypatch.setattr("poolpart.internals.queues.CHECK_S", LONG_S)
 
 
 @pytest.fixture
 def requests(monkeypatch):
     """Record the requests of pipes: (name, longest wait in seconds or None)."""
     found = []
-    ask = pipe_module.ask
+    ask = pipe_module.send_request
 
-    def record(client, timeout_s, question, **arguments):
-        found.append((question, arguments.get("seconds")))
-        return ask(client, timeout_s, question, **arguments)
+    def record(client, timeout_s, handler, **arguments):
+        found.append((handler, arguments.get("seconds")))
+        return ask(client, timeout_s, handler, **arguments)
 
-    monkeypatch.setattr(pipe_module, "ask", record)
+    monkeypatch.setattr(pipe_module, "send_request", record)
     return found
 
 
@@ -337,22 +339,22 @@ def test_a_task_that_ends_without_closing_its_pipe_is_no_failure(client, a, make
 
 def test_advice_can_return_to_what_it_was(client, make_pipe):
     pipe = make_pipe(client)
-    advise(pipe, 5)
-    advise(other_end(pipe), 1)
-    assert advice_of(other_end(pipe)) == 1
+    set_advice(pipe, 5)
+    set_advice(other_end(pipe), 1)
+    assert get_advice(other_end(pipe)) == 1
 
 
 def test_advice_is_requested_once_and_sent_only_if_it_changes(client, make_pipe, requests):
     pipe = make_pipe(client)
-    assert [advice_of(pipe), advice_of(pipe)] == [1, 1]
-    advise(pipe, 1)
+    assert [get_advice(pipe), get_advice(pipe)] == [1, 1]
+    set_advice(pipe, 1)
     assert requests == [(CHANGE, None)]
-    advise(pipe, 2)
-    advise(pipe, 2)
-    assert advice_of(pipe) == 2
+    set_advice(pipe, 2)
+    set_advice(pipe, 2)
+    assert get_advice(pipe) == 2
     assert len(requests) == 2
     with pytest.raises(ValueError, match=r"Invalid advice 0 .* of at least 1"):
-        advise(pipe, 0)
+        set_advice(pipe, 0)
 
 
 def test_each_request_waits_for_a_part_of_the_time_that_is_left(
@@ -382,37 +384,37 @@ def test_items_are_taken_beside_tasks(client, make_pipe, requests, monkeypatch, 
     monkeypatch.setattr(pipe_module, "WAIT_S", 0.05)
     pipe = make_pipe(client, capacity=9)
     pipe.put_many(range(7))
-    assert take_beside(pipe, [], 2, LONG_S) == ([0, 1], False, False)
+    assert take_items(pipe, [], 2, LONG_S) == ([0, 1], False, False)
     assert pipe.depth == 5
     assert pipe.get() == 2
     requests.clear()
-    assert take_beside(pipe, [], 3, LONG_S) == ([3, 4, 5], False, False)
+    assert take_items(pipe, [], 3, LONG_S) == ([3, 4, 5], False, False)
     pipe.close()
-    assert take_beside(pipe, [], 3, LONG_S) == ([6], False, False)
-    assert [question for question, _ in requests] == [CHANGE]  # items of the buffer need none
-    assert take_beside(pipe, [], 3, LONG_S) == ([], True, True)
+    assert take_items(pipe, [], 3, LONG_S) == ([6], False, False)
+    assert [handler for handler, _ in requests] == [CHANGE]  # items of the buffer need none
+    assert take_items(pipe, [], 3, LONG_S) == ([], True, True)
 
     pipe = make_pipe(client)
     task = client.submit(wait_to_go, pure=False)
-    assert take_beside(pipe, [task], 1, 0.1) == ([], False, False)
+    assert take_items(pipe, [task], 1, 0.1) == ([], False, False)
     threading.Timer(0.2, pipe.put, ["late"]).start()
-    assert take_beside(pipe, [task], 1, LONG_S) == (["late"], False, False)
+    assert take_items(pipe, [task], 1, LONG_S) == (["late"], False, False)
     pipe.put("not taken")
     requests.clear()
     threading.Timer(0.2, gate.set).start()
-    assert take_beside(pipe, [task], 0, LONG_S) == ([], False, False)
+    assert take_items(pipe, [task], 0, LONG_S) == ([], False, False)
     assert task.done() and len(requests) > 1
     assert pipe.poll() == ("not taken", True)
 
 
-@pytest.mark.parametrize("take", ["get_all", "take_news"])
+@pytest.mark.parametrize("take", ["get_all", "exchange_items"])
 def test_a_wait_for_more_items_ends_when_the_pipe_is_full_or_ends(
     client, make_pipe, pool, patient, take
 ):
     def take_all(pipe):
         if take == "get_all":
             return other_end(pipe).get_all(linger_s=LONG_S)
-        return take_news(client, LONG_S, [pipe.name], linger_s=LONG_S)[pipe.name]
+        return exchange_items(client, LONG_S, [pipe.name], linger_s=LONG_S)[pipe.name]
 
     start = time.monotonic()
     pipe = make_pipe(client)
@@ -465,7 +467,7 @@ USES = {
     "depth": lambda pipe: pipe.depth,
     "close": lambda pipe: pipe.close(),
     "fail": lambda pipe: pipe.fail("x"),
-    "advise": lambda pipe: advise(pipe, 5),
+    "advise": lambda pipe: set_advice(pipe, 5),
     "iterate": list,
 }
 
@@ -501,7 +503,7 @@ def test_a_pipe_that_was_never_created_is_an_error_of_its_user_only(start, caplo
     for use in USES.values():
         with pytest.raises(PipeFailed, match=r"does not exist\. It was deleted or never created"):
             use(Pipe("never-created", client=client))
-    assert take_news(client, 0.0, ["never-created"]) == {}
+    assert exchange_items(client, 0.0, ["never-created"]) == {}
     with Client(client.cluster) as other:
         other.gather([other.submit(use_in_task, "never-created", use) for use in USES])
     with Pipe("made", client=client) as pipe:
@@ -574,7 +576,7 @@ def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, patient, 
     pipe = make_pipe(client)
     start = time.monotonic()
     threading.Timer(0.1, change, [pipe]).start()
-    assert take_news(client, LONG_S, [pipe.name]) in ({}, {pipe.name: ["item"]})
+    assert exchange_items(client, LONG_S, [pipe.name]) in ({}, {pipe.name: ["item"]})
     assert 0.1 <= time.monotonic() - start < LONG_S / 2
 
 
@@ -583,14 +585,16 @@ def test_a_task_that_ends_or_is_not_known_ends_the_wait(client, make_pipe, patie
     future = client.submit(wait_to_go, pure=False)
     wait_until(lambda: future.key in client.cluster.scheduler.tasks)
     start = time.monotonic()
-    waiting = pool.submit(take_news, client, LONG_S, [pipe.name], [future.key])
+    waiting = pool.submit(exchange_items, client, LONG_S, [pipe.name], [future.key])
     wait_for_waiters(client, {pipe: 1})
-    assert take_news(client, 0.1, [pipe.name], [future.key]) == {}  # leaves the other wait alone
+    assert (
+        exchange_items(client, 0.1, [pipe.name], [future.key]) == {}
+    )  # leaves the other wait alone
     assert time.monotonic() - start >= 0.1
     assert not waiting.done()
     gate.set()
     assert waiting.result(LONG_S) == {}
-    take_news(client, LONG_S, [], ["nobody-knows"])
+    exchange_items(client, LONG_S, [], ["nobody-knows"])
     assert time.monotonic() - start < LONG_S / 2
 
 
@@ -598,7 +602,7 @@ def test_items_are_put_beyond_the_capacity_in_the_request_that_takes_others(clie
     inlet, outlet = make_pipe(client, capacity=1), make_pipe(client)
     outlet.put("news")
     puts = {inlet.name: [1, 2], "nobody-knows": [3]}
-    assert take_news(client, 0.0, [outlet.name], puts=puts) == {outlet.name: ["news"]}
+    assert exchange_items(client, 0.0, [outlet.name], puts=puts) == {outlet.name: ["news"]}
     assert inlet.drain() == [1, 2]
 
 
@@ -611,10 +615,10 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
     asked = []
     ask = client.sync
     monkeypatch.setattr(client, "sync", lambda *a, **k: asked.append(1) or ask(*a, **k))
-    found = take_news(client, LONG_S, [pipe.name for pipe in pipes])
+    found = exchange_items(client, LONG_S, [pipe.name for pipe in pipes])
     assert len(asked) == 1
     assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}
-    assert take_news(client, 0.0, [one.name, two.name, empty.name]) == {}
+    assert exchange_items(client, 0.0, [one.name, two.name, empty.name]) == {}
 
 
 # -- waits and items that go wrong ---------------------------------------------------------
@@ -836,7 +840,7 @@ def test_the_variable_is_the_state(client, other, make_pipe, pool):
         "advice": 1,
     }
     variable.set({**variable.get(), "advice": 5})
-    assert advice_of(other_end(pipe)) == 5
+    assert get_advice(other_end(pipe)) == 5
     pipe.close()
     assert len(variable.get()["closed_by"]) == 1
     waiting = pool.submit(pipe.get, LONG_S)
@@ -942,7 +946,7 @@ def test_a_pipe_of_a_client_that_has_left_is_not_made(client):
     """The last request of a client that was killed may arrive after the news of its end."""
     before = known(client)
     late = {"name": "late", "owner": "gone", "capacity": 1, "producers": 1}
-    assert client.run_on_scheduler(open_pipe, **late) is False
+    assert client.run_on_scheduler(create_pipe, **late) is False
     assert known(client) == before
 
 
@@ -984,7 +988,7 @@ def test_a_killed_task_ends_the_open_pipes_that_it_does_not_consume(client, b, m
         annotations = None
 
     def fail(dask_scheduler=None):
-        fail_pipes_of_killed(dask_scheduler, key, annotations)
+        fail_pipes_of_killed_task(dask_scheduler, key, annotations)
 
     client.run_on_scheduler(fail)
     if case == "open":

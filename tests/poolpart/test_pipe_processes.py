@@ -143,14 +143,14 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
         full = Pipe("full", 1, client).create()
         empty = Pipe("empty", 1, client).create()
         full.put(1)
-        monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.1)
+        monkeypatch.setattr("poolpart.mapping.CHECK_S", 0.1)
         computed = part.map(abs, [-1], chunk=1)
         assert part.submit(pow, 2, 10).result(LONG_S) == 1024  # after the map, on the same slot
         running = part.map(time.sleep, [LONG_S])
         pool = Pool.from_client(client)
         monkeypatch.setattr("poolpart.internals.client.ANSWER_S", 0.03)
         monkeypatch.setattr("poolpart.division.ANSWER_S", 0.03)
-        monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.1)
+        monkeypatch.setattr("poolpart.for_each.CHECK_S", 0.1)
         os.kill(scheduler.pid, signal.SIGSTOP)
         calls = {
             "get": empty.get,
@@ -172,7 +172,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
             "dissolve": lambda: pool.dissolve(timeout_s=0.1),
             "divide": lambda: pool.divide({"Q": rest()}),
             "adapt": lambda: part.adapt(0, 1),
-            "want": lambda: part.want(1),
+            "want": lambda: part.request_slots(1),
             "first submit": lambda: Partition("Q", client).submit(abs, 1),
         }
         message = f"^The scheduler at {address} has not responded for 0.[0-9]+ s. Check that"

@@ -20,7 +20,7 @@ from poolpart import (
     rest,
     steward,
 )
-from poolpart.rules import divide, partition_for
+from poolpart.rules import divide_workers, partition_for
 
 
 def worker(name, *gpus, host="h", **resources):
@@ -28,7 +28,7 @@ def worker(name, *gpus, host="h", **resources):
 
 
 def names(rules, pool):
-    return {name: [w.name for w in group] for name, group in divide(rules, pool)[0].items()}
+    return {name: [w.name for w in group] for name, group in divide_workers(rules, pool)[0].items()}
 
 
 def test_each_rule_takes_of_what_those_before_it_have_left():
@@ -47,19 +47,19 @@ def test_fewer_than_the_minimum():
     pool = [worker("a"), worker("b")]
     message = "'Q' requires at least 1 worker, but its rule selects 0. 0 of 2 workers are available"
     with pytest.raises(PoolError, match=message):
-        divide({"P": n_workers(2), "Q": per_host(1)}, pool)
+        divide_workers({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
     with pytest.raises(PoolError, match=r"no worker named 'c'\. Existing workers: 'a', 'b'\.$"):
-        divide({"P": named("c")}, pool)
+        divide_workers({"P": named("c")}, pool)
     with pytest.raises(PoolError, match=r"workers are available .* Start more workers\.$"):
-        divide({"P": per_host(1, minimum=2)}, pool)
+        divide_workers({"P": per_host(1, minimum=2)}, pool)
     with pytest.raises(PoolError, match="requires at least 3 workers, but its rule selects 2"):
-        divide({"P": rest(minimum=3)}, pool)
+        divide_workers({"P": rest(minimum=3)}, pool)
 
 
 def test_two_rules_for_the_rest():
     with pytest.raises(PoolError, match=r"'P' and 'Q' both have the rule `rest\(\)`.*before 'P'"):
-        divide({"P": rest(), "Q": rest()}, [worker("a")])
+        divide_workers({"P": rest(), "Q": rest()}, [worker("a")])
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_what_names_no_workers(names, message):
 
 def test_workers_that_a_rule_names_and_that_are_not_there():
     rules = {"P": named("a", "tcp://b", 3)}
-    _, notes = divide(rules, [worker("a"), worker("b")])
+    _, notes = divide_workers(rules, [worker("a"), worker("b")])
     assert notes == {
         "P": "The partition does not have all workers that its rule names. The pool has no worker "
         "named '3'. Existing workers: 'a', 'b'."
@@ -87,7 +87,7 @@ def test_workers_that_a_rule_names_and_that_are_not_there():
 def test_named_workers_that_belong_elsewhere_are_reported_with_their_partition():
     pool = [worker(f"lidar-{i}", LIDAR=1) for i in (10, 1, 0)] + [worker("gpu-0", "x", GPU=1)]
     with pytest.raises(PoolError) as caught:
-        divide({"PLAN": named("lidar-0", "lidar-1", "nobody")}, pool)
+        divide_workers({"PLAN": named("lidar-0", "lidar-1", "nobody")}, pool)
     assert str(caught.value).startswith(
         "Partition 'PLAN' requires at least 1 worker, but its rule selects 0. Workers 'lidar-0', "
         "'lidar-1' already belong to partition 'LIDAR'. The pool has no worker named 'nobody'. "
@@ -96,14 +96,14 @@ def test_named_workers_that_belong_elsewhere_are_reported_with_their_partition()
     )
     assert "`partition.resize(1, source='LIDAR')`" in str(caught.value)
     with pytest.raises(PoolError, match="Worker 'a' is selected by another rule"):
-        divide({"P": named("a"), "Q": named("a")}, [worker("a")])
+        divide_workers({"P": named("a"), "Q": named("a")}, [worker("a")])
 
 
 def test_the_largest_partition_is_suggested_as_source():
     pool = [worker("gpu-0", "x", GPU=1), *(worker(f"cpu-{i}", CPU=1) for i in range(3))]
     with pytest.raises(PoolError, match=r"`n_workers\(1, minimum=0\)` .* source='CPU'\)`"):
-        divide({"PLAN": n_workers(1)}, pool)
-    _, notes = divide({"PLAN": n_workers(2, minimum=0)}, pool)
+        divide_workers({"PLAN": n_workers(1)}, pool)
+    _, notes = divide_workers({"PLAN": n_workers(2, minimum=0)}, pool)
     assert notes["PLAN"] == (
         "The partition has 0 of the 2 workers that its rule requests. Workers that join the "
         "cluster later are added to it, and `resize(…, source='CPU')` moves existing workers into "
@@ -231,10 +231,10 @@ def test_a_later_partition_of_the_remainder_forgets_no_gpus(start, wait_until, m
     client = start({"a": {}, "b": {}})
     gpu, remainder = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)
     remainder.partition("OTHER", n_workers=1)
-    seats = client.cluster.scheduler.plugins[steward.NAME].seats
+    records = client.cluster.scheduler.plugins[steward.NAME].records
     join(client, "late")
-    wait_until(lambda: seats["late"].info.gpus == ("x",))
-    assert seats["late"].partition is None
+    wait_until(lambda: records["late"].info.gpus == ("x",))
+    assert records["late"].partition is None
     assert len(gpu) == 1
 
 

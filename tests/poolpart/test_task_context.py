@@ -8,7 +8,7 @@ from distributed import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
 from tests.poolpart.helpers import LONG_S
 
-from poolpart.task_context import WorkerLeft, own_client, telling_departure
+from poolpart.task_context import WorkerLeavingError, own_client, translate_leaving_errors
 from poolpart.workers import worker_identities
 
 
@@ -88,7 +88,7 @@ class ClosingWorker:
 def test_what_is_raised_while_a_worker_leaves_says_so(monkeypatch):
     monkeypatch.setattr("poolpart.task_context.get_worker", ClosingWorker)
     message = r"The worker has left the cluster \(AttributeError: 'NoneType' object has no"
-    with pytest.raises(WorkerLeft, match=message) as caught, telling_departure():
+    with pytest.raises(WorkerLeavingError, match=message) as caught, translate_leaving_errors():
         None.queue_get  # noqa: B018 - what Dask does with a client that was closed
     assert caught.value.__cause__ is None
 
@@ -97,5 +97,5 @@ def test_what_is_raised_while_a_worker_leaves_says_so(monkeypatch):
 def test_on_a_worker_that_stays_errors_are_what_they_are(monkeypatch, status):
     monkeypatch.setattr(ClosingWorker, "status", status)
     monkeypatch.setattr("poolpart.task_context.get_worker", ClosingWorker)
-    with pytest.raises(ZeroDivisionError), telling_departure():
+    with pytest.raises(ZeroDivisionError), translate_leaving_errors():
         1 / 0  # noqa: B018

@@ -9,7 +9,7 @@ from distributed import wait
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition
-from poolpart.task_table import KEPT, TaskRow, TaskTable
+from poolpart.task_table import MAX_ENDED_TASKS, TaskRow, TaskTable
 
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
@@ -97,10 +97,12 @@ def test_the_time_of_a_running_task(part, wait_until):
 
 def test_only_the_last_that_have_ended_are_kept(part):
     part.tasks()
-    futures = part.client.map(after, range(KEPT + 5), resources={"A": 1}, key="many", batch_size=50)
+    futures = part.client.map(
+        after, range(MAX_ENDED_TASKS + 5), resources={"A": 1}, key="many", batch_size=50
+    )
     wait(futures, LONG_S)
     rows = part.tasks()
-    assert len(rows) == KEPT and {row.state for row in rows} == {"done"}
+    assert len(rows) == MAX_ENDED_TASKS and {row.state for row in rows} == {"done"}
 
 
 def test_the_table_is_printed_in_notebooks_and_as_a_frame(part):

@@ -24,7 +24,7 @@ def two(start):
 def both(monkeypatch):
     """Call two functions so that both have looked at the cluster before either changes it."""
     looked = threading.Barrier(2, timeout=LONG_S)
-    ask = pool.ask
+    ask = pool.call_steward
 
     def wait_and_ask(*args, **kwargs):
         looked.wait()
@@ -37,10 +37,10 @@ def both(monkeypatch):
             except PoolError as error:
                 return error
 
-        monkeypatch.setattr(pool, "ask", wait_and_ask)
+        monkeypatch.setattr(pool, "call_steward", wait_and_ask)
         with ThreadPoolExecutor(2) as threads:
             outcomes = list(threads.map(outcome, functions))
-        monkeypatch.setattr(pool, "ask", ask)
+        monkeypatch.setattr(pool, "call_steward", ask)
         return outcomes
 
     return call

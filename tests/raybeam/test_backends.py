@@ -12,7 +12,7 @@ import pytest
 
 from raybeam import BackendUnavailable, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
-from raybeam.instances import plain
+from raybeam.instances import single_mesh_scene
 from raybeam.mesh import local_mesh
 from raybeam.tile_backend import TileBackend
 
@@ -23,7 +23,7 @@ def test_auto_takes_the_first_that_can_be_used(monkeypatch):
     usable = [name for name, reason in available_backends().items() if not reason]
     assert RayCaster(*MESH).backend == usable[0]
     for backend in (CudaBackend, TileBackend):
-        monkeypatch.setattr(backend, "missing", classmethod(lambda _: "not today"))
+        monkeypatch.setattr(backend, "unavailable_reason", classmethod(lambda _: "not today"))
     assert RayCaster(*MESH).backend == "numpy"
 
 
@@ -40,7 +40,7 @@ def test_what_cannot_be_had_says_why(monkeypatch):
     with pytest.raises(ValueError, match="threads must be at least 1"):
         RayCaster(*MESH, backend="numpy", threads=0)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "pip install cupy" in CudaBackend.missing()
+    assert "pip install cupy" in CudaBackend.unavailable_reason()
     with pytest.raises(BackendUnavailable, match=r"'tiles' cannot be used: .* run pip install"):
         RayCaster(*MESH, backend="tiles")
 
@@ -74,7 +74,7 @@ def test_threads_of_one_process_may_share_a_caster(backend, shapes):
 
 def test_device_that_is_not_there(source_backend):
     with pytest.raises(ValueError, match=r"CUDA device 99 does not exist. This process has 1 "):
-        source_backend(plain(local_mesh(*MESH)), device=99)
+        source_backend(single_mesh_scene(local_mesh(*MESH)), device=99)
 
 
 class CudaError(RuntimeError):
@@ -111,7 +111,7 @@ def test_what_cuda_lacks(monkeypatch, devices, version, headers, words):
     monkeypatch.setitem(sys.modules, "cuda", SimpleNamespace(pathfinder=finder))
     monkeypatch.setitem(sys.modules, "cuda.pathfinder", finder)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
-    assert re.search(words, CudaBackend.missing())
+    assert re.search(words, CudaBackend.unavailable_reason())
 
 
 def casting_threads():

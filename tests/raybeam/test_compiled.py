@@ -203,7 +203,7 @@ def test_a_loop_that_cannot_be_kept_runs_with_a_note(package, function, caplog):
 def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
     """Numba would compile it for 0, and again for what the loop counts."""
 
-    @compiled.stage
+    @compiled.noinline
     def more(number):
         return number + 1
 
@@ -219,7 +219,7 @@ def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
 
 def test_compiling_is_told_once_and_not_when_loops_are_loaded(package):
     tell = (
-        "import logging, sys; import raybeam.compiled as c; c._TOLD_AFTER_S = 1e-9; "
+        "import logging, sys; import raybeam.compiled as c; c._LOG_AFTER_S = 1e-9; "
         "logging.basicConfig(level=logging.INFO, stream=sys.stdout, format='%(message)s'); "
         "import loops.more"
     )

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from raybeam import Pattern, device
-from raybeam.device import Outbox
-from raybeam.instances import plain
+from raybeam.device import CopyQueue
+from raybeam.instances import single_mesh_scene
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
@@ -30,7 +30,7 @@ def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, 
     cupy = source_backend.load_cupy()
     monkeypatch.setattr(type(cupy.empty(1)), "set", copy)
     monkeypatch.setattr(cupy.cuda.Stream, "synchronize", synchronize)
-    engine = source_backend(plain(mesh))
+    engine = source_backend(single_mesh_scene(mesh))
     engine.scan(check_scan(Pattern(np.eye(3)), [0, 0, 0]))
     assert len(read) > 1
     assert all(read)
@@ -48,8 +48,8 @@ def test_page_locked_memory_is_bounded_and_comes_back(source_backend, monkeypatc
         return bytearray(size)
 
     monkeypatch.setattr(cupy.cuda, "alloc_pinned_memory", allocate)
-    outbox = Outbox(cupy)
-    rooms = [device.host_array(cupy, 1000, np.uint8) for _ in range(3)]
+    outbox = CopyQueue(cupy)
+    rooms = [device.pinned_array(cupy, 1000, np.uint8) for _ in range(3)]
     assert locked == [1000, 1000]
     sent = [cupy.asarray(np.full(1000, number, np.uint8)) for number in range(3)]
     outbox.send([*zip(sent, rooms, strict=True)])
@@ -57,14 +57,14 @@ def test_page_locked_memory_is_bounded_and_comes_back(source_backend, monkeypatc
     assert [room[0] for room in rooms] == [0, 1, 2]  # the third, too
     view = rooms[0][:10]
     del rooms
-    assert device.host_array(cupy, 1000, np.uint8).nbytes == 1000
+    assert device.pinned_array(cupy, 1000, np.uint8).nbytes == 1000
     assert len(locked) == 3  # of the two that were read, one is held by a view
     del view
 
 
 def test_an_error_after_which_all_calls_fail_is_told_from_others(source_backend, monkeypatch):
     cupy = source_backend.load_cupy()
-    engine = source_backend(plain(local_mesh(np.eye(3), np.array([[0, 1, 2]]))))
+    engine = source_backend(single_mesh_scene(local_mesh(np.eye(3), np.array([[0, 1, 2]]))))
     assert not engine.device_lost
 
     def synchronize(self):

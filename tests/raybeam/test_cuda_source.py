@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from raybeam.cuda_backend import flags, source
+from raybeam.cuda_backend import compiler_options, kernel_source
 
 CARDS = (75, 80, 86, 89, 90, 100, 120)
 AS_CUPY = "-ftz=true"  # what it adds of itself
 # {(whether there are instances, whether there are masks): options}
-FLAGS = {kind: (*flags(64, *kind), AS_CUPY) for kind in product((False, True), repeat=2)}
+FLAGS = {kind: (*compiler_options(64, *kind), AS_CUPY) for kind in product((False, True), repeat=2)}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def report(nvcc, folder, card, kind):
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
     if f"compute_{card}" not in known.split():
         pytest.skip(f"this nvcc does not know sm_{card}")
-    (folder / "kernels.cu").write_text(source())
+    (folder / "kernels.cu").write_text(kernel_source())
     done = subprocess.run(
         [nvcc, *FLAGS[kind], f"-arch=sm_{card}", "-cubin", "--resource-usage",
          "-o", str(folder / "out.cubin"), str(folder / "kernels.cu")],
@@ -65,7 +65,7 @@ def report(nvcc, folder, card, kind):
 @pytest.mark.parametrize("card", CARDS)
 def test_compiles_without_spills(nvcc, tmp_path, card, kind):
     kernels = report(nvcc, tmp_path, card, kind)
-    assert len(kernels) == source().count("\nKERNEL ")
+    assert len(kernels) == kernel_source().count("\nKERNEL ")
     for name, (stack, stores, loads, registers) in kernels.items():
         assert (stores, loads) == (0, 0), name
         # The nodes that wait and nothing else: what has to be looked up is not kept there.
@@ -82,7 +82,7 @@ def test_compiles_without_spills(nvcc, tmp_path, card, kind):
 def test_nvrtc_compiles_as_cupy_does(card, kind):
     cupy = pytest.importorskip("cupy", reason="CuPy is not installed")
     nvrtc = cupy.cuda.nvrtc
-    program = nvrtc.createProgram(source(), "intersect.cu", (), ())
+    program = nvrtc.createProgram(kernel_source(), "intersect.cu", (), ())
     try:
         nvrtc.compileProgram(program, (*FLAGS[kind], f"-arch=sm_{card}"))
     except nvrtc.NVRTCError:
@@ -95,4 +95,4 @@ def test_nvrtc_compiles_as_cupy_does(card, kind):
 
 def test_no_headers():
     """NVRTC has none, and g++ and nvcc would not mind."""
-    assert "#include" not in source() and "INFINITY" not in source()
+    assert "#include" not in kernel_source() and "INFINITY" not in kernel_source()

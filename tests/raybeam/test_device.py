@@ -9,7 +9,7 @@ from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 from tests.raybeam.test_scan import case_of
 
 from raybeam import BackendUnavailable, Instance, Mesh, Pattern, RayCaster, pattern_rays
-from raybeam.device import OtherHits
+from raybeam.device import ExternalHits
 from raybeam.scan import check_scan
 
 CASE = case_of("on the move, lever arms")
@@ -44,7 +44,7 @@ def visited(caster, scan, counters=None, others=None):
         rays.append([np.asarray(a.get()) for a in hits.rays()])
         assert len(hits) == len(found[-1][0])
 
-    counted = caster.visit(scan, use, counters, others)
+    counted = caster.scan_on_device(scan, use, counters, others)
     joined = [np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True)]
     return joined, [np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)], *counted
 
@@ -81,7 +81,7 @@ def test_instances_may_be_counted_as_a_whole(vase):
 def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
     rng = np.random.default_rng(5)
     ray = np.flatnonzero(rng.random(2000) < 0.3).astype(np.uint32)
-    others = OtherHits(ray, rng.uniform(0, 3, len(ray)), rng.integers(0, 9, len(ray), np.int32))
+    others = ExternalHits(ray, rng.uniform(0, 3, len(ray)), rng.integers(0, 9, len(ray), np.int32))
     many = vase.instance_count
     table = np.array([[0, 1]] * many + [[vase.face_count, 1]])
     scan = scan_of(tally=True, keep_every=2)
@@ -105,7 +105,7 @@ def test_other_backends_have_no_device(shapes):
     caster = RayCaster(*shapes["cube"](), backend="numpy")
     assert not caster.on_device
     with pytest.raises(BackendUnavailable, match="Use scan"):
-        caster.visit(scan_of(), print)
+        caster.scan_on_device(scan_of(), print)
 
 
 def test_the_example_of_the_page(played_cuda, capsys):  # noqa: F811

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from raybeam import RayCaster
-from raybeam.triangle import inside, intersect, shear
+from raybeam.triangle import intersect, is_inside, shear_rays
 
 pytest.importorskip("hypothesis")
 from hypothesis import HealthCheck, given, settings
@@ -72,6 +72,6 @@ def test_integer_triangles(backend, corners, origins, data):
 def test_rays_whose_areas_overflow_hit_nothing_and_warn_of_nothing(far):
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
     origins = np.array([[far, -far, 5], [far, far, far], [-far, 0, -far]])
-    rays = shear(origins, np.tile([0.0, 0.0, -1.0], (3, 1)))
+    rays = shear_rays(origins, np.tile([0.0, 0.0, -1.0], (3, 1)))
     plane = intersect(rays, np.arange(3), corners, np.zeros(3, int))
-    assert not inside(plane.a, plane.b, plane.c, plane.det).any()
+    assert not is_inside(plane.a, plane.b, plane.c, plane.det).any()

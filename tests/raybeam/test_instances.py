@@ -171,24 +171,26 @@ def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest
     before = caster.cast(origins, directions)
     # The last one goes far away, so the scene's coordinates change.
     for number, place in ((3, shift(1, 2, 3)), (7, np.eye(4)), (0, shift(90, 50, -40))):
-        caster.move(number, place)
+        caster.set_transforms(number, place)
         instances[number] = Instance(instances[number].mesh, place)
     after = caster.cast(origins, directions)
     assert (after.instance != before.instance).any()
     same(after, RayCaster.from_instances(instances, backend).cast(origins, directions))
     together = RayCaster.from_instances(forest("uneven", 8)[0], backend)
-    together.move([3, 7, 0], np.stack([shift(1, 2, 3), np.eye(4)[:3], shift(90, 50, -40)]))
+    together.set_transforms(
+        [3, 7, 0], np.stack([shift(1, 2, 3), np.eye(4)[:3], shift(90, 50, -40)])
+    )
     same(together.cast(origins, directions), after)
     with pytest.raises(IndexError, match="Instance 41"):
-        caster.move([2, 41], [np.eye(4)] * 2)
+        caster.set_transforms([2, 41], [np.eye(4)] * 2)
     with pytest.raises(ValueError, match="instance 6 is singular"):
-        caster.move([2, 6], [np.eye(4), np.diag([1, 1, 0, 1])])
+        caster.set_transforms([2, 6], [np.eye(4), np.diag([1, 1, 0, 1])])
     with pytest.raises(ValueError, match="2 instances require transforms"):
-        caster.move([2, 6], np.eye(4)[None])
+        caster.set_transforms([2, 6], np.eye(4)[None])
     with pytest.raises(IndexError, match="Instance 40"):
-        caster.move(40, np.eye(4))
+        caster.set_transforms(40, np.eye(4))
     with pytest.raises(ValueError, match="instance 5 is singular"):
-        caster.move(5, np.zeros((3, 4)))
+        caster.set_transforms(5, np.zeros((3, 4)))
     same(caster.cast(origins, directions), after)
 
 
@@ -220,7 +222,7 @@ def test_an_instance_without_a_transform_is_its_mesh(backend, shapes):
     same(alone.cast(origins, directions), want)
     assert (want.instance == np.where(want.hit, 0, -1)).all()
     with pytest.raises(ValueError, match="cannot be moved"):
-        alone.move(0, np.eye(4))
+        alone.set_transforms(0, np.eye(4))
 
 
 @pytest.mark.extended

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from raybeam import (
-    Deforming,
+    DeformingMesh,
     Instance,
     Mesh,
-    Moving,
+    MovingBodies,
     Opacity,
     Pattern,
     PoseMotion,
@@ -18,8 +18,8 @@ from raybeam import (
     triangle,
 )
 from raybeam import moving as module
-from raybeam.moving import hits_on
-from raybeam.pattern_rays import checked_rays
+from raybeam.moving import nearest_body_hits
+from raybeam.pattern_rays import compute_rays
 from raybeam.scan import check_scan
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -71,11 +71,11 @@ class Bodies:
             RayCaster.from_instances([Instance(mesh)], backend, threads=1) for mesh in shapes
         ]
         boxes = np.array([[[-2, -1, -0.7], [2, 1, 0.7]], *2 * [[[-1.0, -1, 0], [1, 1, 0]]]])
-        return Moving(tuple(casters), boxes, self.shape, self.presence, self.poses)
+        return MovingBodies(tuple(casters), boxes, self.shape, self.presence, self.poses)
 
 
 def table(places, turns):
-    """Poses as `Moving.poses` gives them."""
+    """Poses as `MovingBodies.poses` gives them."""
     return np.concatenate([places.T, turns.transpose(1, 2, 0).reshape(9, -1)])
 
 
@@ -125,7 +125,7 @@ def scans(kind, rays=RAYS):
 
 def by_all(moving, scan, times):
     """Nearest hits, of each ray cast by itself at every body that is there."""
-    origins, directions = checked_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
+    origins, directions = compute_rays(scan.pattern, scan.first, np.arange(len(scan)), scan.poses)
     best = {}
     for body, (first, last) in enumerate(moving.presence):
         rows = np.flatnonzero((first <= times) & (times <= last))
@@ -161,14 +161,14 @@ def listed(hits):
 def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
     scan, times, around = scans(kind)
     moving = Bodies(70, 1, around).moving(backend)
-    hits = hits_on(moving, scan, lambda ray: times[ray])
+    hits = nearest_body_hits(moving, scan, lambda ray: times[ray])
     expected = by_all(moving, scan, times)
     assert len(expected) > 80 and listed(hits) == expected
     assert len({body for _, _, body, _ in expected}) > 10
     monkeypatch.setattr(module, "CHUNK_RAYS", 650)
     monkeypatch.setattr(module, "CHUNK_PAIRS", 7)
     monkeypatch.setattr(module, "CHUNK_POSES", 999)
-    assert listed(hits_on(moving, scan, lambda ray: times[ray])) == expected
+    assert listed(nearest_body_hits(moving, scan, lambda ray: times[ray])) == expected
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
 def test_hits_of_a_million_rays(kind):
     scan, times, around = scans(kind, 1_000_000)
     moving = Bodies(30, 2, around).moving("tiles")
-    hits = hits_on(moving, scan, lambda ray: times[ray])
+    hits = nearest_body_hits(moving, scan, lambda ray: times[ray])
     assert listed(hits) == by_all(moving, scan, times)
 
 
@@ -184,13 +184,13 @@ def test_hits_of_a_million_rays(kind):
 def test_only_hits_before_what_stands_there_count(backend):
     scan, times, _ = scans("fan")
     moving = Bodies(24, 1).moving(backend)
-    hits = hits_on(moving, scan, lambda ray: times[ray])
+    hits = nearest_body_hits(moving, scan, lambda ray: times[ray])
     ray = rays_of(hits)
     ends = hits.distance.copy()
     third = ray[::3]
     ends[third] = np.nextafter(hits.distance[third], np.inf)
     ends[ray[2::3]] /= 2
-    before = hits_on(moving, scan, lambda ray: times[ray], ends)
+    before = nearest_body_hits(moving, scan, lambda ray: times[ray], ends)
     assert rays_of(before).tolist() == third.tolist()
     assert before.distance[third].tolist() == hits.distance[third].tolist()
 
@@ -203,7 +203,7 @@ def test_of_equal_distances_the_first_body_counts(backend):
     bodies.presence[:] = [-np.inf, np.inf]
     bodies.shape[:] = 0
     scan, times, _ = scans("fan")
-    hits = hits_on(bodies.moving(backend), scan, lambda ray: times[ray])
+    hits = nearest_body_hits(bodies.moving(backend), scan, lambda ray: times[ray])
     assert len(rays_of(hits)) > 50 and hits.body.max() == 0
 
 
@@ -212,14 +212,14 @@ def test_most_rays_are_not_looked_at(monkeypatch):
     scan, times, _ = scans("fan")
     moving = Bodies(24, 1).moving("numpy")
     asked = []
-    cast_crossing = RayCaster.cast_crossing
+    cast_pairs = RayCaster.cast_pairs
 
-    def noted(caster, crossing, nearest):
-        asked.append(len(crossing.row))
-        cast_crossing(caster, crossing, nearest)
+    def noted(caster, pairs, nearest):
+        asked.append(len(pairs.row))
+        cast_pairs(caster, pairs, nearest)
 
-    monkeypatch.setattr(RayCaster, "cast_crossing", noted)
-    hits = hits_on(moving, scan, lambda ray: times[ray])
+    monkeypatch.setattr(RayCaster, "cast_pairs", noted)
+    hits = nearest_body_hits(moving, scan, lambda ray: times[ray])
     assert len(rays_of(hits)) <= sum(asked) < 12 * len(rays_of(hits))
 
 
@@ -235,11 +235,13 @@ def test_rays_beside_the_moment_when_a_body_is_there_miss_it(backend, there):
 
     floor = RayCaster(FLAT[0] * 50, FLAT[1], backend, threads=1)
     boxes = np.array([[[-50.0, -50, 0], [50, 50, 0]]])
-    moving = Moving((floor,), boxes, np.zeros(1, int), np.array([there]), below)
+    moving = MovingBodies((floor,), boxes, np.zeros(1, int), np.array([there]), below)
     directions = np.tile([0.0, 0.01, -1], (128, 1))
     directions[:, 0] = np.linspace(-0.1, 0.1, 128)
     times = np.repeat([1.0, 2.0], [80, 48])
-    found = hits_on(moving, check_scan(Pattern(directions), [0, 0, 0]), lambda ray: times[ray])
+    found = nearest_body_hits(
+        moving, check_scan(Pattern(directions), [0, 0, 0]), lambda ray: times[ray]
+    )
     assert np.array_equal(found.body >= 0, (there[0] <= times) & (times <= there[1]))
 
 
@@ -258,21 +260,21 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     frames = points * random.uniform(0.6, 1.4, (6, 1, 3)) + random.normal(0, 0.05, (6, 1, 3))
     frames[:, :, 2] += 0.3 * np.sin(3 * points[:, 0] + np.arange(6)[:, None])
     doubled = np.concatenate([faces, faces])  # each triangle twice: the first is hit
-    shape = Deforming(frames, doubled)
+    shape = DeformingMesh(frames, doubled)
     offsets = random.uniform(0, 5, 9)
 
     def frame(body, times):
         return (offsets[body] + 60 * times) % 5
 
     kinds = np.zeros(9, np.intp)
-    moving = Moving((shape,), shape.box[None], kinds, bodies.presence, bodies.poses, frame)
+    moving = MovingBodies((shape,), shape.box[None], kinds, bodies.presence, bodies.poses, frame)
     rays = RAYS // 2
     directions = bodies.start[random.integers(0, 9, rays)] + random.normal(0, 1.5, (rays, 3))
     directions += [9, -0.2, 0]
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     times = np.sort(random.uniform(0, PERIOD, rays))
     scan = check_scan(Pattern(directions), [-9, 0.2, 0], t_min=0.3, t_max=30)
-    found = hits_on(moving, scan, lambda ray: times[ray])
+    found = nearest_body_hits(moving, scan, lambda ray: times[ray])
     expected = np.full(rays, np.inf), np.full(rays, -1), np.zeros(rays)
     for body in range(9):
         first, last = bodies.presence[body]
@@ -288,12 +290,12 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
             at = frame(body, times[ray])
             share = at - int(at)
             corners = ((1 - share) * frames[int(at)] + share * frames[int(at) + 1])[doubled]
-            sheared = triangle.shear(start[[number]], ahead[[number]])
+            sheared = triangle.shear_rays(start[[number]], ahead[[number]])
             count = len(doubled)
             a, b, c, det, t = triangle.intersect(
                 sheared, np.zeros(count, int), corners, np.arange(count)
             )
-            hit = triangle.inside(a, b, c, det) & (t >= 0.3) & (t <= 30)
+            hit = triangle.is_inside(a, b, c, det) & (t >= 0.3) & (t <= 30)
             nearest = np.where(hit, t, np.inf)
             if nearest.min() < expected[0][ray]:
                 expected[0][ray] = nearest.min()
@@ -321,4 +323,6 @@ def test_rays_aimed_at_bodies_from_anywhere(backend, seed):
     expected = by_all(bodies.moving("numpy"), scan, times)
     at_balls = np.flatnonzero(bodies.shape[aimed] == 0)  # others may pass through holes or beside
     assert len(at_balls) > 200 and {*at_balls} <= {ray for ray, *_ in expected}
-    assert listed(hits_on(bodies.moving(backend), scan, lambda ray: times[ray])) == expected
+    assert (
+        listed(nearest_body_hits(bodies.moving(backend), scan, lambda ray: times[ray])) == expected
+    )

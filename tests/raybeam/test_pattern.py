@@ -52,7 +52,7 @@ def test_a_given_step_is_taken():
     directions = grid(8, 90, 20).reshape(-1, 3)
     pattern = Pattern(directions, step=24)
     assert pattern.step == 24
-    assert pattern.divided(SubRays(np.zeros((2, 2)))).step == 24
+    assert pattern.with_sub_rays(SubRays(np.zeros((2, 2)))).step == 24
     assert Pattern(directions[:8], step=8).step == 8  # a single firing, which the head turns
     for step in (0, -1):
         with pytest.raises(ValueError, match=f"step must be at least 1, .* but is {step}"):

@@ -99,7 +99,7 @@ def hits_of(caster, origins, directions, *limits):
     """What `cast` finds of rays, as a scan gives it."""
     if len(directions) and np.abs((directions**2).sum(axis=1) - 1).max() > 1e-14:
         # Those that drift: not quite of unit length, which `cast` would make them.
-        found = caster.engine.closest(Rays(origins, directions, *(limits or (0.0, np.inf))))
+        found = caster.engine.closest_hits(Rays(origins, directions, *(limits or (0.0, np.inf))))
         ray = found.ray.astype(np.uint32)
         # The scale is private: it is about the engines' arithmetic, and hits come in meters.
         distance = found.t / caster._scene.frame.scale

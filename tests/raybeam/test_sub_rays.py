@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from raybeam import Moving, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
-from raybeam.moving import hits_on
-from raybeam.pattern_rays import plain_rays
+from raybeam import MovingBodies, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
+from raybeam.moving import nearest_body_hits
+from raybeam.pattern_rays import compute_rays_numpy
 from raybeam.poses import check_poses
 from raybeam.scan import check_scan
 
@@ -92,7 +92,7 @@ def check_rays_of_loops(place, kind, count):
     ray = rng.permutation(2_000)[:1_100]
     made = pattern_rays(given, ray, **where, start=4)
     asked = where["positions"], where["rotations"], where["rays_per_pose"], 2_000
-    plain = plain_rays(given, 4, ray, check_poses(*asked, where.get("motion")))
+    plain = compute_rays_numpy(given, 4, ray, check_poses(*asked, where.get("motion")))
     for one, other in zip(made, plain, strict=True):
         assert np.array_equal(one, other)
 
@@ -137,9 +137,9 @@ def test_sub_rays_hit_what_moves(shapes, kind):
         table[[3, 7, 11]] = 1
         return table
 
-    alone = Moving((shape,), corners[None], np.zeros(1, int), np.array([[-1.0, 1.0]]), stand)
+    alone = MovingBodies((shape,), corners[None], np.zeros(1, int), np.array([[-1.0, 1.0]]), stand)
     scan = check_scan(given, **where)
-    found = hits_on(alone, scan, lambda ray: 1e-6 * ray)
+    found = nearest_body_hits(alone, scan, lambda ray: 1e-6 * ray)
     expected = shape.scan(given, **where)
     ray = np.flatnonzero(found.body >= 0)
     assert np.array_equal(ray, expected.ray) and len(ray) > 100

@@ -239,7 +239,7 @@ def test_sub_rays_in_tiles_have_the_bits_of_numpy(shapes, subrays):
     """Windows begin within a firing and within a beam; poses change within them."""
     rng = np.random.default_rng(subrays)
     angles = rng.normal(0, 1e-3, (subrays, 2))
-    given = Pattern(lidar(), step=RINGS).divided(SubRays(angles))
+    given = Pattern(lidar(), step=RINGS).with_sub_rays(SubRays(angles))
     casters = [RayCaster(*shapes["vase"](), backend=name) for name in ("numpy", "tiles")]
     track = np.linspace([0.05, 0.1, 0.4], [0.1, 0.1, 0.3], 200)
     for window in [(0, 30_000), (7, 5_000), (RINGS * subrays * 3 + 1, 20_000)]:

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from raybeam import Instance, Mesh, Moving, Opacity, Pattern, RayCaster, SubRays, pattern_rays
-from raybeam.moving import hits_on
+from raybeam import Instance, Mesh, MovingBodies, Opacity, Pattern, RayCaster, SubRays, pattern_rays
+from raybeam.moving import nearest_body_hits
 from raybeam.scan import check_scan
 
 FIELDS = ("distance", "triangle", "u", "v", "instance")
@@ -111,7 +111,7 @@ def test_rays_at_many_instances(backend, shapes):
     casters = [RayCaster.from_instances(instances, each, threads=1) for each in ("numpy", backend)]
     hits = []
     for caster in casters:
-        caster.move(0, instance(shell, "two angles").transform)
+        caster.set_transforms(0, instance(shell, "two angles").transform)
         hits.append(caster.cast(ORIGIN, packets(60)))
     assert hits[0].hit.all() and np.array_equal(hits[1].distance, hits[0].distance)
 
@@ -149,10 +149,10 @@ def test_rays_at_moving_bodies(backend, shapes):
         shapes_of = tuple(RayCaster.from_instances([Instance(m)], name, threads=1) for m in meshes)
         boxes = sizes[:, None, None] * np.array([[-1.0] * 3, [1.0] * 3])
         presence = np.array([[0.0, 0.3], [0.0, 0.6], [0.0, 1.0]])
-        moving = Moving(shapes_of, boxes, np.arange(3), presence, poses)
+        moving = MovingBodies(shapes_of, boxes, np.arange(3), presence, poses)
         times = np.linspace(0, 1, len(directions))
         scan = check_scan(Pattern(directions), ORIGIN)
-        found.append(hits_on(moving, scan, lambda ray, times=times: times[ray]))
+        found.append(nearest_body_hits(moving, scan, lambda ray, times=times: times[ray]))
     assert set(found[0].body.tolist()) == {0, 1, 2}  # each ray hits a body
     for name in ("body", "distance", "triangle"):
         np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))
@@ -175,7 +175,9 @@ def test_sub_rays(backend, shapes):
     beams = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
     around = np.radians(60 * np.arange(6))
     angles = 1e-3 * np.stack([np.cos(around), np.sin(around)], axis=-1)
-    pattern = Pattern(beams.reshape(-1, 3)).divided(SubRays(np.concatenate([[[0, 0]], angles])))
+    pattern = Pattern(beams.reshape(-1, 3)).with_sub_rays(
+        SubRays(np.concatenate([[[0, 0]], angles]))
+    )
     _, directions = pattern_rays(pattern, np.arange(len(pattern)), ORIGIN)
     assert ((directions > -1e-18) & (directions < 0)).any()
     want, got = (

@@ -78,7 +78,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
             [".", "--pose", "0,0,0", "--pose", "1,0,0"],
             "`pose` contains 2 poses, but . has 4 sweeps. Pass",
         ),
-        ([".", "--white-intensity", "0"], "white must be above 0"),
+        ([".", "--white-intensity", "0"], "white must be a number above 0"),
     ],
 )
 def test_what_cannot_be_done_is_told_in_a_line(sweeps, lidarpool, monkeypatch, arguments, says):

@@ -65,8 +65,8 @@ def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
         ({"only": ["clod"]}, "Did you mean 'cloud'"),
         ({"size": (10, 10)}, "480 to 4096"),
         ({"only": ["cloud"], "color": "rang"}, "no column 'rang'"),
-        ({"only": "cloud"}, "only must be a list of text, but is 'cloud'"),
-        ({"size": 480}, "size must be a list of whole numbers, but is 480"),
+        ({"only": "cloud"}, "only must be a list, but is 'cloud'"),
+        ({"size": 480}, "size must be a list of 2 whole numbers, but is 480"),
     ):
         with pytest.raises(LidarError, match=words):
             result.pictures(tmp_path, **wrong)

@@ -151,7 +151,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
 
     monkeypatch.setattr(jobs, "_submit_job", submit)
     monkeypatch.setattr(jobs, "_close_job", close)
-    monkeypatch.setattr(poolpart.deploy.clusters, "LOOK_EVERY_S", 0.1)
+    monkeypatch.setattr(poolpart.deploy.clusters, "CHECK_EVERY_S", 0.1)
     options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
     told: list[str] = []
     with import_jobqueue().SLURMCluster(

@@ -242,7 +242,7 @@ def test_the_first_job_without_points_is_named(cluster_client, caplog):
 
 def test_errors_are_told_in_a_line(cluster_client):
     for options, words in (
-        ({"ahead": 0}, "ahead must be at least 1, but is 0"),
+        ({"ahead": 0}, "ahead must be a whole number at least 1, but is 0"),
         ({"split": "tran"}, r"Unknown split 'tran'\. Did you mean 'train'"),
         ({"split": "x"}, r"Unknown split 'x'\. Available splits: train, test"),
     ):

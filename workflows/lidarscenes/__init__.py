@@ -1,1 +1,1 @@
-"""Kinds of scenes that lidarsim lacks: files, robots, procedural worlds, HELIOS++ surveys."""
+"""Add scene formats, robots, procedural scenes, and importers for other simulators to lidarsim."""

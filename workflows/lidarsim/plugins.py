@@ -1,7 +1,6 @@
 """The imports of plug-ins of mesh files and packets, with examples in docs/how-to/plugins.md."""
 
 from .base.declared import about
-from .base.validation import checked_fields
 from .packets.encoders import Datagrams, PacketEncoder, PacketSource
 from .packets.service import Destination, Service
 from .packets.shots import CarryOver, Shots
@@ -23,5 +22,4 @@ __all__ = [
     "Service",
     "Shots",
     "about",
-    "checked_fields",
 ]

@@ -1,8 +1,8 @@
-"""Pictures, films and pages of scenes and points."""
+"""Draw pictures and films of scenes and point clouds, and serve them as browser pages."""
 
 from lidarsim.base.notebook import draw_with
 
-# Notebooks show these objects with a picture; whatever draws is imported with the first.
+# Notebooks show these objects with a picture. The drawing code is imported for the first picture.
 draw_with(
     {
         name: f"lidarview.cell_pictures:draw_{name.lower()}"

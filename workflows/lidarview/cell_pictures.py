@@ -1,4 +1,7 @@
-"""Small pictures of scenes, sensors, surveys and clouds, for the cells of notebooks."""
+"""Draw the small pictures that notebooks show for scenes, sensors, surveys, and clouds.
+
+`lidarview/__init__.py` registers each ``draw_CLASS`` function of this module by its name.
+"""
 
 from __future__ import annotations
 
@@ -24,26 +27,27 @@ from .picture_file import SensorPositions, sensor_positions
 from .render import theme
 from .render.beam_picture import beam_page
 from .render.camera import fit_camera
-from .render.coloring import colors_of
+from .render.coloring import make_coloring
 from .render.picture_page import Page
+from .render.pictures import draw_discs
 from .render.pictures import draw_scene as draw_objects
-from .render.pictures import splat
 from .render.shot import take_shot
 from .render.stage import PlotBox
 
-MAX_BYTES = 60_000  # bytes of a picture; notebooks keep all of them
+MAX_BYTES = 60_000  # maximum size of a picture, because notebooks store every picture
 MAX_POINTS = 60_000
 MAX_TRIANGLES = 200_000
-_PALETTES = (128, 32)  # numbers of colors, until a picture is small enough
+_PALETTES = (128, 32)  # numbers of colors to try until a picture is small enough
 _CHART = (0.09, 0.115, 0.72, 0.735)  # left, bottom, width, height on the page
 _BOX = (0.06, 0.2, 0.82, 0.94)  # left, top, right, bottom of the points on the page
-_SPREAD = (1, 99)  # percentiles of the positions that are in the picture
+_SPREAD = (1, 99)  # percentiles of the positions that the picture shows
 
 
-def small_png(png: bytes) -> bytes:
-    """Return a PNG with at most `MAX_BYTES`: with fewer colors, and if need be of half the size.
+def compress_png(png: bytes) -> bytes:
+    """Return a PNG of at most `MAX_BYTES`.
 
-    If both are too large, as of a picture of noise, the last form is returned.
+    The number of colors is reduced first, then the size is halved. If the result is still too
+    large, as it may be for a picture of noise, the smallest version is returned.
     """
     image = Image.open(io.BytesIO(png)).convert("RGB")
     half = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
@@ -56,7 +60,7 @@ def small_png(png: bytes) -> bytes:
 
 
 def draw_scene(scene: Scene) -> bytes:
-    """Draw a scene at time 0, each object in its color."""
+    """Draw a scene at time 0, with one color per object."""
     drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
     if len(drawn.faces) > MAX_TRIANGLES:
         drawn, _ = simplified(drawn, MAX_TRIANGLES)
@@ -68,16 +72,16 @@ def draw_scene(scene: Scene) -> bytes:
         caption=f"{sides} m",
         size=PICTURE_SIZE,
     )
-    return small_png(draw_objects(shot, scene.triangles).png())
+    return compress_png(draw_objects(shot, scene.triangles).png())
 
 
 def draw_sensor(sensor: Sensor) -> bytes:
     """Draw the directions of a sensor's first rays, colored by time."""
-    return small_png(beam_page(sensor, PICTURE_SIZE).png())
+    return compress_png(beam_page(sensor, PICTURE_SIZE).png())
 
 
 def draw_survey(survey: Survey) -> bytes:
-    """Draw the positions of a survey's sensors from above, with the directions of their x axes."""
+    """Draw a survey from above: the sensor positions, with arrows along the sensors' x axes."""
     page = Page(PICTURE_SIZE)
     sensors = sensor_positions(survey)
     limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
@@ -93,11 +97,15 @@ def draw_survey(survey: Survey) -> bytes:
     page.legend([*zip(names, colors, strict=True)], "")
     rays = f"{plural(survey.scan_count, 'scan')} · {plural(survey.ray_count, 'ray')}"
     page.title("Survey from above", f"{_positions_in_words(sensors)} · {rays}")
-    return small_png(page.png())
+    return compress_png(page.png())
 
 
 def _headings(survey: Survey, count: int = 24) -> Floats:
-    """Return positions and directions of the x axis of the first sensor, (k, 4): x, y, dx, dy."""
+    """Sample `count` poses of the first sensor.
+
+    Returns an array of shape (k, 4) with the columns x, y, dx, and dy, where (dx, dy) is the
+    horizontal direction of the sensor's x axis.
+    """
     last = survey.steps_each[0] * survey.path.stations - 1
     scans = np.unique(np.linspace(0, last, count).astype(int)).tolist()
     poses = [survey.pose(scan) for scan in scans]
@@ -105,7 +113,10 @@ def _headings(survey: Survey, count: int = 24) -> Floats:
 
 
 def _around(points: Floats) -> Floats:
-    """Return the corners (2, 2) of a box around points (n, 2), in the proportions of the chart."""
+    """Return the limits of a chart around points, in the aspect ratio of the chart.
+
+    `points` has shape (n, 2); the result has shape (2, 2), the lower and the upper corner.
+    """
     lower = points.min(axis=0)
     upper = points.max(axis=0)
     sides = np.array(_CHART[2:]) * PICTURE_SIZE
@@ -115,7 +126,7 @@ def _around(points: Floats) -> Floats:
 
 
 def _positions_in_words(sensors: list[SensorPositions]) -> str:
-    """Return the number of positions, or the length of the first trajectory."""
+    """Describe the number of positions, or the length of a moving sensor's trajectory."""
     if not sensors[0].moves:
         return plural(sum(len(sensor.positions) for sensor in sensors), "position")
     steps = np.diff(sensors[0].positions, axis=0)
@@ -123,9 +134,9 @@ def _positions_in_words(sensors: list[SensorPositions]) -> str:
 
 
 def draw_cloud(cloud: CloudLike) -> bytes | None:
-    """Draw points colored by height.
+    """Draw a cloud colored by height, or return None if the cloud is empty.
 
-    Of many points, an even choice is drawn. Returns None for an empty cloud.
+    A cloud with more than `MAX_POINTS` points is thinned out evenly.
     """
     total = len(cloud)
     positions = _sampled(cloud, -(-total // MAX_POINTS) or 1)
@@ -135,20 +146,20 @@ def draw_cloud(cloud: CloudLike) -> bytes | None:
     positions = positions[((positions >= box[0]) & (positions <= box[1])).all(axis=1)]
     page = Page(PICTURE_SIZE)
     if len(positions):
-        coloring = colors_of(positions[:, 2], Z)
+        coloring = make_coloring(positions[:, 2], Z)
         image = _image_of(positions, coloring.paint(positions[:, 2]), box)
         page.figure.figimage(image, zorder=-1)
         page.color_bar(coloring.scale, Normalize(*coloring.limits or (0, 1)), "z (m)")
     sides = " × ".join(f"{side:,.1f}" for side in np.ptp(cloud.bounds, axis=0))
     page.title("Point cloud by height", f"{plural(total, 'point')} · {sides} m")
-    return small_png(page.png())
+    return compress_png(page.png())
 
 
 draw_storedcloud = draw_cloud
 
 
 def _sampled(cloud: CloudLike, step: int) -> Floats:
-    """Return the position of every `step`-th point of a cloud, (n, 3)."""
+    """Return the positions (n, 3) of every `step`-th point of a cloud."""
     pieces = [np.zeros((0, 3))]
     first = 0
     for piece in cloud.chunks():
@@ -158,7 +169,11 @@ def _sampled(cloud: CloudLike, step: int) -> Floats:
 
 
 def _image_of(positions: Floats, colors: Floats, box: Floats) -> Floats32:
-    """Return a picture (height, width, 4) of points (n, 3) in a box (2, 3), seen from above."""
+    """Render points as an RGBA image, viewed obliquely from above.
+
+    `positions` has shape (n, 3), `colors` (n, 3), and `box` (2, 3). The image has shape
+    (height, width, 4).
+    """
     origin = np.round(box.mean(axis=0))
     stage = PlotBox.from_bounds(box - origin, origin)
     is_wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
@@ -170,4 +185,4 @@ def _image_of(positions: Floats, colors: Floats, box: Floats) -> Floats32:
     width, height = PICTURE_SIZE
     radius = float(np.clip(180 / np.sqrt(len(positions)), 1.5, 5.0))
     empty = np.zeros((height, width, 4), np.float32)
-    return splat(empty, pixels[order], opaque[order], radius)
+    return draw_discs(empty, pixels[order], opaque[order], radius)

@@ -1,4 +1,4 @@
-"""The data of a result's pictures, except the cloud, in a separate file."""
+"""Store the data for a result's pictures, except the cloud, in a separate file."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from lidarsim.sweeps.sweeps import numbered_places
 
 PICTURE_FILE = "pictures.npz"
 
-MAX_MODELS = 4  # sensors named in a picture
-MAX_POSITIONS = 1000  # positions of a moving sensor or actor
+MAX_MODELS = 4  # maximum number of sensor models in a caption
+MAX_POSITIONS = 1000  # maximum number of positions of a moving sensor or actor
 _FORMAT = 6
 # {name in the file: field of an actor's track}
 _TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
@@ -44,18 +44,18 @@ _PATH_LENGTHS = {
 class SensorPositions:
     """Positions of a sensor over time."""
 
-    times_ns: Floats  # (k,), ascending, nanoseconds since the survey's start
-    positions: Floats  # (k, 3), meters, local coordinates
-    moves: bool = False  # continuously; else the sensor stays at each position until the next time
-    name: str = ""  # "" for a single sensor
+    times_ns: Floats  # (k,) ascending, relative to the start of the survey
+    positions: Floats  # (k, 3) local, in meters
+    moves: bool = False  # if False, the sensor stays at each position until the next time
+    name: str = ""  # empty for a single sensor
     model: str = ""
 
     @property
     def labels(self) -> list[str]:
-        """Name of each position, (k,), as the picture of stations has them: 1, 2, … in order.
+        """Label of each position, numbered in the same order as in the picture of stations.
 
-        A position that the sensor returns to has its first number. A sensor that stays at one
-        position, or moves, has its own name.
+        A position that the sensor returns to keeps its first number. If the sensor stays at one
+        position, the label is the name of the sensor. A moving sensor has no labels.
         """
         if self.moves or not len(self.positions):
             return []
@@ -65,7 +65,7 @@ class SensorPositions:
         return [f"{self.name} {number}".strip() for number in numbers.tolist()]
 
     def position_at(self, time_ns: float) -> Floats:
-        """Return the position at a time, (3,)."""
+        """Return the position (3,) at a time."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
         last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
@@ -74,51 +74,49 @@ class SensorPositions:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPath:
-    """The best path of a search in the plane, for pictures."""
+    """The best path of a path search in the plane."""
 
-    corners: Floats  # (w, 2), from start to target, meters, local coordinates
+    corners: Floats  # (w, 2) from start to target, local, in meters
     length_m: float
-    shortest_m: float  # length of the shortest path; inf if discs cut off the target
-    clearance_m: float  # smallest distance to a disc; negative within a disc, inf without discs
-    trials: Sequence[Floats] = ()  # (w, 2) each: corners of each trial's path between the ends
+    shortest_m: float  # length of the shortest path, infinite if discs block the target
+    clearance_m: float  # distance to the nearest disc: negative inside, infinite without discs
+    trials: Sequence[Floats] = ()  # (w, 2) corners of each trial's path, without its ends
 
     @property
     def excess(self) -> float:
-        """Length of the path over the shortest length, less 1: 0.01 is 1%."""
+        """Relative excess over the shortest length; 0.01 means 1 % longer."""
         return self.length_m / self.shortest_m - 1
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningPicture:
-    """A search for a path in the plane, for pictures, in meters of local coordinates."""
+    """A path search in the plane, in local coordinates in meters."""
 
     start: tuple[float, float]
     target: tuple[float, float]
-    centers: Floats  # (m, 2): centers of the discs to keep out of
-    radii: Floats  # (m,): radii of the discs
-    best: PlannedPath | None = None  # None before the end of all trials
+    centers: Floats  # (m, 2) centers of the discs to avoid
+    radii: Floats  # (m,) radii of the discs
+    best: PlannedPath | None = None  # None until all trials have finished
 
 
 @dataclass(frozen=True, eq=False)
 class PictureContent:
-    """Content of a result's pictures, except the points."""
+    """The content of a result's pictures, except the points."""
 
-    scene: Scene  # actors have a thousand positions at most, and poses for pictures
+    scene: Scene  # the trajectories of actors have at most `MAX_POSITIONS` positions
     sensors: Sequence[SensorPositions]
-    hit_counts: AnyArray  # (f,): of each triangle, triangles of actors last
-    sample_rays: Floats32  # (k, 2, 3): ends of some rays, meters, local coordinates
+    hit_counts: AnyArray  # (f,) hits on each triangle, the actors' triangles last
+    sample_rays: Floats32  # (k, 2, 3) start and end points of some rays, local, in meters
     planning: PlanningPicture | None = None
-    duration_ns: float = 0.0  # duration of the survey, by its own clock
-    extra_columns: Sequence[
-        Column
-    ] = ()  # columns of the cloud's file that are not in the table of columns
-    # (objects,): share of light that each object reflects, actors last; None if unknown.
+    duration_ns: float = 0.0  # duration of the survey
+    extra_columns: Sequence[Column] = ()  # columns of the cloud that are not in `TABLE`
+    # (objects,) share of light that each object reflects, actors last; None if unknown
     reflectance: Floats | None = None
-    coordinates: str = "world"  # frame of the cloud's points; "sensor" does not fit the scene
-    triangles: int = 0  # triangles of the scene, though simpler instances may be drawn
+    coordinates: str = "world"  # frame of the points; the scene is not shown with "sensor"
+    triangles: int = 0  # number of triangles in the scene; simpler instances may be drawn
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
-    face_materials: Ints32 | None = None  # (f,): material of each static triangle, -1 for none
+    face_materials: Ints32 | None = None  # (f,) material of each static triangle, -1 for none
 
     @classmethod
     def before_casting(
@@ -126,7 +124,7 @@ class PictureContent:
     ) -> tuple[PictureContent, SimplifiedScene]:
         """Return the content that is known before rays are cast, and the drawn scene.
 
-        The drawn scene turns hits of the scene's triangles into `hit_counts`.
+        The drawn scene converts hits on the triangles of the scene to `hit_counts`.
         """
         samples = samples_per_actor(scene.actors, MAX_POSITIONS)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
@@ -157,7 +155,10 @@ class PictureContent:
 
     @property
     def caption(self) -> str:
-        """Number of sensors, and the time of pictures with motion: half of the survey."""
+        """Number of sensors and, if anything moves, the time that a picture shows.
+
+        Pictures show the middle of the survey.
+        """
         sensors = len(self.sensors)
         actors = len(self.scene.actors)
         if any(sensor.moves for sensor in self.sensors):
@@ -173,7 +174,7 @@ class PictureContent:
 
     @property
     def models(self) -> str:
-        """Models of the sensors, with the names of named sensors."""
+        """Sensor models, with the names of named sensors."""
         models = [
             f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
             for sensor in self.sensors
@@ -184,7 +185,7 @@ class PictureContent:
         return " · ".join(models)
 
     def names_of(self, column: Column) -> Sequence[str]:
-        """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
+        """Return the names of the values 0, 1, 2, … in a column, or nothing if they are unnamed."""
         if column.name == "sensor":
             return [sensor.name for sensor in self.sensors]
         if column == TABLE["cause"]:
@@ -199,7 +200,7 @@ class PictureContent:
     def save(self, path: Path) -> None:
         """Write the content as a NumPy archive.
 
-        The same content gives the same bytes.
+        The same content always results in the same bytes.
         """
         names = {
             "objects": self.scene.names,
@@ -216,7 +217,7 @@ class PictureContent:
             "vertices": self.scene.vertices,
             "faces": self.scene.faces,
             "face_object": self.scene.face_object,
-            # NumPy strings all have the length of the longest, and lose trailing zeros.
+            # NumPy would pad strings to the longest and strip trailing null characters.
             "names": np.frombuffer(json.dumps(names).encode(), np.uint8),
             "origin": self.scene.origin,
             "duration_ns": self.duration_ns,
@@ -233,7 +234,7 @@ class PictureContent:
         path.write_bytes(packed(arrays))
 
     def _track_arrays(self) -> dict[str, Any]:
-        """Return the positions of sensors and the trajectories of actors, {name in the file: …}."""
+        """Return the positions of sensors and the trajectories of actors as named arrays."""
         arrays: dict[str, Any] = {}
         for number, sensor in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = sensor.times_ns
@@ -249,7 +250,7 @@ class PictureContent:
         return arrays
 
     def _mesh_arrays(self) -> dict[str, Any]:
-        """Return the meshes of actors and their animations, {name in the file: array}."""
+        """Return the meshes of actors and their animations as named arrays."""
         arrays: dict[str, Any] = {}
         meshes, arrays["actor_mesh"] = distinct_meshes(self.scene.actors)
         for number, mesh in enumerate(meshes):
@@ -268,10 +269,7 @@ class PictureContent:
         return arrays
 
     def _planning_arrays(self) -> dict[str, Any]:
-        """Return the search and its best path, {name in the file: array}.
-
-        The result is empty without a path.
-        """
+        """Return the path search and its best path as named arrays, or nothing without a path."""
         planning = self.planning
         if planning is None or planning.best is None:
             return {}
@@ -287,26 +285,24 @@ class PictureContent:
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
-        """Read a file that `save` wrote.
+        """Read a file that `save` has written.
 
-        Raises LidarError if the file is damaged.
-
-        No code in the file is run.
+        The file cannot contain executable code. Raises LidarError if the file is damaged.
         """
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 
     @classmethod
     def load_from(cls, folder: Path) -> PictureContent | None:
-        """Read the file in the folder of a result, or None if there is none."""
+        """Read the picture file in a result folder, or return None if there is none."""
         path = folder / PICTURE_FILE
         return cls.load(path) if path.exists() else None
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
-        """Build the content from the arrays of a file.
+        """Build the content from the arrays in a file.
 
-        Raises ValueError for another format.
+        Raises ValueError if the file has another format version.
         """
         if (version := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"its format version is {version}; expected {_FORMAT}")
@@ -364,7 +360,7 @@ class PictureContent:
 
 
 def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
-    """Return the search and the path that an archive holds."""
+    """Return the path search and its best path from the arrays in a file."""
     lengths = {field: arrays[name].item() for name, field in _PATH_LENGTHS.items()}
     best = PlannedPath(arrays["path"], **lengths, trials=tuple(arrays["waypoints"]))
     (x0, y0), (x1, y1) = arrays["ends"].tolist()
@@ -372,12 +368,12 @@ def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
 
 
 def _colors(arrays: Mapping[str, Any], name: str) -> Colors | None:
-    """Return the colors of faces, if the archive has any."""
+    """Return the colors of faces, or None if the file has none."""
     return Colors.of_faces(arrays[name]) if name in arrays else None
 
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
-    """Return the poses of a mesh, if the archive has any."""
+    """Return the animation of a mesh, or None if the file has none."""
     if (steps := arrays.get(f"{mesh}_steps")) is None:
         return None
     step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
@@ -385,13 +381,13 @@ def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
 
 
 def sensor_positions(survey: Survey) -> list[SensorPositions]:
-    """Return positions of each sensor: at each station, or samples of the trajectory."""
+    """Return the positions of each sensor: its stations, or samples of its trajectory."""
     path = survey.path
     sensors: list[SensorPositions] = []
     first = 0
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         stop = first + steps * path.stations
-        scans: Iterable[int] = range(first, stop, steps)  # the first at each station
+        scans: Iterable[int] = range(first, stop, steps)  # the first scan at each station
         if path.moves:
             scans = np.unique(np.linspace(first, stop - 1, MAX_POSITIONS).astype(int)).tolist()
         times = np.array([survey.begins_ns(scan) for scan in scans])
@@ -406,9 +402,10 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
 def moving_positions(
     sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Return the positions (k, 3) that a picture of a survey with motion has to show.
+    """Return the positions (k, 3) that a picture of a survey with motion must show.
 
-    These are the positions of moving sensors, else of actors and sensors; empty without motion.
+    These are the positions of the moving sensors or, if only actors move, of all sensors and
+    actors. The result is empty without motion.
     """
     moving = [sensor.positions for sensor in sensors if sensor.moves]
     if moving or not actors:
@@ -419,14 +416,15 @@ def moving_positions(
 
 
 def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
-    """Return an actor whose trajectory is sampled at times of a survey."""
+    """Return an actor whose trajectory is sampled at `count` times of a survey."""
     times, positions, rotations = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
     track = Track(times / 1e9, positions, rotations, start_s=0.0, beyond=beyond)
     sampled = replace(actor, trajectory=track)
     if (animation := actor.mesh.animation) is None:
         return sampled
-    # The animation may follow the trajectory. The samples lack its part before the survey.
+    # The animation may depend on the distance along the trajectory. The sampled trajectory lacks
+    # the part before the survey.
     missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
     mesh = replace(actor.mesh, animation=animation.pictured)
     return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

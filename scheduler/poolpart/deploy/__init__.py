@@ -1,7 +1,6 @@
-"""Clusters whose workers form partitions from the start: on this machine, in queues, over SSH.
+"""Clusters whose workers form partitions from the start: local, in queues, over SSH, in Kubernetes.
 
-Worker groups of Kubernetes are scaled. Partitions and pipes need none of it: they divide any
-running cluster.
+Partitions and pipes do not need these modules, because they can divide any running cluster.
 """
 
 from .clusters import start_partitions

@@ -1,6 +1,7 @@
-"""Partitions whose workers are jobs of a queue, or processes that SSH starts.
+"""Partitions whose workers are jobs of a queue or processes that are started over SSH.
 
-Their number is fixed, or follows the work; then `adapting.py` decides, on the scheduler.
+The number of jobs is fixed, or follows the work. In the latter case, `adapting.py` decides on the
+scheduler which jobs to start and end.
 """
 
 from __future__ import annotations
@@ -21,25 +22,25 @@ from distributed import SpecCluster, Status
 from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
-from ..adapting import IDLE_S, Bounds, JobKind, begin, look
+from ..adapting import IDLE_S, JobBounds, JobSpec, add_partitions, advise_jobs
 from ..errors import PoolError
-from ..internals.names import ADAPTING, CLUSTERS, require
-from ..internals.scheduler import ask_of_cluster
+from ..internals.names import ADAPTING, CLUSTERS, require_feature
+from ..internals.scheduler import run_on_cluster_scheduler
 from ..rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
 
-_NAME = "poolpart"  # name of what looks after the jobs of a cluster
-ADAPT_EVERY_S = 1.0  # seconds between two adaptations of the partitions to their tasks
-LOOK_EVERY_S = 5.0  # seconds between two looks for workers that are gone
-INFORMATION = " - INFO - "  # marks lines of Dask's logs that are not complaints
-_DEATH_S = 60  # a worker that finds no scheduler for so long ends, like a worker of dask-jobqueue
+_NAME = "poolpart"  # name of the cluster's periodic callback that manages the jobs
+ADAPT_EVERY_S = 1.0  # interval at which partitions are adapted to their tasks
+CHECK_EVERY_S = 5.0  # interval between checks for lost workers
+INFO_MARK = " - INFO - "  # identifies lines in Dask's logs that are not warnings or errors
+_DEATH_S = 60  # time without a scheduler after which a worker exits, as in dask-jobqueue
 
 
 def start_partitions(
     cluster: SpecCluster,
     partitions: Mapping[str, Mapping[str, Any]],
-    tell: Callable[[str], object] = logger.warning,
+    report: Callable[[str], object] = logger.warning,
 ) -> None:
     """Start the workers of partitions on a dask-jobqueue cluster or an `SSHCluster`.
 
@@ -63,7 +64,7 @@ def start_partitions(
         example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster` accepts
         ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and ``hosts``.
         Workers are distributed over the hosts in turn. By default, there is one for each host.
-    tell
+    report
         Function that is called with problems that occur later: the last line of a job's log while
         workers are missing, or the reason why a worker cannot be started.
 
@@ -86,12 +87,12 @@ def start_partitions(
     ...         },
     ...     )
     """
-    require(CLUSTERS)
+    require_feature(CLUSTERS)
     jobqueue = sys.modules.get("dask_jobqueue")
     if jobqueue and isinstance(cluster, jobqueue.JobQueueCluster):
-        describe = _job
+        describe = _describe_job
     elif getattr(cluster, "scheduler_spec", {}).get("cls") is ssh.Scheduler:
-        describe = _process
+        describe = _describe_process
     else:
         raise PoolError(
             f"A {type(cluster).__name__} has only one kind of worker. Start its workers, then "
@@ -108,7 +109,7 @@ def start_partitions(
         name: _PartitionJobs.from_options(cluster, describe, name, options)
         for name, options in partitions.items()
     }
-    cluster.sync(_JobStarter(cluster, parts, tell).begin)
+    cluster.sync(_JobStarter(cluster, parts, report).start)
 
 
 Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]]
@@ -116,32 +117,32 @@ Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]
 
 @dataclass
 class _PartitionJobs:
-    """The jobs of a partition."""
+    """Jobs of a partition."""
 
     name: str
-    options: Mapping[str, Any]  # options of the cluster's class, where this partition differs
-    initial_count: int  # number of jobs
-    kind: JobKind
+    options: Mapping[str, Any]  # options of the cluster's class that differ for this partition
+    initial_count: int  # number of jobs to start initially
+    spec: JobSpec
     describe: Describe
-    submitted: int = 0  # jobs so far
+    submitted: int = 0  # number of jobs submitted so far
     host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
 
     @classmethod
     def from_options(
         cls, cluster: SpecCluster, describe: Describe, name: str, options: Mapping[str, Any]
     ) -> _PartitionJobs:
-        """Read the options of a partition, without starting jobs.
+        """Create the jobs of a partition from its options, without starting them.
 
         Raises
         ------
         PoolError
-            If an option is wrong.
+            If an option is invalid.
         """
         check_name(name)
         cluster_options = dict(options)
         slots = cluster_options.pop("slots", 1)
         check_count(f"the number of slots of partition {name!r}", slots)
-        bounds = take_bounds(name, cluster_options)
+        bounds = pop_bounds(name, cluster_options)
         try:
             if bounds is not None:
                 count = bounds.minimum
@@ -149,28 +150,28 @@ class _PartitionJobs:
                 hosts = cluster_options.get("hosts", ".")
                 count = cluster_options.pop("workers", len(hosts))
             check_count(f"the number of workers of partition {name!r}", count, minimum=0)
-            # A first description shows that the cluster's class takes the options.
+            # Describing a sample job checks that the cluster's class accepts the options.
             sample = describe(cluster, f"{name}-0", name, slots, 0, cluster_options)
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started. {error}") from error
-        kind = JobKind(slots, len(sample.get("group", ".")), bounds)
-        return cls(name, cluster_options, count, kind, describe)
+        spec = JobSpec(slots, len(sample.get("group", ".")), bounds)
+        return cls(name, cluster_options, count, spec, describe)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
-        """Let the cluster start a number of further jobs."""
+        """Add further jobs to the cluster, which starts them when it is awaited."""
         for _ in range(count):
-            # Each job has a new name: for some time after a worker was lost, Dask would take a job
-            # of the same name for the lost worker, and cancel the job.
+            # Each job has a new name. For some time after a worker was lost, Dask would mistake a
+            # job with the same name for the lost worker, and cancel the job.
             job = f"{self.name}-{self.submitted}"
             self.submitted += 1
             used = self.host_indices.values()
             index = next(number for number in range(self.submitted) if number not in used)
             self.host_indices[job] = index
-            spec = self.describe(cluster, job, self.name, self.kind.slots, index, self.options)
+            spec = self.describe(cluster, job, self.name, self.spec.slots, index, self.options)
             cluster.worker_spec[job] = spec
 
     def workers(self, cluster: SpecCluster) -> dict[str, list[str]]:
-        """Return the names of the workers of each submitted job, by job."""
+        """Return the names of the workers of all submitted jobs, by job."""
         return {
             job: [job + suffix for suffix in cluster.worker_spec[job].get("group", [""])]
             for job in self.host_indices
@@ -178,8 +179,16 @@ class _PartitionJobs:
         }
 
 
-def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
-    """Remove `adapt` and `idle_s` from the options of a partition, or return None if absent."""
+def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
+    """Remove `adapt` and `idle_s` from the options of a partition, and return them as bounds.
+
+    The result is None if the partition is not adaptive.
+
+    Raises
+    ------
+    PoolError
+        If the options are invalid.
+    """
     adapt = options.pop("adapt", None)
     idle_s = options.pop("idle_s", None)
     if adapt is None:
@@ -189,7 +198,7 @@ def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
                 "example to [0, 8]."
             )
         return None
-    require(ADAPTING)
+    require_feature(ADAPTING)
     if "workers" in options or not isinstance(adapt, Sequence) or len(adapt) != 2:
         raise PoolError(
             f"Invalid value {adapt!r} for `adapt` of partition {name!r}. Expected the minimum and "
@@ -197,34 +206,34 @@ def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
             "`workers`."
         )
     minimum, maximum = adapt
-    return Bounds.checked(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
+    return JobBounds.validated(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
 
 
 class _JobStarter:
-    """Starts the jobs of partitions, and starts lost jobs again."""
+    """Starts the jobs of partitions, and replaces lost jobs."""
 
     def __init__(
         self,
         cluster: SpecCluster,
         partition_jobs: Mapping[str, _PartitionJobs],
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
     ) -> None:
         self._cluster = cluster
         self._parts = partition_jobs
-        self._tell = tell
+        self._report = report
         samples = (
             part.describe(cluster, "", part.name, 1, 0, part.options)
             for part in partition_jobs.values()
         )
         self._logs = JobLogs(sample["options"] for sample in samples)
-        self._messages: set[str] = set()  # messages so far, without numbers
+        self._messages: set[str] = set()  # reported messages, without their numbers
         self._logs_read_at = time.monotonic()
 
-    async def begin(self) -> None:
-        """Submit the first jobs, and manage all jobs as long as the cluster is open."""
-        kinds = {name: part.kind for name, part in self._parts.items()}
+    async def start(self) -> None:
+        """Submit the initial jobs, and start managing all jobs until the cluster is closed."""
+        specs = {name: part.spec for name, part in self._parts.items()}
         try:
-            await ask_of_cluster(self._cluster, begin, kinds=kinds)
+            await run_on_cluster_scheduler(self._cluster, add_partitions, specs=specs)
         except ModuleNotFoundError as error:
             raise PoolError(
                 f"The scheduler of the cluster cannot import {error.name!r}. Start it in the same "
@@ -232,100 +241,102 @@ class _JobStarter:
             ) from error
         for part in self._parts.values():
             part.add(self._cluster, part.initial_count)
-        await _start(self._cluster)
-        callback = PeriodicCallback(self._look, 1000 * ADAPT_EVERY_S)
-        self._cluster.periodic_callbacks[_NAME] = callback  # ends with the cluster
+        await _start_workers(self._cluster)
+        callback = PeriodicCallback(self._manage_jobs, 1000 * ADAPT_EVERY_S)
+        self._cluster.periodic_callbacks[_NAME] = callback  # stops when the cluster is closed
         callback.start()
 
-    async def _look(self) -> None:
-        """Follow the scheduler's advice, start lost workers again, and sometimes read logs."""
+    async def _manage_jobs(self) -> None:
+        """Follow the scheduler's advice, restart lost workers, and report errors in job logs."""
         if self._cluster.status != Status.running:
             return
-        with suppress(OSError):  # the scheduler is ending
+        with suppress(OSError):  # the scheduler is closing
             changed = await self._adapt()
             looked_at = time.monotonic()
-            due = looked_at - self._logs_read_at >= LOOK_EVERY_S
+            due = looked_at - self._logs_read_at >= CHECK_EVERY_S
             if changed or due:
-                # A SpecCluster drops a lost worker, and starts a new worker when it is awaited.
+                # When a SpecCluster is awaited, it starts the workers that it has lost.
                 try:
-                    await _start(self._cluster)
+                    await _start_workers(self._cluster)
                 except Exception as error:
-                    self._say(f"A worker could not be started: {error}")
+                    self._report_once(f"A worker could not be started: {error}")
             if due:
                 self._logs_read_at = looked_at
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
-                    for line in self._logs.endings():
-                        self._say(line)
+                    for line in self._logs.new_last_lines():
+                        self._report_once(line)
 
     async def _adapt(self) -> bool:
         """Start and forget jobs as the scheduler advises, and return whether jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
-        advice = await ask_of_cluster(self._cluster, look, jobs=jobs)
+        advice = await run_on_cluster_scheduler(self._cluster, advise_jobs, jobs=jobs)
         for name, advice_of_part in advice.items():
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
-            await asyncio.gather(*(self._end(part, job) for job in advice_of_part.jobs_to_forget))
+            await asyncio.gather(
+                *(self._remove_job(part, job) for job in advice_of_part.jobs_to_forget)
+            )
             if self._cluster.status != Status.running:
                 return False
-            # Jobs that were lost, or could not be submitted, are submitted again first.
+            # Jobs that were lost or could not be submitted are submitted again first.
             lost = [job for job in part.host_indices if job not in self._cluster.workers]
-            await asyncio.gather(*(self._end(part, job) for job in lost[to_start:]))
+            await asyncio.gather(*(self._remove_job(part, job) for job in lost[to_start:]))
             part.add(self._cluster, to_start - len(lost))
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
-    async def _end(self, part: _PartitionJobs, job: str) -> None:
-        """Forget a job whose workers have been closed, or will be closed if they join."""
+    async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
+        """Remove a job whose workers have been closed, or will be closed if they join."""
         self._cluster.worker_spec.pop(job, None)
         part.host_indices.pop(job, None)
         worker = self._cluster.workers.get(job)
         if worker is not None:
-            worker.status = Status.closing  # else the cluster refuses to close meanwhile
-            with suppress(OSError):  # its process has ended
+            worker.status = Status.closing  # otherwise, the cluster would refuse to close
+            with suppress(OSError):  # the process has already ended
                 await worker.close()
             worker.status = Status.closed
             self._cluster.workers.pop(job, None)
 
-    def _say(self, message: str) -> None:
-        """Pass a message on, unless a message that differs in numbers alone was passed on."""
+    def _report_once(self, message: str) -> None:
+        """Report a message, unless a message that differs only in its numbers was reported."""
         line = " ".join(message.split())[:400]
         text = re.sub(r"\d+", "", line)
-        # "in": the same message also stands in the log of this program itself.
+        # An earlier message may be contained in this one, which can be a line of a log file.
         if not any(earlier in text for earlier in self._messages):
             self._messages.add(text)
-            self._tell(line)
+            self._report(line)
 
 
-async def _start(cluster: SpecCluster) -> None:
-    """Start the workers that the specification of a cluster requires and that are missing."""
+async def _start_workers(cluster: SpecCluster) -> None:
+    """Start the workers of the cluster's specification that are missing."""
     try:
         await cluster
     except Exception:
         for name, worker in list(cluster.workers.items()):
-            if worker.status == Status.created:  # the next call tries this worker again
+            if worker.status == Status.created:  # the next call will try to start it again
                 del cluster.workers[name]
-            # A cluster refuses to close while it knows of jobs that were not submitted.
+            # A cluster refuses to close while it has jobs that were not submitted.
             worker.status = Status.failed
         raise
 
 
 class JobLogs:
-    """Logs of jobs, which say why workers are missing.
+    """Log files of jobs, which contain the reasons why workers are missing.
 
-    Dask does not notice a job that ends before its worker has connected.
+    Dask does not notice if a job ends before its worker has connected.
     """
 
     def __init__(self, jobs: Iterable[Mapping[str, Any]]) -> None:
         self._folders = {Path(job["log_directory"]) for job in jobs if job.get("log_directory")}
-        self._read = self._files()  # logs that are older than this object, or have been read
+        self._read = self._files()  # logs that existed before, or have been read
         self._previous: set[tuple[Path, int]] = set()
 
     def _files(self) -> set[tuple[Path, int]]:
-        """Return all files with the times when they were written, in nanoseconds."""
+        """Return all log files with their modification times in nanoseconds."""
         files = (path for folder in self._folders for path in folder.glob("*") if path.is_file())
         return {(path, path.stat().st_mtime_ns) for path in files}
 
-    def endings(self) -> Iterator[str]:
-        """Yield the last lines of new logs that have not changed since the previous call."""
+    def new_last_lines(self) -> Iterator[str]:
+        """Yield the last lines of new log files that have not changed since the previous call."""
         files = self._files()
         unchanged = (files & self._previous) - self._read
         self._read |= unchanged
@@ -334,11 +345,11 @@ class JobLogs:
             with path.open("rb") as log:
                 log.seek(max(0, path.stat().st_size - 4000))
                 last_line = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
-            if last_line and INFORMATION not in last_line:
+            if last_line and INFO_MARK not in last_line:
                 yield f"The last line of the log {path} is: {last_line}"
 
 
-def _job(
+def _describe_job(
     cluster: Any,
     name: str,
     partition: str,
@@ -346,7 +357,7 @@ def _job(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Describe a job as a cluster of dask-jobqueue does."""
+    """Return the specification of a job of a dask-jobqueue cluster."""
     options = {**cluster.new_spec["options"], **partition_options}
     defaults = {"processes": 1, "worker_extra_args": [], "log_directory": None}
     for option, default in defaults.items():
@@ -355,15 +366,14 @@ def _job(
             options[option] = dask.config.get(key, None) or default
     declared = ["--resources", f"{partition}={slots}"]
     options["worker_extra_args"] = [*options["worker_extra_args"], *declared]
-    cluster.job_cls(
-        cluster.scheduler_address, name=name, **options
-    )  # raises if it does not take an option
+    # Creating a job raises an error if it does not accept an option.
+    cluster.job_cls(cluster.scheduler_address, name=name, **options)
     processes = options["processes"]
     group = {"group": [f"-{process}" for process in range(processes)]} if processes > 1 else {}
     return {**cluster.new_spec, **group, "options": options}
 
 
-def _process(
+def _describe_process(
     cluster: Any,
     name: str,
     partition: str,
@@ -371,7 +381,7 @@ def _process(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Describe a worker as an SSHCluster does, on the host of a number `index`."""
+    """Return the specification of a worker of an SSHCluster on the host with the given index."""
     common = cluster.scheduler_spec["options"]
     options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(
         partition_options
@@ -380,8 +390,8 @@ def _process(
     if isinstance(hosts, str) or not hosts:
         raise ValueError("`hosts` is missing. Set it to a list of hosts for the workers.")
     kwargs = {"name": name, "nthreads": slots, "resources": {partition: slots}}
-    kwargs["death_timeout"] = _DEATH_S  # not every SSH server ends processes for its client
+    kwargs["death_timeout"] = _DEATH_S  # some SSH servers do not end the processes of a client
     options["kwargs"] = kwargs | options.pop("worker_options", {})
     options["address"] = hosts[index % len(hosts)]
-    ssh.Worker(cluster.scheduler_address, **options)  # raises if it does not take an option
+    ssh.Worker(cluster.scheduler_address, **options)  # raises an error if an option is unknown
     return {"cls": ssh.Worker, "options": options}

@@ -1,4 +1,4 @@
-"""Worker groups of the operator of dask-kubernetes, as groups that `scale_groups` scales."""
+"""Worker groups of the dask-kubernetes operator, for `scale_groups`."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class KubernetesGroups:
         self._cluster.scale(n, worker_group=group.lower().replace("_", "-"))
 
     def _delete(self, workers: Sequence[str]) -> None:
-        """Delete the Deployments of workers, which are named after their workers."""
-        from kr8s import NotFoundError  # dask-kubernetes needs kr8s, too
+        """Delete the Deployments of workers, which have the same names as the workers."""
+        from kr8s import NotFoundError  # a dependency of dask-kubernetes
         from kr8s.objects import Deployment
 
         for worker in workers:

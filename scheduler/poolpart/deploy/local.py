@@ -1,4 +1,4 @@
-"""A partitioned cluster on this machine."""
+"""Clusters on this machine that are divided into partitions."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import dask
 from distributed import Scheduler, Security, SpecCluster
 
 from ..errors import PoolError
-from ..internals.names import CLUSTERS, require
+from ..internals.names import CLUSTERS, require_feature
 from ..rules import check_count, check_name
-from .local_processes import FixedCluster, OwnNanny
+from .local_processes import FixedCluster, ScriptlessNanny
 
 LOOPBACK = "127.0.0.1"
 
-# Dask's nannies make each worker return freed memory to the system at once, so that the pages of
-# every large array have to be faulted in again. With these settings workers that make arrays of
-# megabytes ran 1.36 times as fast. They have to be set before the process starts.
+# Dask's nannies make each worker return freed memory to the system immediately, so the pages of
+# every large array have to be faulted in again. With these settings, workers that create arrays of
+# several megabytes were 1.36 times as fast. They have to be set before the process starts.
 _PRE_SPAWN = {
     f"distributed.nanny.pre-spawn-environ.{name}": 256 << 20
     for name in ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
@@ -66,7 +66,7 @@ def local_cluster(
     >>> with local_cluster({"GPU": (2, 1), "IO": (1, 8)}) as cluster:    # doctest: +SKIP
     ...     parts = Pool.from_client(Client(cluster)).partitions()
     """
-    require(CLUSTERS)
+    require_feature(CLUSTERS)
     for name, (count, slots) in partitions.items():
         check_name(name)
         check_count(f"the number of workers of partition {name!r}", count, minimum=0)
@@ -90,7 +90,7 @@ def local_cluster(
             "port": 0,
             "security": security,
             "dashboard": dashboard_port is not None,
-            # Also without a dashboard there is an HTTP server, else on port 8787.
+            # There is an HTTP server even without a dashboard, by default on port 8787.
             "dashboard_address": f"{LOOPBACK}:{dashboard_port or 0}",
         },
     }
@@ -101,7 +101,7 @@ def local_cluster(
             )
     except RuntimeError as error:
         cause = error.__cause__ or error
-        if isinstance(cause, AssertionError):  # it holds a status, such as Status.starting
+        if isinstance(cause, AssertionError):  # its message is only a status
             cause = RuntimeError("a worker process ended or did not respond during its start")
         raise PoolError(
             f"The workers did not start: {cause}. Check their output above, and whether the "
@@ -110,7 +110,7 @@ def local_cluster(
 
 
 def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, Any]:
-    """Specification of a worker of a partition for SpecCluster."""
+    """Return the SpecCluster specification of a worker of a partition."""
     options = {
         "nthreads": slots,
         "resources": {partition: slots},
@@ -118,20 +118,20 @@ def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, An
         "security": security,
         "dashboard": False,
         "memory_limit": "auto",
-        # One thread for numerical libraries in each worker: the processes share the cores.
+        # Numerical libraries use one thread in each worker, because the processes share the cores.
         "env": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
         "silence_logs": logging.ERROR,
         "preload": [__name__],  # calls `dask_setup`
     }
-    return {"cls": OwnNanny, "options": options}
+    return {"cls": ScriptlessNanny, "options": options}
 
 
 def dask_setup(worker: Any) -> None:
-    """Drop a worker's traceback of its last heartbeat.
+    """Suppress the log message of a worker's last heartbeat.
 
-    A worker that is told to close while its heartbeat waits for an answer closes the connection
-    under it, and logs that as an error. On a busy machine, whose scheduler answers late, most runs
-    ended so. A worker that has really lost its scheduler closes, whatever it logs.
+    If a worker is closed while its heartbeat waits for a response, the connection is closed and
+    Dask logs an error with a traceback. This happens in most runs on a busy machine, where the
+    scheduler responds late. A worker that has actually lost its scheduler closes in any case.
     """
     logging.getLogger("distributed.worker").addFilter(
         lambda record: "scheduler during heartbeat" not in str(record.msg)

@@ -1,4 +1,4 @@
-"""A cluster on this machine with its client, which ends with a pool or when nobody uses it."""
+"""Local cluster with its client, closed at the end of its pool or when it is idle."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Any
 from distributed import Client
 
 from ..errors import PoolError
-from ..extras.background import in_background
-from ..internals.scheduler import number_of_transitions
+from ..extras.background import run_in_background
+from ..internals.scheduler import count_transitions
 from ..pipe_states import names_of_pipes
 from ..stats import statistics_of
-from ..workers import on_scheduler
+from ..workers import run_on_scheduler
 from .local import local_cluster
 
 logger = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 1.0  # between looks whether the cluster is used
+CHECK_EVERY_S = 1.0  # interval between checks whether the cluster is in use
 
 
 class LocalPool:
-    """Cluster of `local_cluster` with a client, as `Pool.local` starts them."""
+    """Cluster of `local_cluster` and its client, as started by `Pool.local`."""
 
     def __init__(
         self, partitions: Mapping[str, tuple[int, int]], idle_s: float, options: dict[str, Any]
@@ -39,26 +39,26 @@ class LocalPool:
         with ExitStack() as stack:
             cluster = stack.enter_context(local_cluster(partitions, **options))
             self.client = stack.enter_context(Client(cluster))
-            on_scheduler(self.client, _begin_to_count)
+            run_on_scheduler(self.client, _begin_to_count)
             self._stack = stack.pop_all()
         self._closing = threading.Lock()
         self._closed = threading.Event()
         if idle_s < math.inf:
-            in_background(lambda: self._close_when_idle(idle_s))
+            run_in_background(lambda: self._close_when_idle(idle_s))
 
     def close(self) -> None:
-        """Close the client and the cluster, unless they are closed."""
+        """Close the client and the cluster unless they are already closed."""
         self._closed.set()
-        with self._closing:  # so that this also waits for the end in another thread
+        with self._closing:  # waits if another thread is closing the cluster
             self._stack.close()
 
     def _close_when_idle(self, idle_s: float) -> None:
-        """Close everything once the cluster was not used for `idle_s` seconds."""
+        """Close the client and the cluster once they have not been used for `idle_s` seconds."""
         last_transitions = -1
         used_at = time.monotonic()
-        while not self._closed.wait(min(LOOK_EVERY_S, idle_s)):
-            in_use, transitions = on_scheduler(self.client, _use)
-            if in_use or transitions != last_transitions:  # or it was used between two looks
+        while not self._closed.wait(min(CHECK_EVERY_S, idle_s)):
+            in_use, transitions = run_on_scheduler(self.client, _usage)
+            if in_use or transitions != last_transitions:  # used now or since the last check
                 last_transitions = transitions
                 used_at = time.monotonic()
             elif time.monotonic() - used_at >= idle_s:
@@ -67,11 +67,11 @@ class LocalPool:
 
 
 def _begin_to_count(dask_scheduler: Any = None) -> None:
-    """Count the tasks of the cluster from now on, for `Partition.stats` and `Partition.tasks`."""
+    """Start counting tasks for `Partition.stats` and `Partition.tasks`."""
     statistics_of(dask_scheduler)
 
 
-def _use(dask_scheduler: Any = None) -> tuple[bool, int]:
-    """Return whether a cluster has tasks, results or pipes, and a number that tasks change."""
+def _usage(dask_scheduler: Any = None) -> tuple[bool, int]:
+    """Return whether a cluster has tasks, results or pipes, and its number of transitions."""
     in_use = bool(dask_scheduler.tasks or names_of_pipes(dask_scheduler))
-    return in_use, number_of_transitions(dask_scheduler)
+    return in_use, count_transitions(dask_scheduler)

@@ -1,4 +1,4 @@
-"""A cluster on this machine: how its workers start, and start again."""
+"""Worker processes of local clusters: how they are started and restarted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from ..errors import PoolError
 
 @contextmanager
 def forked_workers() -> Iterator[None]:
-    """Let nannies fork workers from the fork server, at first and for a restart.
+    """Make nannies fork workers from the fork server within the block.
 
-    Dask would make it import pandas and more; it has already imported what is needed.
+    This applies to the first start and to restarts. By default, Dask would make the fork server
+    import pandas and other libraries. Here, the fork server has already imported what is needed.
     """
     utils = distributed.utils
     preload_set = utils._forkserver_preload_set
@@ -31,10 +32,10 @@ def forked_workers() -> Iterator[None]:
             utils._forkserver_preload_set = preload_set
 
 
-_starting: set[Nanny] = set()  # nannies of `OwnNanny` that are starting a worker
+_starting: set[Nanny] = set()  # instances of `ScriptlessNanny` that are starting a worker
 
 
-@cache  # once: another library may have wrapped the same since
+@cache  # only once per process, because another library may have wrapped the wrapper since
 def _spare_workers_the_script() -> None:
     prepare = spawn.get_preparation_data
 
@@ -48,15 +49,16 @@ def _spare_workers_the_script() -> None:
     spawn.get_preparation_data = without_script
 
 
-class OwnNanny(Nanny):
-    """A nanny whose workers do not import the script that starts the nanny.
+class ScriptlessNanny(Nanny):
+    """Nanny whose workers do not import the script that starts the nanny.
 
-    multiprocessing imports it to find functions by name, and a script without a main guard would
-    start itself again in each worker. Dask sends what a script defines by value.
+    multiprocessing imports the main script of the parent process to find functions by name. A
+    script without a main guard would therefore run again in each worker. Dask pickles the functions
+    of a script by value, so the import is not needed.
     """
 
     async def instantiate(self) -> Status:
-        """Start or restart a worker."""
+        """Start or restart the worker process."""
         _spare_workers_the_script()
         _starting.add(self)
         try:
@@ -66,19 +68,19 @@ class OwnNanny(Nanny):
 
 
 class FixedCluster(SpecCluster):
-    """A cluster that leaves dead workers to their nannies, and cannot be scaled.
+    """Cluster that cannot be scaled and leaves the restart of dead workers to their nannies.
 
-    15 seconds after a worker was lost, a SpecCluster closes its nanny unless a worker of its name
-    is present. A worker that dies twice within that time may be starting just then, and would
-    never come back.
+    15 seconds after a worker was lost, a plain SpecCluster closes the nanny of this worker unless a
+    worker with the same name is present. A worker that dies twice within this time may just be
+    restarting at that moment, and would never return.
     """
 
     def _update_worker_status(self, op: str, msg: Any) -> None:
         super(SpecCluster, self)._update_worker_status(op, msg)
 
     def scale(self, n: int = 0, **options: Any) -> None:
-        """Refuse: SpecCluster would drop the workers specified last, whatever their kind."""
-        if self.status == Status.closing:  # it stops its workers by this
+        """Raise PoolError, because SpecCluster would remove workers regardless of their kind."""
+        if self.status == Status.closing:  # SpecCluster calls this method to close its workers
             super().scale(n, **options)
             return
         raise PoolError(

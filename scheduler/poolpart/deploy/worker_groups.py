@@ -1,7 +1,7 @@
-"""Partitions whose workers are a group of a deployment that scales groups, such as Kubernetes.
+"""Partitions whose workers are scaled as groups by another system, for example Kubernetes.
 
-The scheduler decides (`adapting.py`), as for jobs of a queue. Each second a thread of this process
-asks for the size that each group shall have, and passes changes on.
+As for jobs of a queue, `adapting.py` decides on the scheduler. Once per second, a thread of this
+process requests the target size of each group and passes changes on.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import Any, Protocol, Self
 
 from distributed import Client
 
-from ..adapting import GroupAdvice, GroupReport, JobKind, begin, look_at_groups
+from ..adapting import GroupAdvice, GroupReport, JobSpec, add_partitions, advise_groups
 from ..errors import PoolError
 from ..rules import check_count, check_name
-from ..workers import on_scheduler
-from .clusters import take_bounds
+from ..workers import run_on_scheduler
+from .clusters import pop_bounds
 
 logger = logging.getLogger(__name__)
 
-ADAPT_EVERY_S = 1.0  # seconds between two questions to the scheduler
+ADAPT_EVERY_S = 1.0  # interval between requests to the scheduler
 
 
 class WorkerGroups(Protocol):
@@ -54,7 +54,7 @@ def scale_groups(
     client: Client,
     groups: WorkerGroups,
     partitions: Mapping[str, Mapping[str, Any]],
-    tell: Callable[[str], object] = logger.warning,
+    report: Callable[[str], object] = logger.warning,
 ) -> GroupScaler:
     """Adapt the sizes of worker groups to the work of their partitions.
 
@@ -74,7 +74,7 @@ def scale_groups(
         for example ``[0, 8]``. ``slots`` is the number of tasks that each worker runs at the same
         time (1 by default). ``idle_s`` is the time in seconds without work after which a worker is
         closed (60 by default). `Partition.adapt` changes the range.
-    tell
+    report
         Function that is called with the reason if a group cannot be scaled, once for each message.
 
     Returns
@@ -99,19 +99,22 @@ def scale_groups(
             "`scale_groups` expects an object with a method `scale(group, n, leaving)`, but got "
             f"{groups!r}. For dask-kubernetes, pass `KubernetesGroups(cluster)`."
         )
-    kinds = {name: _kind(name, options) for name, options in partitions.items()}
-    on_scheduler(client, begin, kinds=kinds)
-    return GroupScaler(client, groups, kinds, tell)
+    specs = {name: _job_spec(name, options) for name, options in partitions.items()}
+    run_on_scheduler(client, add_partitions, specs=specs)
+    return GroupScaler(client, groups, specs, report)
 
 
-def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
+def _job_spec(name: str, options: Mapping[str, Any]) -> JobSpec:
     """Read and check the options of a partition.
 
-    Raises PoolError if an option is wrong.
+    Raises
+    ------
+    PoolError
+        If an option is invalid.
     """
     check_name(name)
     remaining = dict(options)
-    bounds = take_bounds(name, remaining)
+    bounds = pop_bounds(name, remaining)
     slots = remaining.pop("slots", 1)
     check_count(f"the number of slots of partition {name!r}", slots)
     if bounds is None or remaining:
@@ -121,33 +124,33 @@ def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
             f"Invalid options for partition {name!r}. {problem} Expected `adapt`, for example "
             "[0, 8], and optionally `slots` and `idle_s`."
         )
-    return JobKind(slots, bounds=bounds, cancellable=False)
+    return JobSpec(slots, bounds=bounds, cancellable=False)
 
 
 class GroupScaler:
-    """The thread of `scale_groups`."""
+    """Thread that scales worker groups, started by `scale_groups`."""
 
     def __init__(
         self,
         client: Client,
         groups: WorkerGroups,
-        kinds: Mapping[str, JobKind],
-        tell: Callable[[str], object],
+        specs: Mapping[str, JobSpec],
+        report: Callable[[str], object],
     ) -> None:
         self._client = client
         self._groups = groups
-        self._tell = tell
+        self._report = report
         self._reports = {
-            name: GroupReport(kind.bounds.minimum if kind.bounds else 0)
-            for name, kind in kinds.items()
+            name: GroupReport(spec.bounds.minimum if spec.bounds else 0)
+            for name, spec in specs.items()
         }
-        self._messages: set[str] = set()  # passed on so far
+        self._messages: set[str] = set()  # reported messages
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="poolpart-groups", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="poolpart-groups", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop scaling, and wait for a call of `scale` that is under way."""
+        """Stop scaling, after waiting for a call to `scale` that is in progress."""
         self._closed.set()
         self._thread.join()
 
@@ -157,12 +160,12 @@ class GroupScaler:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _follow(self) -> None:
-        """Ask the scheduler for sizes, and pass them on, until this or the client is closed."""
+    def _run(self) -> None:
+        """Request target sizes and scale the groups until the scaler or the client is closed."""
         while not self._closed.wait(ADAPT_EVERY_S):
             try:
-                advice = on_scheduler(self._client, look_at_groups, reports=self._reports)
-            except (PoolError, OSError):  # the client is closed, or is connecting again
+                advice = run_on_scheduler(self._client, advise_groups, reports=self._reports)
+            except (PoolError, OSError):  # the client is closed or reconnecting
                 if self._client.status in ("closing", "closed"):
                     return
                 continue
@@ -170,10 +173,7 @@ class GroupScaler:
                 self._scale(name, advice_of_group)
 
     def _scale(self, name: str, advice: GroupAdvice) -> None:
-        """Scale a group.
-
-        If that fails, the next advice is the same.
-        """
+        """Scale a group. If this fails, the next advice is the same, so the call is repeated."""
         if advice == GroupAdvice(self._reports[name].size):
             return
         try:
@@ -182,6 +182,6 @@ class GroupScaler:
             message = f"Group {name!r} could not be scaled to {advice.size} workers: {error}"
             if message not in self._messages:
                 self._messages.add(message)
-                self._tell(message)
+                self._report(message)
         else:
             self._reports[name] = GroupReport(advice.size, advice.leaving)

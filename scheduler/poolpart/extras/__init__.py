@@ -1,7 +1,8 @@
-"""Features beside the core: each module is an idea. The README says who asks for each of them.
+"""Features beside the core, one idea per module. The README lists the purpose of each module.
 
-The core does not import these modules. `Partition`, `Pool` and `Pipe` hand calls on to them, and
-modules with a `Feature` begin and end with partitions.
+These modules import the core. Of the rest of the package, only `Pool`, `Partition`, `Pipe` and
+`deploy` import them, and they never import these classes in turn. Modules that define a `Feature`
+add it to `features.FEATURES`, through which the core calls it.
 """
 
 from . import dashboard_page, inherit, metrics

@@ -1,8 +1,7 @@
-"""Calls in threads of this process, and futures of their results.
+"""Calls that run in threads of this process, with futures for their results.
 
-The futures are futures of `concurrent.futures`, so that `concurrent.futures.wait` and
-`asyncio.wrap_future` take them. A future of Dask has a task on the scheduler. These futures have
-none.
+The futures are those of `concurrent.futures`, so that `concurrent.futures.wait` and
+`asyncio.wrap_future` accept them. Unlike Dask futures, they have no task on the scheduler.
 """
 
 from __future__ import annotations
@@ -16,23 +15,22 @@ from typing import Any, TypeVar
 
 from distributed import Future
 
-from ..internals.client import when_done
+from ..internals.client import call_when_done
 
 Result = TypeVar("Result")
 
 
-def in_background(
+def run_in_background(
     call: Callable[[], Result], stop: Callable[[], object] = lambda: None
 ) -> concurrent.futures.Future[Result]:
-    """Make a call in a thread and return a future of its result or error.
+    """Call a function in a daemon thread, and return a future for its result or error.
 
-    `Future.cancel` takes effect at once, and calls `stop`, which should end the call. The thread
-    does not keep this process alive.
+    Canceling the future takes effect immediately and calls `stop`, which should end the call.
     """
-    # The future is never marked as running: then it could not be cancelled any more.
+    # The future is never marked as running, because it could not be canceled afterwards.
     future: concurrent.futures.Future[Result] = concurrent.futures.Future()
     future.add_done_callback(lambda ended: stop() if ended.cancelled() else None)
-    context = copy_context()  # has the annotations of Dask
+    context = copy_context()  # includes Dask's annotations
 
     def run() -> None:
         try:
@@ -49,11 +47,11 @@ def in_background(
 def _end(
     future: concurrent.futures.Future[Any], set_outcome: Callable[[Any], None], outcome: Any
 ) -> None:
-    """Set the result or the error of a future, unless it was cancelled."""
+    """Set the result or the error of a future unless it was canceled."""
     try:
         set_outcome(outcome)
     except concurrent.futures.InvalidStateError:
-        future.set_running_or_notify_cancel()  # only now `concurrent.futures.wait` sees it
+        future.set_running_or_notify_cancel()  # notifies `concurrent.futures.wait`
 
 
 def after_all(
@@ -87,11 +85,11 @@ def after_all(
     7
     """
     futures = list(futures)
-    # Futures as they end; None once the call is cancelled.
+    # Futures in order of completion, and None if the call was canceled.
     ended: SimpleQueue[Any] = SimpleQueue()
     for future in futures:
         if isinstance(future, Future):
-            when_done(future, ended.put)
+            call_when_done(future, ended.put)
         else:
             future.add_done_callback(ended.put)
 
@@ -104,4 +102,4 @@ def after_all(
                 future.result()  # raises the error of the future
         return function([future.result() for future in futures])
 
-    return in_background(wait_and_call, lambda: ended.put(None))
+    return run_in_background(wait_and_call, lambda: ended.put(None))

@@ -1,9 +1,9 @@
-"""Cancelling tasks, also while they run.
+"""Cancellation of tasks, including running ones.
 
-Dask does not stop a function that runs: its thread goes on, and keeps the task's slot. The function
-can look (`cancelled`), or the worker process can be restarted, if nothing else would be lost. The
-scheduler decides that in two steps, as for idle workers of `adapting.py`: it gives the worker no
-further tasks, and then asks the worker what it runs.
+Dask does not stop a running function. Its thread continues and keeps the task's slot. The function
+can check `cancelled`, or the worker process can be restarted if nothing else would be lost. The
+scheduler decides this in two steps, as for idle workers in `adapting.py`: it stops assigning tasks
+to the worker, and then asks the worker which tasks it runs.
 """
 
 from __future__ import annotations
@@ -11,26 +11,31 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Collection, Coroutine, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from distributed import Future, Status
+from distributed import Client, Future, Status
 
 from ..errors import PoolError
-from ..fetch import holds_for_driver
-from ..internals.scheduler import asks_for, call, cancel_keys, holds_nothing, reopen, restart, shut
-from ..internals.worker import running_keys, task_of_thread
-from ..pipe_states import fail_pipes_of_killed
-from ..workers import on_scheduler
-
-if TYPE_CHECKING:
-    from ..partition import Partition
+from ..fetch import holds_bytes
+from ..internals.scheduler import (
+    call_worker,
+    cancel_keys,
+    holds_nothing,
+    requires_any,
+    restart_worker,
+    resume_assigning,
+    stop_assigning,
+)
+from ..internals.worker import current_task, running_keys
+from ..pipe_states import fail_pipes_of_killed_task
+from ..workers import run_on_scheduler
 
 T = TypeVar("T")
-Outcomes = dict[Any, str]  # {key of a task: what happened}
+Outcomes = dict[Any, str]  # {task key: outcome}
 
-ARRIVAL_S = 1.0  # a task has to arrive at the scheduler, on another connection than the request
-ANSWER_S = 5.0  # seconds for a worker to say what it runs: a function may hold its interpreter
-RESTART_S = 60.0  # seconds for a worker to come back
+ARRIVAL_S = 1.0  # time for submitted tasks to arrive, which use another connection
+ANSWER_S = 5.0  # time for a worker to respond, which a function that holds the GIL can delay
+RESTART_S = 60.0  # time for a restarted worker to rejoin
 
 
 def cancelled() -> bool:
@@ -46,23 +51,30 @@ def cancelled() -> bool:
     ...     while not cancelled():
     ...         start = improve(start)
     """
-    running = task_of_thread()
+    running = current_task()
     return running is not None and running[1].state == "cancelled"
 
 
-def ask_to_cancel(tasks: Mapping[Any, Future], partition: Partition, restarts: bool) -> Outcomes:
-    """Cancel tasks of a partition, by key, on the scheduler.
+def cancel_tasks(
+    tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
+) -> Outcomes:
+    """Cancel tasks of a partition on the scheduler, and return the outcomes by key.
 
-    Returns {key: what happened}, without tasks that had not started, or had ended.
+    Tasks that had not started or had already finished are omitted from the result. If `restarts` is
+    true, workers that only run these tasks are restarted.
+
+    Raises
+    ------
+    PoolError
+        If a task belongs to another partition.
     """
-    client = partition.client
-    outcomes, complaint = on_scheduler(
+    outcomes, complaint = run_on_scheduler(
         client,
         _cancel_tasks,
         keys=list(tasks),
         pending_keys=[key for key, task in tasks.items() if task.status == "pending"],
-        name=partition.name,
-        asking=client.id,
+        name=name,
+        client_id=client.id,
         restarts=restarts,
     )
     if complaint:
@@ -74,43 +86,46 @@ async def _cancel_tasks(
     keys: Collection[Any],
     pending_keys: Collection[Any],
     name: str,
-    asking: str,
+    client_id: str,
     restarts: bool,
     dask_scheduler: Any = None,
 ) -> tuple[Outcomes, str]:
-    """Return the outcomes and "", or no outcomes and the message of a PoolError."""
+    """Cancel tasks, and return their outcomes and "", or no outcomes and an error message."""
     scheduler = dask_scheduler
     deadline = time.monotonic() + ARRIVAL_S
     while not scheduler.tasks.keys() >= {*pending_keys} and time.monotonic() < deadline:
         await asyncio.sleep(0.01)
     known = {key: scheduler.tasks[key] for key in keys if key in scheduler.tasks}
     for key, task in known.items():
-        if not asks_for(task, [name]):
+        if not requires_any(task, [name]):
             return {}, f"Task {key!r} does not belong to partition {name!r}. No task was canceled."
     workers = {key: task.processing_on for key, task in known.items()}
     annotations = {key: task.annotations for key, task in known.items()}
-    cancel_keys(scheduler, keys, asking)
+    cancel_keys(scheduler, keys, client_id)
     kept = [key for key in known if key in scheduler.tasks]
     outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
     members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
     loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
-    affected: dict[Any, list[Any]] = {}  # {worker: keys of cancelled tasks that it runs}
+    affected: dict[Any, list[Any]] = {}  # {worker: keys of canceled tasks that it runs}
     for worker, load in zip(members, loads, strict=True):
-        if load is None:  # such a task may keep it from answering
+        if load is None:  # a canceled task may prevent the worker from responding
             silent = [key for key, at in workers.items() if at is worker and key not in outcomes]
             outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not respond")
         elif running := [key for key in load.running if key in keys and key not in outcomes]:
             affected[worker] = running
-    ends = (_end(scheduler, worker, running, restarts) for worker, running in affected.items())
+    ends = (
+        _restart_if_idle(scheduler, worker, running, restarts)
+        for worker, running in affected.items()
+    )
     for running, outcome in zip(affected.values(), await asyncio.gather(*ends), strict=True):
         outcomes |= dict.fromkeys(running, outcome)
         if outcome.startswith("restarted"):
             for key in running:
-                fail_pipes_of_killed(scheduler, key, annotations.get(key))
+                fail_pipes_of_killed_task(scheduler, key, annotations.get(key))
     return outcomes, ""
 
 
-async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
+async def _restart_if_idle(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
     """Restart a worker if all of its tasks are canceled, and return the outcome."""
     still_running = f"running: worker {worker.name}"
     if not restarts:
@@ -119,38 +134,37 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
         return f"{still_running} has no nanny to restart it"
     if worker.status is not Status.running:
         return f"{still_running} is {worker.status.name}"
-    shut(scheduler, worker)  # one step of the event loop: no task can arrive before
+    # No task can arrive in between, because the event loop has not run since the checks above.
+    stop_assigning(scheduler, worker)
     load = await _load(scheduler, worker)
     alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
     if not alone or not holds_nothing(scheduler, worker):
-        reopen(scheduler, worker)
+        resume_assigning(scheduler, worker)
         return f"{still_running} holds other tasks or results"
-    if await _within(restart(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
+    if await _await_for(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
 
 
 class _Load(NamedTuple):
-    """What a worker itself knows that it has."""
+    """Tasks and results of a worker, as reported by the worker itself."""
 
-    running: list[Any]  # keys of tasks, even of cancelled tasks that the scheduler has forgotten
-    holds_results: bool  # whether a driver still has to fetch results from it
+    running: list[Any]  # keys of running tasks, including those that the scheduler has forgotten
+    holds_results: bool  # whether the worker holds bytes that a client has not fetched yet
 
 
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
-    """Ask a worker for its load, or return None if it does not answer."""
+    """Request the load of a worker, or return None if it does not respond."""
     try:
-        return await _within(call(scheduler, worker.address, _load_here), ANSWER_S)
+        return await _await_for(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
     except OSError:
         return None
 
 
-async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
-    """Await a request, or return None if it takes longer than the given number of seconds."""
-    # `asyncio.wait_for` of Python 3.11 also waits until the cancelled request has ended, which may
-    # involve closing a connection to a worker that reads nothing. Tried on one to four workers, of
-    # which one held the interpreter's lock for 40 s, from 1 s before to 1 s after the request:
-    # 20 tasks were answered within 10 s in 17 of 17 runs.
+async def _await_for(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
+    """Await a request, or return None if it takes longer than the given time."""
+    # `asyncio.wait_for` of Python 3.11 is not used, because it also waits until the canceled
+    # request has ended, which may involve closing a connection to a worker that does not read.
     task = asyncio.ensure_future(request)
     await asyncio.wait([task], timeout=seconds)
     if task.done():
@@ -160,4 +174,4 @@ async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
 
 
 def _load_here(dask_worker: Any = None) -> _Load:
-    return _Load(running_keys(dask_worker), holds_for_driver())
+    return _Load(running_keys(dask_worker), holds_bytes())

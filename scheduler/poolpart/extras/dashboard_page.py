@@ -1,6 +1,6 @@
-"""A page in Dask's dashboard: partitions, stages, workers and pipes, as tables.
+"""Page of Dask's dashboard with tables of partitions, stages, workers and pipes.
 
-The scheduler makes it, and it reloads every two seconds, without scripts.
+The scheduler renders the page, which contains no scripts and reloads every two seconds.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from tornado.template import Template
 
 from ..errors import PoolError
 from ..features import FEATURES, Feature
-from ..fence import fences_of
-from ..html_table import WORDS, shown_seconds
-from ..internals.names import PAGE, require
-from ..internals.scheduler import serve, serve_no_longer
+from ..fence import fence_names
+from ..html_table import TEXT_COLUMNS, format_seconds
+from ..internals.names import PAGE, require_feature
+from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
 from ..partition_stats import COUNTS, NO_PARTITION, StageStats
 from ..pipe_states import pipes_of
@@ -34,15 +34,15 @@ from ..stats import (
     stats_of,
 )
 from ..steward import NAME as STEWARD
-from ..workers import check_client, on_scheduler
+from ..workers import check_client, run_on_scheduler
 from .other_sites import names_of_machine, refusal
 
 NAME = "poolpart-page"
 PATH = "partitions"
-_ANY_ADDRESS = "0.0.0.0"  # dashboards listen on the network unless they are told otherwise
-_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable behind the proxy of a JupyterHub
+_ANY_ADDRESS = "0.0.0.0"  # dashboards listen on all interfaces by default
+_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable that JupyterHub sets behind its proxy
 
-# Names come from users: tornado escapes all that is written into a template.
+# Names come from users, and tornado escapes everything that is inserted into a template.
 _PAGE = Template("""<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
@@ -89,21 +89,23 @@ _FIGURES = (*COUNTS, "seconds")
 _OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "status", "address")
 
 
-def page_of(scheduler: Any) -> bytes:
-    """Return the HTML of the current page."""
+def render_page(scheduler: Any) -> bytes:
+    """Return the HTML of the page with the current state."""
     workers = list(scheduler.workers.values())
-    names = {*partition_names(scheduler)} | fences_of(scheduler)
+    names = {*partition_names(scheduler)} | fence_names(scheduler)
     names |= {name for name, _ in statistics_of(scheduler).ended if name}
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
     pipes: list[list[object]] = []
     for p in stats_of([*sorted(names), ""], scheduler):
-        title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
+        title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
-        stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
-    rows_of_workers = sorted((_worker(worker) for worker in workers), key=_by_partition_and_name)
+        stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+    rows_of_workers = sorted(
+        (_worker_row(worker) for worker in workers), key=_by_partition_and_name
+    )
     for name, pipe in pipes_of(scheduler).items():
-        pipes.append([name, *pipe.figures])
+        pipes.append([name, *pipe.summary])
     tables = [
         ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
         ("Stages", ["stage", "partition", *_FIGURES], stages),
@@ -111,22 +113,24 @@ def page_of(scheduler: Any) -> bytes:
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
     ]
     counts = f"workers {len(workers)}, partitions {len(partitions) - 1}, pipes {len(pipes)}"
-    return _PAGE.generate(tables=tables, counts=counts, words=WORDS, address=scheduler.address)
+    return _PAGE.generate(
+        tables=tables, counts=counts, words=TEXT_COLUMNS, address=scheduler.address
+    )
 
 
-def _shown(partition: str) -> str:
+def _label(partition: str) -> str:
     return partition or NO_PARTITION
 
 
 def _counts(stats: StageStats) -> list[object]:
-    return [*(getattr(stats, count) for count in COUNTS), shown_seconds(stats.seconds)]
+    return [*(getattr(stats, count) for count in COUNTS), format_seconds(stats.seconds)]
 
 
-def _worker(worker: Any) -> list[object]:
+def _worker_row(worker: Any) -> list[object]:
     partition = next((name for name, slots in worker.resources.items() if slots), "")
     return [
         worker.name,
-        _shown(partition),
+        _label(partition),
         slots_of(worker, partition),
         running_on(worker, partition)[1],
         len(worker.processing),
@@ -136,16 +140,16 @@ def _worker(worker: Any) -> list[object]:
 
 
 def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
-    """Return the key that sorts rows of workers: 10 behind 9, and those of no partition last."""
+    """Return the sort key of a worker's row, which sorts 9 before 10 and no partition last."""
     name = str(row[0])
     partition = str(row[1])
-    return partition == _shown(""), partition, len(name), name
+    return partition == _label(""), partition, len(name), name
 
 
 class _Handler(web.RequestHandler):
-    """Sends the page, but to no other website.
+    """Request handler that sends the page and rejects requests from other websites.
 
-    The browser may load and run the page alone.
+    Its content security policy does not allow the browser to load or run anything else.
     """
 
     def initialize(self, scheduler: Any, owners: PageOwners) -> None:
@@ -153,7 +157,7 @@ class _Handler(web.RequestHandler):
         self.names = owners.names
 
     def prepare(self) -> None:
-        """Refuse requests of other websites, except for links to the page."""
+        """Reject requests from other websites, except for links to the page."""
         reason = refusal(self.request.headers, self.names, is_page=True)
         if reason:
             self.set_status(HTTPStatus.FORBIDDEN)
@@ -163,36 +167,36 @@ class _Handler(web.RequestHandler):
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
         self.set_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
-        self.finish(page_of(self.scheduler))
+        self.finish(render_page(self.scheduler))
 
 
 class PageOwners(SchedulerPlugin):
-    """Serves the page until the last client that wanted the page has gone."""
+    """Scheduler plugin that serves the page until the last client that opened it has left."""
 
     name = NAME
 
     def __init__(self, scheduler: Any, names: Collection[str]) -> None:
-        self.owners: set[str] = set()  # clients, by id
-        # Names that the page is asked by; None where a proxy has a name that is not known here.
+        self.owners: set[str] = set()  # IDs of the clients that have opened the page
+        # Host names that requests may use. None behind a proxy whose name is unknown.
         self.names: set[str] | None = None if _HUB in os.environ else {*names}
         statistics = scheduler.plugins.get(STATISTICS)
         self.began_to_count = statistics is None or not statistics.is_kept
-        # A `dask scheduler --dashboard-prefix` is part of the path.
+        # The path includes the prefix of `dask scheduler --dashboard-prefix`.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler, "owners": self})]
         self.page = web.Application(handlers)
-        serve(scheduler, self.page)
+        add_pages(scheduler, self.page)
 
-    def add(self, owner: str, link: str | None) -> None:
-        """Add a client that wants the page, with its link to the dashboard, None if unknown."""
+    def add_owner(self, owner: str, link: str | None) -> None:
+        """Add a client that has opened the page, with its link to the dashboard if known."""
         self.owners.add(owner)
         host = urlsplit(link or "").hostname
-        if link and not host:  # relative to the page of a notebook
+        if link and not host:  # a link relative to the page of a notebook
             self.names = None
         elif host and self.names is not None:
             self.names.add(host)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Record that a client has gone, or no longer wants the page."""
+        """Remove a client that has left or has closed the page."""
         self.owners.discard(client)
         if not self.owners:
             close_page(scheduler)
@@ -200,10 +204,10 @@ class PageOwners(SchedulerPlugin):
                 release_statistics(scheduler)
 
 
-def partitions_page(client: Client) -> str:
-    """Add the page to the dashboard of the client's cluster and return its URL."""
+def open_page(client: Client) -> str:
+    """Add the page to the dashboard of the client's cluster, and return its URL."""
     check_client(client)
-    on_scheduler(client, _open, owner=client.id, link=_dashboard_link(client))
+    run_on_scheduler(client, _open_page, owner=client.id, link=_dashboard_link(client))
     link = page_link(client)
     if link is None:
         raise PoolError(
@@ -214,41 +218,38 @@ def partitions_page(client: Client) -> str:
 
 
 def page_link(client: Client) -> str | None:
-    """Return the URL that the page has while it is open, or None without an HTTP server."""
+    """Return the URL of the page while it is open, or None if there is no HTTP server."""
     link = _dashboard_link(client)
     return link and f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
 
 
 def _dashboard_link(client: Client) -> str | None:
-    """Return the URL of Dask's dashboard, or None if the scheduler has no such service."""
+    """Return the URL of Dask's dashboard, or None if the scheduler has none."""
     try:
         return client.dashboard_link or None
     except KeyError:
         return None
 
 
-def is_open(scheduler: Any) -> bool:
+def is_page_open(scheduler: Any) -> bool:
     """Return whether the scheduler serves the page."""
     return NAME in scheduler.plugins
 
 
-async def _open(owner: str, link: str | None, dask_scheduler: Any = None) -> None:
-    require(PAGE)
-    # Looking up the domain may take seconds.
+async def _open_page(owner: str, link: str | None, dask_scheduler: Any = None) -> None:
+    require_feature(PAGE)
+    # Resolving the domain may take seconds.
     names = await asyncio.to_thread(names_of_machine, _ANY_ADDRESS)
-    if owner not in dask_scheduler.clients:  # killed, and already removed
+    if owner not in dask_scheduler.clients:  # the client was killed and already removed
         return
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PageOwners(dask_scheduler, names))
-    dask_scheduler.plugins[NAME].add(owner, link)
+    dask_scheduler.plugins[NAME].add_owner(owner, link)
     statistics_of(dask_scheduler)
 
 
 async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
-    """Remove the page for a client.
-
-    It stays for further clients. Runs on the scheduler.
-    """
+    """Close the page for a client. It stays open for other clients. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
 
@@ -256,14 +257,14 @@ async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
 def close_page(scheduler: Any) -> None:
     """Stop serving the page."""
     if NAME in scheduler.plugins:
-        serve_no_longer(scheduler, scheduler.plugins[NAME].page)
+        remove_pages(scheduler, scheduler.plugins[NAME].page)
         scheduler.remove_plugin(NAME)
 
 
 class _Page(Feature):
-    """Closes the page with the last partition."""
+    """Feature that closes the page after the last partition was dissolved."""
 
-    def end_all(self, scheduler: Any) -> None:
+    def clean_up(self, scheduler: Any) -> None:
         """Stop serving the page."""
         close_page(scheduler)
 

@@ -1,19 +1,21 @@
-"""Tasks that are submitted from inside a task of a partition belong to that partition.
+"""Inheritance: tasks that a task of a partition submits belong to the same partition.
 
-Dask's resources are not inherited: what a GPU task submits runs anywhere. Here the scheduler gives
-such tasks the partition of the task that submits them, at any depth, unless they say otherwise: by
-resources, by workers, by another partition, or with ``dask.annotate(resources={})`` for none.
+In plain Dask, resources are not inherited, so the tasks that a GPU task submits run on any worker.
+With this feature, the scheduler assigns such tasks, at any depth, to the partition of the
+submitting task, unless they specify resources, workers or another partition.
+``dask.annotate(resources={})`` excludes them from all partitions.
 
-Each takes a slot, as a task that `Partition.submit` submits. The task that submits them lends its
-own while it waits for them (`lending.py`).
+Each of these tasks takes a slot, like a task of `Partition.submit`. The submitting task lends its
+own slot while it waits for them (see `lending.py`).
 
-Who submits is known by its thread. What a method of an actor submits belongs to the partition that
-the actor was submitted to, unless actors of the same key prefix are in different partitions. What a
-coroutine, or a thread that a task started itself, submits is not inherited.
+The submitting task is identified by its thread. Tasks that a method of an actor submits belong to
+the partition of the actor, unless actors with the same key prefix belong to different partitions.
+Tasks that are submitted by coroutines, or by threads that a task has started, do not inherit a
+partition.
 
-Tried and left: running each function under ``dask.annotate`` (the annotation is a context variable
-and does reach `submit`, `map` and collections, but not the tasks that *those* submit, and every
-task is pickled with a wrapper around it).
+Running each function under ``dask.annotate`` instead was rejected. The annotation is a context
+variable and reaches `submit`, `map` and collections, but not the next level of nested tasks. In
+addition, every task would be pickled with a wrapper.
 """
 
 from __future__ import annotations
@@ -25,75 +27,79 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from ..choosing import WorkerChoice
+from ..choosing import WorkerChooser
 from ..errors import PoolError
 from ..features import FEATURES, Feature
-from ..internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
-from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require
-from ..internals.scheduler import Resources, tell_of_plugin
+from ..internals.method_rules import MethodRules, add_graph_rule, add_shuffle_rule
+from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require_feature
+from ..internals.scheduler import Resources, set_worker_plugin
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-inherit"
-ANSWER_S = 5.0  # workers have to begin or end lending; a worker that is stopped does so later
+ANSWER_S = 5.0  # time for workers to start or stop lending, which stopped workers do later
 
 
 class Inheritance(SchedulerPlugin):
-    """The scheduler's side: looks at each graph before its tasks are made, and at shuffles."""
+    """Scheduler plugin that adds the partition to each arriving graph, and controls shuffles."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        self.note = ""  # remark for users: what does not work with this version of Dask
-        self._rules = Rules()
-        self._choice: WorkerChoice | None = None
+        self.note = ""  # note for users about parts that this version of Dask does not support
+        self._rules = MethodRules()
+        self._choice: WorkerChooser | None = None
         self._unreadable: UnreadableInputs | None = None
-        self.lends = self._begin(
+        self.lends = self._enable_part(
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
         )
-        self._begin(SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle)
-        self._begin(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
-        self._begin(READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read)
+        self._enable_part(
+            SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle
+        )
+        self._enable_part(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
+        self._enable_part(
+            READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read
+        )
         scheduler.add_plugin(self)
 
-    def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
-        """Begin a feature.
+    def _enable_part(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
+        """Enable a part of the feature, and return whether this version of Dask supports it.
 
-        Returns False, and notes the missing names, if Dask lacks them.
+        If not, a note for users that begins with `without` names the missing private API.
         """
         try:
-            require(feature)
+            require_feature(feature)
             begin()
-        except PoolError as error:  # partitions are of use without
+        except PoolError as error:  # partitions are useful without this part
             self.note = " ".join(filter(None, (self.note, f"{without} {error}")))
             logger.warning("Partitions: %s %s", without, error)
             return False
         return True
 
     def _nest(self) -> None:
-        rule_for_graphs(self._rules, self.scheduler, self._bequeath)
+        add_graph_rule(self._rules, self.scheduler, self._inherited_resources)
 
     def _shuffle(self) -> None:
-        rule_for_shuffles(self._rules, self.scheduler)
+        add_shuffle_rule(self._rules, self.scheduler)
 
     def _choose(self) -> None:
-        self._choice = WorkerChoice(self.scheduler, self.names)
+        self._choice = WorkerChooser(self.scheduler, self.names)
 
     def _read(self) -> None:
         self._unreadable = UnreadableInputs(self.scheduler, self.names)
 
-    def _bequeath(self, task: Any) -> Resources:
-        """Return the resources of tasks that a task submits, empty outside partitions."""
+    def _inherited_resources(self, task: Any) -> Resources:
+        """Return the resources that tasks inherit from a task, empty outside of partitions."""
         resources = task.resource_restrictions
         return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}
 
     def uninstall(self) -> None:
-        """Take the rules back."""
-        self._rules.take_back()
+        """Remove all rules from the scheduler."""
+        self._rules.remove_all()
         if self._choice is not None:
             self._choice.uninstall()
         if self._unreadable is not None:
@@ -102,10 +108,10 @@ class Inheritance(SchedulerPlugin):
 
 
 class _Inheriting(Feature):
-    """Begins and ends inheritance with partitions."""
+    """Feature that enables inheritance in partitions."""
 
-    def begin(self, scheduler: Any, names: Iterable[str]) -> str:
-        """Have nested tasks and shuffles of partitions stay in their partition."""
+    def enable(self, scheduler: Any, names: Iterable[str]) -> str:
+        """Keep nested tasks and shuffles of partitions in their partition from now on."""
         rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
         for name in names:
             if name not in rule.names:
@@ -114,8 +120,8 @@ class _Inheriting(Feature):
                     _inform_workers(scheduler, name, lending_plugin(name))
         return rule.note
 
-    def end(self, scheduler: Any, name: str) -> None:
-        """End inheritance in a partition."""
+    def disable(self, scheduler: Any, name: str) -> None:
+        """Disable inheritance in a partition."""
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         if rule is None or name not in rule.names:
             return
@@ -125,12 +131,12 @@ class _Inheriting(Feature):
             rule.uninstall()
 
     def names(self, scheduler: Any) -> Set[str]:
-        """Return the partitions whose nested tasks belong to them."""
+        """Return the names of the partitions in which inheritance is enabled."""
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         return frozenset() if rule is None else rule.names
 
-    async def settle(self) -> None:
-        """Wait until the workers have started or stopped lending, at most `ANSWER_S` seconds."""
+    async def wait_for_workers(self) -> None:
+        """Wait up to `ANSWER_S` seconds until the workers have started or stopped lending."""
         loop = asyncio.get_running_loop()
         requests = {request for request in _requests if request.get_loop() is loop}
         if requests:
@@ -140,13 +146,13 @@ class _Inheriting(Feature):
 FEATURES.append(_Inheriting())
 
 
-# -- workers, which lend -------------------------------------------------------------------
+# -- requests to workers, which lend slots -------------------------------------------------
 
-_requests: set[asyncio.Future[Any]] = set()  # sent to workers and under way, of all schedulers here
+_requests: set[asyncio.Future[Any]] = set()  # requests in flight of all schedulers in this process
 
 
 def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
-    """Add the plugin of a partition to all workers, or remove the plugin with None."""
-    for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
+    """Add the lending plugin of a partition to all workers, or remove it if `plugin` is None."""
+    for request in set_worker_plugin(scheduler, f"poolpart-lending-{name}", plugin):
         _requests.add(request)
         request.add_done_callback(_requests.discard)

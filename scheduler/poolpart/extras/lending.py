@@ -1,29 +1,31 @@
-"""Tasks of a partition lend their slots while they wait for other tasks.
+"""Lending of slots: a task of a partition lends its slots while it waits for other tasks.
 
-A task that waits for tasks which it has submitted to its own partition holds what these need. So
-while it waits, its slots are there for others, and its thread if it has one of the worker's:
+A task that waits for tasks that it has submitted to its own partition occupies the slots that these
+tasks need. Therefore, while it waits, other tasks can use its slots and its worker thread:
 
-- in `Future.result`, `Client.gather`, `distributed.wait`, `as_completed`, for a collection or a
-  `Partition.map`: at once;
-- in every other call of the scheduler that waits, such as `Queue.get`, `Variable.get`,
-  `Event.wait`, `Lock.acquire`, `Pipe.get` and `Pipe.put`: once a nested task, or a task that wants
-  its own slots or thread back, is waiting on this worker. A nested task is one that another task of
-  a partition has submitted. A long task on a worker without nested tasks keeps its slots. So a
-  producer and a consumer that a client submits need a slot each.
+- In `Future.result`, `Client.gather`, `distributed.wait` and `as_completed`, and for collections
+  and `Partition.map`, the task lends its slots immediately.
+- In all other calls of the scheduler that wait, for example `Queue.get`, `Variable.get`,
+  `Event.wait`, `Lock.acquire`, `Pipe.get` and `Pipe.put`, the task lends its slots as soon as
+  another task needs them on this worker. This is either a nested task, which another task of a
+  partition has submitted, or a task that waits to get its own slots or thread back. On a worker
+  without nested tasks, a long-running task keeps its slots. Therefore, a producer and a consumer
+  that a client has submitted need one slot each.
 
-A loan lasts to the end of the wait. Then the task gets slots and thread back before it goes on,
-even if the wait ended by a time-out. From the end of its wait until it has them, no other task may
-start in them. Of several tasks that want slots back on one worker, the first to ask is the first to
-get them. Do not hold a `threading.Lock` while you wait: a task that borrows the slot may want it.
+A loan lasts until the end of the wait. The task then gets its slots and thread back before it
+continues, even if the wait has timed out. From the end of the wait until then, no other task can
+start in these slots. If several tasks on a worker wait for their slots, they get them back in the
+order in which their waits ended. Do not hold a `threading.Lock` during a wait, because a task that
+borrows the slot may try to acquire it.
 
-A task that waits in another way, such as a loop over `Future.done`, lends nothing. If a task that
-it has submitted waits for slots meanwhile, all clients get a warning.
+A task that waits in another way, for example by calling `Future.done` in a loop, does not lend its
+slots. If a task that it has submitted waits for slots in the meantime, all clients receive a
+warning.
 
-Lending happens in the worker, because only the worker counts free slots. The scheduler knows a task
-that has lent its slots as one that runs. Only tasks of partitions lend: other users' tasks that
-hold a resource keep it, as in Dask without poolpart.
-
-Coroutines, and threads that a task starts itself, do not lend.
+Slots are lent on the worker, because only the worker counts free slots. For the scheduler, a task
+that has lent its slots is still running. Only tasks of partitions lend slots. Other tasks that
+occupy a resource keep it, as in plain Dask. Coroutines, and threads that a task has started, do not
+lend slots.
 """
 
 from __future__ import annotations
@@ -44,166 +46,164 @@ from distributed import Status, rejoin, secede
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
-from ..internals.client import let_waits_lend
-from ..internals.scheduler import Resources, Submitter, call
+from ..internals.client import install_wait_hooks
+from ..internals.scheduler import Resources, SubmittingTask, call_worker
 from ..internals.worker import (
-    free_slots,
+    count_slots,
+    current_task,
     is_running,
+    release_slots,
+    reserve_slots,
     resources_of,
-    slots_here,
     submitter_of,
-    take_slots,
-    task_of_thread,
     threads_of,
 )
 
 logger = logging.getLogger(__name__)
 
-WARN_AFTER_S = 5.0  # seconds that a nested task waits for slots before clients are warned
-_CHECK_EVERY_S = 1.0  # whether the worker still exists
+WARN_AFTER_S = 5.0  # time that a nested task waits for slots before clients are warned
+_CHECK_EVERY_S = 1.0  # interval between checks whether the worker still exists
 _ENDING = (Status.closing, Status.closed, Status.failed)
 
 _lock = threading.Lock()
-_lenders: dict[Any, Lender] = {}  # {worker of this process: its lender}
+_lenders: dict[Any, Lender] = {}  # lenders by worker of this process
 _thread = threading.local()
 
 
 @dataclass
 class _Loan:
-    """Slots that a task has lent, and whether the task has the slots back."""
+    """Slots that a task has lent."""
 
     key: Any  # key of the task
     slots: Resources
-    returned: threading.Event = field(default_factory=threading.Event)
+    returned: threading.Event = field(default_factory=threading.Event)  # set with the slots back
 
 
 @dataclass(frozen=True)
 class _NestedTask:
-    """A task that waits for slots of this worker, with its submitting task."""
+    """Nested task that waits for slots of this worker, with the task that has submitted it."""
 
-    submitter: Submitter
+    submitter: SubmittingTask
     since: float  # time.monotonic()
 
 
 class Lender:
-    """Lends the slots of a worker's tasks, in the worker's event loop."""
+    """Manages the loans on a worker. Methods that change its state run in the event loop."""
 
     def __init__(self, worker: Any) -> None:
         self.worker = worker
-        self.names: set[str] = set()  # partitions whose tasks lend
-        self.waiters: set[threading.Event] = set()  # threads that lend once slots are wanted
-        self._nested: dict[Any, _NestedTask] = {}  # {key: a task that waits for slots}
-        self._loans: Counter[Any] = Counter()  # {key of a task: its loans under way}
-        self._returning: deque[_Loan] = deque()  # loans whose tasks wait for their slots
+        self.names: set[str] = set()  # partitions whose tasks lend their slots
+        self.waiters: set[threading.Event] = set()  # events of threads that lend on demand
+        self._nested: dict[Any, _NestedTask] = {}  # nested tasks that wait for slots, by key
+        self._loans: Counter[Any] = Counter()  # {task key: number of current loans}
+        self._returning: deque[_Loan] = deque()  # loans whose tasks wait to get their slots back
         self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
-        self._lent: set[Any] = set()  # keys of running tasks that have lent before
-        self._warned: set[Any] = set()  # keys of submitting tasks that clients were warned of
-        self._next_look: Any = None  # handle of the event loop
+        self._lent: set[Any] = set()  # keys of running tasks that have lent their slots before
+        self._warned: set[Any] = set()  # keys of submitting tasks with a warning
+        self._next_check: Any = None  # timer handle of the next check
 
     # -- loans -------------------------------------------------------------------------
 
     def lend(self, loan: _Loan) -> None:
-        """Make the slots of a loan free for further tasks."""
+        """Release the slots of a loan for other tasks."""
         self._loans[loan.key] += 1
         self._lent.add(loan.key)
-        free_slots(self.worker, loan.slots)
-        self.serve()
+        release_slots(self.worker, loan.slots)
+        self.return_slots()
 
     def take_back(self, loan: _Loan) -> None:
-        """Reserve the slots of a loan, and set `returned` of the loan once the slots are free."""
+        """Reserve the slots of a loan, and set its `returned` event once they are free."""
         self._loans[loan.key] -= 1
         if not self._loans[loan.key]:
             del self._loans[loan.key]
-        take_slots(self.worker, loan.slots)
+        reserve_slots(self.worker, loan.slots)
         self._returning.append(loan)
-        self.serve()
+        self.return_slots()
 
     def begin_rejoin(self, key: Any) -> None:
-        """Note a task that has its slots back, and waits for a thread."""
+        """Record that a task has its slots back and waits for a thread."""
         self._rejoining.add(key)
         self._notify()
 
     def end_rejoin(self, key: Any) -> None:
-        """Note a task that has a thread again."""
+        """Record that a task has a thread again."""
         self._rejoining.discard(key)
 
-    def serve(self) -> None:
-        """Give slots back to returning tasks in order, as far as the slots are free.
+    def return_slots(self) -> None:
+        """Return free slots to the waiting tasks in order.
 
-        After the last partition has ended, all returning tasks go on at once.
+        If lending has ended in all partitions, all waiting tasks continue immediately.
         """
         while self._returning and (not self.names or self._are_free(self._returning[0].slots)):
             self._returning.popleft().returned.set()
         self._notify()
 
     def _are_free(self, slots: Resources) -> bool:
-        """Return whether a returning task may have these slots, {resource: number}, back.
+        """Return whether a waiting task can have its slots back.
 
-        `take_back` has taken the slots of all returning tasks from the available slots, which may
-        be below 0: the sum of both is what further tasks leave.
+        The available slots may be negative, because `take_back` has subtracted the slots of all
+        waiting tasks. The sum of both is the number of slots that running tasks do not occupy.
         """
         for name, number in slots.items():
-            available, total = slots_here(self.worker, name)
+            available, total = count_slots(self.worker, name)
             free = available + sum(loan.slots.get(name, 0) for loan in self._returning)
-            # The total may be smaller than the loan: the partition has changed.
+            # The total may be smaller than the loan if the partition has changed.
             if free < min(number, total):
                 return False
         return True
 
-    # -- who wants slots ---------------------------------------------------------------
+    # -- demand for slots --------------------------------------------------------------
 
     def slots_wanted(self) -> bool:
-        """Return whether nested or returning tasks wait for slots, or a task for its thread."""
+        """Return whether any task waits for slots, or waits to get its slots or thread back."""
         return bool(self._nested or self._returning or self._rejoining)
 
     def lends_at_once(self, loan: _Loan) -> bool:
-        """Return whether a task must lend in each wait, although nobody waits for slots.
+        """Return whether a task must lend its slots in each wait, even if no task waits for them.
 
-        True for a task that has lent before, on a worker with more slots than threads. Dask counts
-        a task that has seceded as long-running to its end, also after it has rejoined the worker's
-        threads: a nested task may have started in a free slot, and wait for this task's thread. The
-        nested task does not wait for slots, so that `slots_wanted` does not see it.
+        This is the case if the task has lent its slots before and the worker has more slots than
+        threads. Dask counts a task that has seceded as long-running until it ends, even after it
+        has rejoined the worker's threads. Therefore, a nested task may have started in a free slot
+        and wait for the thread of this task. It does not wait for slots, so `slots_wanted` does not
+        include it.
         """
-        slots = sum(slots_here(self.worker, name)[1] for name in loan.slots)
+        slots = sum(count_slots(self.worker, name)[1] for name in loan.slots)
         return loan.key in self._lent and slots > threads_of(self.worker)
 
     def _notify(self) -> None:
-        """Wake the threads that would lend, if slots are wanted."""
+        """Wake the threads that lend their slots on demand if slots are needed."""
         if self.slots_wanted():
             for waiter in tuple(self.waiters):
                 waiter.set()
 
     def transition(self, key: Any, finish: str) -> None:
-        """Follow the tasks of the worker.
-
-        Tasks in the state "constrained" wait for slots.
-        """
+        """Follow the state of a task. Tasks in the state "constrained" wait for slots."""
         self._nested.pop(key, None)
         if finish not in ("executing", "long-running"):
             self._lent.discard(key)
         if finish == "constrained" and (submitter := submitter_of(self.worker, key)) is not None:
             self._nested[key] = _NestedTask(submitter, time.monotonic())
-            if self._next_look is None:
-                self._look_later()
-        self.serve()
+            if self._next_check is None:
+                self._schedule_check()
+        self.return_slots()
 
     def stop(self) -> None:
-        """End with the last partition: forget waiting tasks, and warn no more."""
+        """Forget waiting tasks and stop the checks after lending has ended in all partitions."""
         self._nested.clear()
-        if self._next_look is not None:
-            self._next_look.cancel()
-            self._next_look = None
+        if self._next_check is not None:
+            self._next_check.cancel()
+            self._next_check = None
 
     # -- warnings ----------------------------------------------------------------------
 
-    def _look_later(self) -> None:
-        """Call `_look` in half of `WARN_AFTER_S`."""
+    def _schedule_check(self) -> None:
+        """Schedule the next check for tasks that have waited too long."""
         loop = asyncio.get_running_loop()
-        self._next_look = loop.call_later(WARN_AFTER_S / 2, self._look)
+        self._next_check = loop.call_later(WARN_AFTER_S / 2, self._check_nested)
 
-    def _look(self) -> None:
-        """Ask for each task that has waited long whether its submitter holds slots."""
-        self._next_look = None
+    def _check_nested(self) -> None:
+        """For each task that has waited too long, ask whether its submitter occupies slots."""
+        self._next_check = None
         looked_at = time.monotonic()
         for key, nested in self._nested.items():
             if (
@@ -213,20 +213,22 @@ class Lender:
                 self._warned.add(nested.submitter.key)
                 self.worker.loop.add_callback(self._warn, key, nested.submitter)
         if self._nested:
-            self._look_later()
+            self._schedule_check()
         else:
             self._warned.clear()
 
     def holds_slots(self, key: Any) -> bool:
-        """Return whether a task runs here and holds its slots."""
+        """Return whether a task is running on this worker and has not lent its slots."""
         waits = any(loan.key == key for loan in self._returning)
         return is_running(self.worker, key) and not (self._loans[key] or waits)
 
-    async def _warn(self, key: Any, submitter: Submitter) -> None:
-        """Warn all clients if the submitter of a waiting task, on whichever worker, holds slots."""
+    async def _warn(self, key: Any, submitter: SubmittingTask) -> None:
+        """Warn all clients if the submitter of a waiting task occupies slots on any worker."""
         try:
-            holds = await call(self.worker, submitter.worker, _holds_slots, key=submitter.key)
-        except (OSError, ValueError):  # the worker has left, or the submitter's is not known
+            holds = await call_worker(
+                self.worker, submitter.worker, _holds_slots, key=submitter.key
+            )
+        except (OSError, ValueError):  # a worker has left, or the submitter's worker is unknown
             holds = False
         if not holds or key not in self._nested:
             self._warned.discard(submitter.key)
@@ -244,10 +246,7 @@ class Lender:
 
 
 def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
-    """Return whether a task holds slots of a worker.
-
-    Runs on that worker.
-    """
+    """Return whether a task occupies slots of a worker. Runs on that worker."""
     lender = _lenders.get(dask_worker)
     return lender is not None and lender.holds_slots(key)
 
@@ -256,8 +255,8 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 
 
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
-    """Return the lender and a new loan for the task of this thread, or None without slots."""
-    running = task_of_thread()
+    """Return the lender and a new loan for the task of this thread, or None if it has no slots."""
+    running = current_task()
     if running is None or getattr(_thread, "in_loan", False):
         return None
     worker, task = running
@@ -269,14 +268,14 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
 
 
 class _WaitHooks:
-    """Hooks that the waits of clients call, as `internals.client.WaitHooks` describes."""
+    """Implementation of `internals.client.WaitHooks`, whose methods the waits of clients call."""
 
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""
         return _loan_of_thread() is not None
 
-    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
-        """Wait until a call has its answer, or further tasks want the slots."""
+    def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+        """Wait until a call has been answered or another task needs the slots of this task."""
         loan_of_task = _loan_of_thread()
         if loan_of_task is None:
             return
@@ -285,8 +284,8 @@ class _WaitHooks:
         answer.add_done_callback(lambda _: waiter.set())
         lender.waiters.add(waiter)
         try:
-            # The worker's event loop first notes who wants slots, and then sets the waiters that
-            # there are: with this order no wish is missed.
+            # The worker's event loop records a demand before it sets the waiters. Since this thread
+            # adds its waiter before it checks the demand, no demand is missed.
             while not (waiter.is_set() or lender.slots_wanted() or lender.lends_at_once(loan)):
                 waiter.wait(_CHECK_EVERY_S)
                 if lender.worker.status is Status.closed:
@@ -295,10 +294,10 @@ class _WaitHooks:
             lender.waiters.discard(waiter)
 
     @contextmanager
-    def lent(self, waits: bool = True) -> Iterator[None]:
-        """Lend the slots and the thread of this thread's task within the block, if `waits`.
+    def lend(self, waits: bool = True) -> Iterator[None]:
+        """Lend the slots and the thread of this thread's task within the block if `waits` is true.
 
-        At the end of the block the thread waits until the task has them back.
+        At the end of the block, the thread waits until the task has its slots and thread back.
         """
         loan_of_task = _loan_of_thread() if waits else None
         if loan_of_task is None:
@@ -308,7 +307,7 @@ class _WaitHooks:
         worker = lender.worker
         _thread.in_loan = True
         has_thread = False
-        # After `worker_client`, or in the user's executor, the worker did not start this thread.
+        # After `worker_client`, or in a custom executor, the task does not occupy a worker thread.
         with suppress(KeyError, AttributeError):
             secede()
             has_thread = True
@@ -320,9 +319,10 @@ class _WaitHooks:
             worker.loop.add_callback(lender.take_back, loan)
             while not loan.returned.wait(_CHECK_EVERY_S) and worker.status is not Status.closed:
                 pass
-            # Not before: tasks that have borrowed the slots need the worker's threads to end. While
-            # this one waits for a thread, tasks that wait in one lend theirs.
-            if has_thread and worker.status not in _ENDING:  # then the threads end as well
+            # The task rejoins only after its slots are back, because tasks that have borrowed the
+            # slots need the worker's threads to finish. While it waits for a thread, other waiting
+            # tasks lend theirs. If the worker is closing, its threads end and there are none left.
+            if has_thread and worker.status not in _ENDING:
                 worker.loop.add_callback(lender.begin_rejoin, loan.key)
                 rejoin()
                 worker.loop.add_callback(lender.end_rejoin, loan.key)
@@ -331,38 +331,38 @@ class _WaitHooks:
 WAIT_HOOKS = _WaitHooks()
 
 
-# -- on and off --------------------------------------------------------------------------
+# -- enabling and disabling --------------------------------------------------------------
 
 
 def begin_lending(worker: Any, name: str) -> Lender:
-    """Let the tasks of a partition lend on a worker, in the worker's event loop."""
+    """Make the tasks of a partition lend their slots. Runs in the worker's event loop."""
     with _lock:
-        let_waits_lend(WAIT_HOOKS)
+        install_wait_hooks(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Let the tasks of a partition keep their slots again, in the worker's event loop."""
+    """Make the tasks of a partition keep their slots again. Runs in the worker's event loop."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)
         if not lender.names:
             del _lenders[worker]
             lender.stop()
-        lender.serve()
+        lender.return_slots()
 
 
 def lending_plugin(name: str) -> bytes:
-    """Return a pickled plugin that has workers lend until it is removed.
+    """Return a pickled worker plugin that enables lending for a partition until it is removed.
 
-    A joining worker gets tasks before a request can reach the worker, and plugins before its tasks.
-    Workers without this package ignore the plugin.
+    A plugin is used because a joining worker receives plugins before its first tasks, whereas a
+    request could arrive after them. Workers on which poolpart is not installed ignore the plugin.
     """
 
     class LendingPlugin(WorkerPlugin):
-        # A class within a function is sent by value.
+        # The class is defined in a function so that it is pickled by value.
         lender: Any = None
 
         def setup(self, worker: Any) -> None:
@@ -371,7 +371,7 @@ def lending_plugin(name: str) -> bytes:
                 from poolpart.internals.names import NESTED, missing_names
             except ImportError:
                 return
-            if not missing_names(NESTED):  # another version of Dask than the scheduler's
+            if not missing_names(NESTED):  # the worker's version of Dask may differ
                 self.lender = begin_lending(worker, name)
 
         def teardown(self, worker: Any) -> None:
@@ -380,7 +380,7 @@ def lending_plugin(name: str) -> bytes:
                 from poolpart.registration import forget_registrations
 
                 end_lending(worker, name)
-                # The scheduler has removed the registrations of all clients.
+                # The scheduler has removed the registrations of all clients for the partition.
                 forget_registrations(name)
 
         def transition(self, key: Any, start: str, finish: str, **kwargs: Any) -> None:

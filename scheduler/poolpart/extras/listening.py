@@ -1,4 +1,4 @@
-"""A function of this process that gets the items of a pipe."""
+"""Listeners, which call a function of this process for each item of a pipe."""
 
 from __future__ import annotations
 
@@ -6,20 +6,29 @@ import concurrent.futures
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Protocol, Self
 
 from dask.utils import funcname
 
 from ..errors import PipeClosed, PipeFailed
-from .background import in_background
-
-if TYPE_CHECKING:
-    from ..pipe import Pipe
+from .background import run_in_background
 
 _CHECK_S = 1.0  # interval at which the thread checks whether the listener was closed
 
 
-class Listener:
+class ItemSource(Protocol):
+    """The part of a `Pipe` that a listener uses."""
+
+    name: str
+
+    def get(self, timeout_s: float | None = None) -> Any:
+        """Remove and return the next item."""
+
+    def fail(self, reason: str) -> None:
+        """Make the pipe fail."""
+
+
+class PipeListener:
     """Background thread, started by `Pipe.listen`, that calls a function for each item of a pipe.
 
     `join` waits until the pipe has ended, and `close` stops listening. At the end of a ``with``
@@ -36,13 +45,19 @@ class Listener:
     >>> listener.join(timeout_s=60)                                      # doctest: +SKIP
     """
 
-    def __init__(self, pipe: Pipe, function: Callable[[Any], Any]) -> None:
+    def __init__(
+        self,
+        pipe: ItemSource,
+        function: Callable[[Any], Any],
+        put_back: Callable[[Any], None],
+    ) -> None:
         self._pipe = pipe
+        self._put_back = put_back
         self._function = function
         self._closed = threading.Event()
         self._calling = threading.Lock()  # held while the function runs
-        self._thread: threading.Thread | None = None  # thread ids are used again, objects are not
-        self._done = in_background(self._listen)
+        self._thread: threading.Thread | None = None  # not the ID, because IDs are reused
+        self._done = run_in_background(self._listen)
 
     def join(self, timeout_s: float | None = None) -> None:
         """Wait until the pipe has ended and the function has been called for all items.
@@ -87,7 +102,7 @@ class Listener:
             return
         with self._calling:
             pass
-        # The thread ends at its next check, unless it waits for a scheduler that does not answer.
+        # The thread ends at its next check unless the scheduler does not respond.
         concurrent.futures.wait([self._done], 2 * _CHECK_S)
 
     def __enter__(self) -> Self:
@@ -100,9 +115,7 @@ class Listener:
             self.close()
 
     def _listen(self) -> None:
-        """Call the function until the pipe ends or the listener is closed."""
-        from ..pipe import put_back  # `pipe` imports this module
-
+        """Call the function for each item until the pipe ends or the listener is closed."""
         self._thread = threading.current_thread()
         try:
             while not self._closed.is_set():
@@ -118,7 +131,7 @@ class Listener:
                     raise
                 with self._calling:
                     if self._closed.is_set():
-                        put_back(self._pipe, item)
+                        self._put_back(item)
                         return
                     self._function(item)
         except BaseException as error:

@@ -1,7 +1,8 @@
-"""Figures of partitions at the scheduler's address ``/metrics``, in the format of Prometheus.
+"""Metrics of partitions for Prometheus, at the scheduler's ``/metrics`` endpoint.
 
-They are there where Dask's own are: the scheduler needs the package prometheus-client. Scaling and
-alerting can go by the demand of each partition, which Dask's figures of the whole cluster hide.
+Like Dask's own metrics, they require the package prometheus-client in the scheduler's environment.
+They can be used to scale or to send alerts according to the demand of each partition, which Dask's
+metrics of the whole cluster do not show.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ _LABELS = ["partition"]
 
 
 class PartitionCollector:
-    """Collects the figures of a scheduler's partitions at each request."""
+    """Prometheus collector for the statistics of all partitions of a scheduler."""
 
     def __init__(self, collect_stats: Callable[[], list[PartitionStats]]) -> None:
         self._collect_stats = collect_stats
 
     def describe(self) -> Iterator[Any]:
-        """Name no figures before they are requested, since the scheduler may just be starting."""
+        """Return no metrics, since the scheduler may not be ready when the collector is added."""
         return iter(())
 
     def collect(self) -> Iterator[Any]:
@@ -64,13 +65,13 @@ class PartitionCollector:
 
 
 class _Metrics(Feature):
-    """Publishes the figures while a scheduler counts its tasks."""
+    """Feature that publishes metrics while a scheduler counts its tasks."""
 
     def __init__(self) -> None:
         self._collectors: WeakKeyDictionary[Any, PartitionCollector] = WeakKeyDictionary()
 
     def begin_counting(self, statistics: Any) -> None:
-        """Add the figures to ``/metrics``, where prometheus-client is installed."""
+        """Add the metrics to ``/metrics`` if prometheus-client is installed."""
         try:
             from prometheus_client import REGISTRY
         except ImportError:
@@ -80,7 +81,7 @@ class _Metrics(Feature):
         REGISTRY.register(collector)
 
     def end_counting(self, statistics: Any) -> None:
-        """Remove the figures."""
+        """Remove the metrics."""
         collector = self._collectors.pop(statistics, None)
         if collector is not None:
             from prometheus_client import REGISTRY

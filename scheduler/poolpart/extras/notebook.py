@@ -1,4 +1,4 @@
-"""Pools, partitions and pipes as notebooks show them: tables, and a link to the page."""
+"""HTML representations of pools, partitions and pipes for notebooks, with a link to the page."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..membership import has_rule, partition_names
 from ..partition_stats import COUNTS, NO_PARTITION, PartitionStats
 from ..pipe_states import pipes_of
 from ..stats import stats_of
-from ..workers import on_scheduler
-from .dashboard_page import is_open, page_link
+from ..workers import run_on_scheduler
+from .dashboard_page import is_page_open, page_link
 
 _LINK = Template("""\
 {% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Partitions page</a></p>\
@@ -24,31 +24,31 @@ _LINK = Template("""\
 _PLAIN = Template("<pre>{{ text }}</pre>")
 _HEAD = ("partition", "workers", "slots", "busy", *COUNTS)
 _HEAD_OF_A_PIPE = ("pipe", "depth", "capacity", "state")
-# Whoever has a partition or a pipe alone has no variable `pool`.
+# Used for partitions and pipes, because there may be no variable named `pool`.
 _OPENER = "Pool.from_client(client).page()"
 
 
 def table_of_partitions(client: Client, title: str) -> str:
-    """Return the HTML of a table of all partitions, and of what belongs to no partition.
+    """Return the HTML of a table of all partitions, and of workers and tasks without one.
 
-    The link to the page follows if the page is open. Only `title` is shown where the scheduler does
-    not answer.
+    If the page is open, the table is followed by a link to it. If the scheduler is unavailable,
+    only the title is returned.
     """
     try:
-        rows, link = _ask(client, _all_partitions)
+        rows, link = _request(client, _all_partitions)
     except (PoolError, OSError):  # the client was closed, or the scheduler lacks this package
         return _plain(title)
     return html_table(title, _HEAD, rows) + _link(link, "pool.page()")
 
 
 def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of the figures of a partition, or a sentence if it was dissolved."""
+    """Return the HTML of a partition's statistics, or a sentence if it does not exist."""
     gone = "No worker declares this partition. It was dissolved, or its workers have left."
     return _table_of_one(get_client, _one_partition, name, (title, _HEAD, gone))
 
 
 def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of the state of a pipe, or a sentence if it was deleted."""
+    """Return the HTML of a pipe's state, or a sentence if the pipe does not exist."""
     gone = "The pipe does not exist. It was deleted or never created."
     return _table_of_one(get_client, _one_pipe, name, (title, _HEAD_OF_A_PIPE, gone))
 
@@ -59,14 +59,14 @@ def _table_of_one(
     name: str,
     words: tuple[str, Sequence[str], str],
 ) -> str:
-    """Return the HTML of what a function finds of a name on the scheduler.
+    """Return the HTML of a table with one row, which a function returns on the scheduler.
 
-    `words` are the title, the names of the columns, and the sentence if nothing of that name is
-    there. Only the title is shown where the scheduler does not answer.
+    `words` contains the title, the column names, and the sentence that is shown if there is no row.
+    If the scheduler is unavailable, only the title is returned.
     """
     title, head, gone = words
     try:
-        row, link = _ask(get_client(), look, name=name)
+        row, link = _request(get_client(), look, name=name)
     except (PoolError, OSError, ValueError):  # ValueError: this process has no client
         return _plain(title)
     if row is None:
@@ -79,48 +79,41 @@ def _plain(text: str) -> str:
 
 
 def _link(link: str | None, opener: str) -> str:
-    """Return the link to the page, or the call that opens the page."""
+    """Return the HTML of a link to the page, or of the call that opens it."""
     return _LINK.generate(link=link, opener=opener).decode()
 
 
-def _ask(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
-    """Return what a function finds on the scheduler, and the URL of the page if it is open."""
-    found, has_page = on_scheduler(client, look, **arguments)
+def _request(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
+    """Call a function on the scheduler, and return its result and the URL of the page if open."""
+    found, has_page = run_on_scheduler(client, look, **arguments)
     return found, page_link(client) if has_page else None
 
 
 def _row(stats: PartitionStats) -> list[object]:
-    """Return the figures of a partition in the order of the columns."""
+    """Return the table row of a partition's statistics."""
     return [stats.name or NO_PARTITION, *(getattr(stats, column) for column in _HEAD[1:])]
 
 
 def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]], bool]:
-    """Return the rows of all partitions, and whether the page is open.
-
-    Runs on the scheduler.
-    """
+    """Return the rows of all partitions and whether the page is open. Runs on the scheduler."""
     names = [*partition_names(dask_scheduler), ""]
-    return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_open(dask_scheduler)
+    return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_page_open(dask_scheduler)
 
 
 def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a partition, or None if it does not exist.
+    """Return the row of a partition, or None, and whether the page is open.
 
-    Runs on the scheduler.
-
-    A partition of a division, and an adaptive partition, exist without workers, too.
+    Partitions of a divided pool and adaptive partitions exist even without workers. Runs on the
+    scheduler.
     """
     [stats] = stats_of([name], dask_scheduler)
     is_expected = has_rule(dask_scheduler, name) or name in adaptive_names(dask_scheduler)
     exists = bool(stats.workers) or is_expected
-    return _row(stats) if exists else None, is_open(dask_scheduler)
+    return _row(stats) if exists else None, is_page_open(dask_scheduler)
 
 
 def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a pipe, or None if it does not exist.
-
-    Runs on the scheduler.
-    """
+    """Return the row of a pipe, or None, and whether the page is open. Runs on the scheduler."""
     pipe = pipes_of(dask_scheduler).get(name)
-    row = None if pipe is None else [name, *pipe.figures]
-    return row, is_open(dask_scheduler)
+    row = None if pipe is None else [name, *pipe.summary]
+    return row, is_page_open(dask_scheduler)

@@ -1,14 +1,14 @@
 """Errors for tasks whose inputs cannot be unpickled on their worker.
 
-Dask lets such a task wait forever. In an experiment, ``b.submit(use, a.submit(f))``, where the
-result of ``f`` could be unpickled only in the process that had made it, never ended, nor did a map
-of a map. The worker of ``use`` logs the error, keeps the input in its state "error", and tells the
-scheduler that the input has failed. The scheduler ignores this message, because the input is in the
-memory of another worker. This module reacts to the message.
+In plain Dask, such a task waits forever, for example in ``b.submit(use, a.submit(f))`` if the
+result of ``f`` can only be unpickled in the process that created it, or in a map over a map. The
+worker of ``use`` logs the error, keeps the input in the state "error", and reports to the scheduler
+that the input has failed. The scheduler ignores the report, because the input is in the memory of
+another worker. This module handles the report.
 
-A worker fetches several inputs in one request, and if one cannot be unpickled, it reports all of
-them. Therefore it is asked to fetch each input alone. Tasks with inputs that it can read are sent
-to it again.
+A worker fetches several inputs in one request. If one of them cannot be unpickled, it reports all
+of them as failed. Therefore, the worker is asked to fetch each input individually. Tasks whose
+inputs are readable are sent to the worker again.
 """
 
 from __future__ import annotations
@@ -19,36 +19,39 @@ from collections.abc import Set
 from typing import Any
 
 from ..errors import PoolError
-from ..internals.method_rules import Rules, rule_for_failed_fetches
-from ..internals.scheduler import asks_for, call, fail_task, run_again
+from ..internals.method_rules import MethodRules, add_failed_fetch_rule
+from ..internals.scheduler import call_worker, fail_task, requires_any, reschedule_tasks
 from ..internals.worker import why_unreadable
 
-READ_S = 60.0  # seconds for a worker to fetch an input alone
-MAX_ATTEMPTS = 10  # how often a worker fetches an input that it can read alone, but not with others
+READ_S = 60.0  # time for a worker to fetch an input individually
+MAX_ATTEMPTS = 10  # maximum attempts for an input that is only readable individually
 
 
 class UnreadableInputs:
-    """The scheduler's side, for the partitions of `names`, which are read each time."""
+    """Rule on the scheduler that handles reports about unreadable inputs.
+
+    `names` are the names of the partitions, a set that the caller updates.
+    """
 
     def __init__(self, scheduler: Any, names: Set[str]) -> None:
         self.scheduler = scheduler
         self._names = names
-        self._rules = Rules()
-        self._attempts: Counter[tuple[Any, str]] = Counter()  # keys as of `_open`
-        # {(key of an input, address of a worker): the question whether the worker can read it}
+        self._rules = MethodRules()
+        self._attempts: Counter[tuple[Any, str]] = Counter()  # {(input key, worker address): count}
+        # {(input key, worker address): request whether the worker can read the input}
         self._open: dict[tuple[Any, str], asyncio.Task[None]] = {}
-        rule_for_failed_fetches(self._rules, scheduler, self._examine_soon)
+        add_failed_fetch_rule(self._rules, scheduler, self._examine_soon)
 
     def uninstall(self) -> None:
-        """Take the rule back."""
-        self._rules.take_back()
+        """Remove the rule from the scheduler."""
+        self._rules.remove_all()
 
     def _examine_soon(self, task: Any, worker: str) -> None:
-        """Ask a worker about an input that it could not fetch, unless it is being asked."""
-        question = task.key, worker
-        if question not in self._open and self._waiting(task, worker):
-            self._open[question] = asyncio.ensure_future(self._examine(task, worker))
-            self._open[question].add_done_callback(lambda _: self._open.pop(question))
+        """Examine an input that a worker could not fetch, unless this is already in progress."""
+        request = task.key, worker
+        if request not in self._open and self._waiting(task, worker):
+            self._open[request] = asyncio.ensure_future(self._examine(task, worker))
+            self._open[request].add_done_callback(lambda _: self._open.pop(request))
 
     def _waiting(self, task: Any, worker: str) -> list[Any]:
         """Return the tasks of partitions that wait on a worker for the result of a task."""
@@ -57,25 +60,25 @@ class UnreadableInputs:
             for waiting in task.dependents
             if waiting.processing_on is not None
             and waiting.processing_on.address == worker
-            and asks_for(waiting, self._names)
+            and requires_any(waiting, self._names)
         ]
 
     async def _examine(self, task: Any, worker: str) -> None:
-        """Let tasks that wait for a result fail if their worker cannot unpickle the result."""
+        """Make tasks fail if their worker cannot unpickle a result that they wait for."""
         holder = next(iter(task.who_has)).address
-        request = call(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
+        request = call_worker(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
         try:
             async with asyncio.timeout(READ_S):
                 error = await request
         except (OSError, TimeoutError):  # one of the workers has died, or is busy
             error = ""
         state = self.scheduler.workers.get(worker)
-        if state is None:  # Dask runs its tasks elsewhere
+        if state is None:  # Dask runs the tasks of the lost worker elsewhere
             return
         waiting = self._waiting(task, worker)
         self._attempts[task.key, worker] += 1
         if not error and self._attempts[task.key, worker] < MAX_ATTEMPTS:
-            run_again(self.scheduler, waiting)
+            reschedule_tasks(self.scheduler, waiting)
             return
         del self._attempts[task.key, worker]
         for dependent in waiting:

@@ -1,5 +1,6 @@
-"""All that poolpart relies on in Dask beyond its documented interfaces, by what it touches.
+"""All code that relies on undocumented API of Dask, grouped by the objects that it accesses.
 
-docs/pool-partitions.md has the list: what is used, why, the versions tried, and the test that fails
-when it changes. No other module of poolpart reaches into Dask, which a test checks.
+docs/pool-partitions.md lists what is used and why, the tested versions, and the test that fails if
+it changes. A test checks that no other module of poolpart uses private API of Dask, apart from
+`deploy`.
 """

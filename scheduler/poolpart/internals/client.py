@@ -1,4 +1,4 @@
-"""What clients do beyond their documented methods: waits that lend, callbacks, requests."""
+"""Functions for clients that use private API: waits that lend slots, callbacks, and requests."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from typing import Any, Protocol
 import distributed
 from distributed import Client, Future, as_completed, futures_of
 
-ANSWER_S = 300.0  # longest wait for an answer of the scheduler, in seconds
-REQUEST_S = 0.05  # a call of the scheduler that takes longer waits for something
-_OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the called function
+ANSWER_S = 300.0  # default time limit for a response of the scheduler
+REQUEST_S = 0.05  # a call of the scheduler that takes longer is considered to be waiting
+_OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # options that `sync` itself accepts
 
 
 class WaitHooks(Protocol):
-    """Functions that a wait calls to lend the slots of the waiting task."""
+    """Methods that a wait calls to lend the slots of the waiting task."""
 
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""
 
-    def until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
-        """Wait until a call has its answer, or further tasks want the slots."""
+    def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
+        """Wait until a call has been answered or another task needs the slots."""
 
-    def lent(self, waits: bool = True) -> AbstractContextManager[None]:
-        """Lend the slots within the block, if the task waits."""
-
-
-_hooks: list[WaitHooks] = []  # hooks that `let_waits_lend` has set
+    def lend(self, waits: bool = True) -> AbstractContextManager[None]:
+        """Lend the slots within the block if `waits` is true."""
 
 
-@cache  # once: another library may have wrapped the same since, and goes on calling this
-def let_waits_lend(hooks: WaitHooks) -> None:
-    """Wrap the waits of Dask's clients so that waiting tasks of this process lend slots.
+_hooks: list[WaitHooks] = []  # set by `install_wait_hooks`
 
-    `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections, and
-    `as_completed` lend at once if they have to wait. All other calls of the scheduler, such as
-    `Queue.get`, `Variable.get`, `Event.wait` and `Lock.acquire`, lend from the moment on that other
-    tasks want the slots, to their end. All but `as_completed` and the results of actors' methods
-    come down to `SyncMethodMixin.sync`.
+
+@cache  # only once per process, because another library may have wrapped the wrapper since
+def install_wait_hooks(hooks: WaitHooks) -> None:
+    """Wrap the waits of Dask's clients so that waiting tasks in this process lend their slots.
+
+    `Future.result` and `Future.exception`, `Client.gather`, `wait`, the computation of collections,
+    and `as_completed` lend slots immediately if they have to wait. All other calls of the
+    scheduler, for example `Queue.get`, `Variable.get`, `Event.wait` and `Lock.acquire`, lend slots
+    as soon as other tasks need them, until the end of the call. Except for `as_completed` and the
+    results of actor methods, all of these calls go through `SyncMethodMixin.sync`.
     """
     from distributed.actor import ActorFuture
     from distributed.utils import SyncMethodMixin
@@ -62,7 +62,7 @@ def let_waits_lend(hooks: WaitHooks) -> None:
             pending = [future.status in ("pending", "lost") for future in futures]
             first = kwargs.get("return_when") == "FIRST_COMPLETED"
             waits = all(pending) if first else any(pending)
-            with hooks.lent(waits):
+            with hooks.lend(waits):
                 return sync(caller, function, *args, **kwargs)
         if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):
             return sync(caller, function, *args, **kwargs)
@@ -75,21 +75,21 @@ def let_waits_lend(hooks: WaitHooks) -> None:
         answer = asyncio.run_coroutine_threadsafe(call(), caller.loop.asyncio_loop)
         try:
             concurrent.futures.wait([answer], REQUEST_S)
-            hooks.until_wanted(answer)
-            # One loan to the end of the wait: a task that borrows the slots may wait in turn, and
-            # trees of such tasks hang if each looks again and again whether its slots are wanted.
-            with hooks.lent(not answer.done()):
+            hooks.wait_until_wanted(answer)
+            # A single loan until the end of the wait. Tasks that borrow the slots may wait in turn,
+            # and trees of such tasks would hang if each loan ended when the demand ends.
+            with hooks.lend(not answer.done()):
                 return answer.result()
         finally:
-            answer.cancel()  # after an error in this thread
+            answer.cancel()  # has no effect unless an error was raised in this thread
 
     def next_lending(completed: Any) -> Any:
         waits = not completed.has_ready() and not completed.is_empty()
-        with hooks.lent(waits):
+        with hooks.lend(waits):
             return next_completed(completed)
 
     def result_of_actor_lending(future: Any, *args: Any, **kwargs: Any) -> Any:
-        with hooks.lent(not future.done()):
+        with hooks.lend(not future.done()):
             return result_of_actor(future, *args, **kwargs)
 
     SyncMethodMixin.sync = sync_lending
@@ -97,17 +97,21 @@ def let_waits_lend(hooks: WaitHooks) -> None:
     as_completed.__next__ = as_completed.next = next_lending
 
 
-def slots_lent(waits: bool) -> AbstractContextManager[None]:
-    """Lend the slots of this thread's task within the block, if it waits, and tasks lend here."""
-    return _hooks[0].lent(waits) if _hooks else nullcontext()
+def lend_slots(waits: bool) -> AbstractContextManager[None]:
+    """Lend the slots of this thread's task within the block if `waits` is true.
+
+    Nothing happens if the hooks are not installed in this process.
+    """
+    return _hooks[0].lend(waits) if _hooks else nullcontext()
 
 
-def when_done(future: Future, function: Callable[[Future], Any]) -> None:
-    """Call `function(future)` once the task has succeeded, failed or been cancelled.
+def call_when_done(future: Future, function: Callable[[Future], Any]) -> None:
+    """Call `function(future)` once a task has succeeded, failed or been canceled.
 
-    It is called in the client's event loop and must not block. `Future.add_done_callback` uses a
-    thread that all callbacks of the process share: a user's callback that waits there for this
-    one would wait for ever. It also considers a task done whose lost result is being recomputed.
+    The function is called in the client's event loop and must not block. `Future.add_done_callback`
+    is not used for two reasons. All of its callbacks share a thread, so a user's callback that
+    waits for this one would wait forever. It also considers a task done while its lost result is
+    being recomputed.
     """
 
     async def wait() -> None:
@@ -118,7 +122,7 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
     future.client.loop.add_callback(wait)
 
 
-async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
+async def fetch_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
     """Fetch results directly from a worker, without involving the scheduler."""
     from distributed.utils_comm import gather_from_workers
 
@@ -126,29 +130,29 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
     return dict(data)
 
 
-async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
+async def send_request(client: Client, address: str | None, handler: str, **arguments: Any) -> Any:
     """Call a handler of a worker, or of the scheduler if the address is None.
 
-    Returns None if the scheduler lacks the handler, in which case the scheduler logs an error. The
-    caller sets a time limit for a worker; `answer_of_scheduler` sets the limit for the scheduler.
+    If the scheduler lacks the handler, it logs an error and the result is None. For a worker, the
+    caller sets a time limit. For the scheduler, the limit is that of `await_scheduler`.
     """
     if address is None:
-        return await answer_of_scheduler(client, getattr(client.scheduler, question)(**arguments))
-    return await getattr(client.rpc(address), question)(**arguments)
+        return await await_scheduler(client, getattr(client.scheduler, handler)(**arguments))
+    return await getattr(client.rpc(address), handler)(**arguments)
 
 
-async def answer_of_scheduler(
+async def await_scheduler(
     client: Client, request: Awaitable[Any], seconds: float | None = None
 ) -> Any:
-    """Await a request to the scheduler, for `ANSWER_S` seconds by default.
+    """Await a request to the scheduler, for at most `ANSWER_S` seconds by default.
 
     Raises
     ------
     OSError
-        If the scheduler does not answer in time.
+        If the scheduler does not respond in time.
     """
-    # A scheduler process that is stopped (SIGSTOP), or whose machine is suspended, keeps its
-    # connections open: tried, `Pipe.get`, `Partition.stats` and `Pool.partitions` never returned.
+    # If the scheduler process is stopped (SIGSTOP) or its machine is suspended, its connections
+    # remain open, and requests without a time limit would never return.
     seconds = ANSWER_S if seconds is None else seconds
     try:
         async with asyncio.timeout(seconds) as limit:
@@ -156,7 +160,7 @@ async def answer_of_scheduler(
     except TimeoutError as error:
         if not limit.expired():
             raise
-        # Not a TimeoutError, which `Pipe.get` raises if no item comes.
+        # Not a TimeoutError, because `Pipe.get` raises that if no item arrives.
         raise OSError(
             f"The scheduler at {client.scheduler.address} has not responded for {seconds:g} s. "
             "Check that its process is running."
@@ -164,17 +168,21 @@ async def answer_of_scheduler(
 
 
 def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
-    """Return the results of finished tasks, as `Client.gather` does.
+    """Return the results of finished tasks, like `Client.gather`, but with a time limit.
 
-    Raises OSError, as `answer_of_scheduler` does, where `Client.gather` would wait forever.
+    Raises
+    ------
+    OSError
+        If the scheduler does not respond. `Client.gather` would wait forever.
     """
 
     async def watch() -> list[Any]:
         results = asyncio.ensure_future(client.gather(futures, asynchronous=True))
         try:
-            # Large results may take longer than an answer of the scheduler.
+            # A transfer of large results may take longer than the limit, so only check that the
+            # scheduler responds.
             while not (await asyncio.wait([results], timeout=ANSWER_S))[0]:
-                await ask(client, None, "identity", n_workers=0)
+                await send_request(client, None, "identity", n_workers=0)
             return list(results.result())
         finally:
             results.cancel()
@@ -182,8 +190,8 @@ def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
     return list(client.sync(watch))
 
 
-def as_bytes(data: Any) -> Any:
-    """Wrap bytes so that they are sent without copying."""
+def wrap_bytes(data: Any) -> Any:
+    """Wrap bytes so that Dask sends them without copying them."""
     from distributed.protocol import to_serialize
 
     return to_serialize(memoryview(data))

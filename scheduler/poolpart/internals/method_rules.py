@@ -1,4 +1,8 @@
-"""Rules before, after and in place of methods of a scheduler, since its plugins only observe."""
+"""Rules that are called before, after or instead of methods of a running scheduler.
+
+They are required because scheduler plugins can only observe. A rule is installed as an attribute of
+the scheduler instance, which hides the method of the class until the attribute is deleted.
+"""
 
 from __future__ import annotations
 
@@ -10,29 +14,27 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
-from .scheduler import SUBMITTER, Resources, Submitter, actor_of_method
+from .scheduler import SUBMITTER, Resources, SubmittingTask, actor_of_method
 
 logger = logging.getLogger(__name__)
 
-# Plugins of the scheduler only observe. An attribute of the instance hides the class's method
-# until it is deleted.
-
-After = Callable[..., Any]  # gets the method's result and its arguments; returns the result
-Before = Callable[[dict[str, Any]], dict[str, Any]]  # gets the keyword arguments; returns them
-Instead = Callable[..., Any]  # gets the method's arguments; NotImplemented: the method is called
+After = Callable[..., Any]  # receives the method's result and arguments, and returns a result
+Before = Callable[[dict[str, Any]], dict[str, Any]]  # receives and returns keyword arguments
+Instead = Callable[..., Any]  # receives the arguments; NotImplemented means to call the method
 
 
 class _Method:
-    """Replacement of a method: the original, with rules before, after and in place of a call.
+    """Replacement of a method that calls rules before, after and instead of the original.
 
-    A rule that raises is skipped, and the log says so once: other users of the cluster get what
-    Dask does without it. An error of the method itself reaches its caller unchanged, and so does a
-    PoolError of a rule before the call: the rule refuses the call.
+    If a rule raises an exception, the rule is skipped and the first such exception is logged, so
+    that other users of the cluster get Dask's own behavior. Errors of the original method reach the
+    caller unchanged, and so does a PoolError that a rule raises before the call in order to reject
+    it.
     """
 
     def __init__(self, original: Callable[..., Any]) -> None:
         self.original = original
-        self.__name__ = original.__name__  # the server logs the name of the handler
+        self.__name__ = original.__name__  # appears in the server's log
         self.rules_before: list[Before] = []
         self.rules_instead: list[Instead] = []
         self.rules_after: list[After] = []
@@ -63,7 +65,7 @@ class _Method:
         return result
 
     def _log_failure(self, rule: Any) -> None:
-        """Log the exception of a rule, at its first failure."""
+        """Log the exception of a rule when it fails for the first time."""
         if rule not in self._logged:
             self._logged.add(rule)
             logger.exception(
@@ -74,33 +76,42 @@ class _Method:
             )
 
 
-class Rules:
-    """Rules for methods of a running scheduler.
+class MethodRules:
+    """Set of rules for methods of a running scheduler.
 
-    Several objects may have rules for a method.
+    Several sets can have rules for the same method.
     """
 
     def __init__(self) -> None:
-        self._added: list[tuple[Any, str, Any]] = []  # (object, name of its method, rule)
+        self._added: list[tuple[Any, str, Any]] = []  # (object, method name, rule)
 
     def call_after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
         """Call `rule(result, …)` after a method, with its result and arguments, for a new result.
 
-        `parameter` is the name of the method's only parameter. PoolError if this version of Dask
-        has no such method; then all rules are removed.
+        `parameter` is the name of a parameter that the method must have.
+
+        Raises
+        ------
+        PoolError
+            If this version of Dask has no such method. All rules of this set are removed first.
         """
         self._stand_in(owner, name, {parameter}).rules_after.append(rule)
         self._added.append((owner, name, rule))
 
     def call_before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
-        """Call `rule(keywords)` before a method, for the keyword arguments to use."""
+        """Call `rule(keywords)` before a method, and call the method with the returned keywords.
+
+        `parameters` are the names of parameters that the method must have. This method raises the
+        same error as `call_after`.
+        """
         self._stand_in(owner, name, {*parameters}).rules_before.append(rule)
         self._added.append((owner, name, rule))
 
     def call_instead(self, owner: Any, name: str, rule: Instead, parameter: str) -> None:
-        """Call `rule(…)` in place of a method.
+        """Call `rule(…)` instead of a method, unless the rule returns NotImplemented.
 
-        If that is NotImplemented, the method runs.
+        `parameter` is the name of a parameter that the method must have. This method raises the
+        same error as `call_after`.
         """
         self._stand_in(owner, name, {parameter}).rules_instead.append(rule)
         self._added.append((owner, name, rule))
@@ -108,7 +119,7 @@ class Rules:
     def _stand_in(self, owner: Any, name: str, parameters: set[str]) -> _Method:
         method = getattr(type(owner), name, None)
         if method is None or not parameters <= inspect.signature(method).parameters.keys():
-            self.take_back()
+            self.remove_all()
             raise PoolError(
                 f"{type(owner).__name__} in distributed {distributed.__version__} has no method "
                 f"{name}({', '.join(sorted(parameters))}), which poolpart requires. Install a "
@@ -120,8 +131,8 @@ class Rules:
             setattr(owner, name, stand_in)
         return stand_in
 
-    def take_back(self) -> None:
-        """Remove these rules."""
+    def remove_all(self) -> None:
+        """Remove all rules of this set, and restore methods that have no further rules."""
         while self._added:
             owner, name, rule = self._added.pop()
             method = vars(owner)[name]
@@ -132,21 +143,24 @@ class Rules:
                 delattr(owner, name)
 
 
-def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
-    """Give the tasks of a graph that a task submits the resources that the graph leaves open.
+def add_graph_rule(
+    rules: MethodRules, scheduler: Any, inherited_resources: Callable[[Any], Resources]
+) -> None:
+    """Make nested tasks inherit resources from the task that submits their graph.
 
-    `bequeath` returns these resources for the state of the submitting task. Each task is annotated
-    with the task that submits it, so that workers know which tasks wait for slots of their parents.
+    `inherited_resources` returns these resources for the state of the submitting task. Tasks that
+    specify resources or workers inherit nothing. Each nested task is also annotated with its
+    submitting task, so that workers can recognize tasks that wait for the slots of their parents.
     """
 
     def add_annotations(graph: dict[str, Any]) -> dict[str, Any]:
         name = graph["submitting_task"]
         task = scheduler.tasks.get(name) or actor_of_method(scheduler, name)
-        inherited = bequeath(task) if task is not None else {}
+        inherited = inherited_resources(task) if task is not None else {}
         if not inherited:
             return graph
-        address = task.processing_on.address if task.processing_on else ""  # not of an actor
-        submitter = Submitter(task.key, address)
+        address = task.processing_on.address if task.processing_on else ""  # "" for actors
+        submitter = SubmittingTask(task.key, address)
         global_annotations = graph["global_annotations"] or {}
         by_type = graph["annotations_by_type"]  # {"workers": {key: …}, "resources": …}
         by_type = {**by_type, SUBMITTER: dict.fromkeys(graph["dsk"], submitter)}
@@ -165,10 +179,10 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
     )
 
 
-def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> None:
-    """Call `check` with the arguments of each graph that arrives, so that its PoolError refuses it.
+def add_arrival_rule(rules: MethodRules, scheduler: Any, check: Before) -> None:
+    """Call `check` with the arguments of each arriving graph, which it may change or reject.
 
-    The client then gets the error from each of the graph's futures.
+    If `check` raises a PoolError, all futures of the graph raise this error.
     """
     rules.call_before(
         scheduler,
@@ -178,23 +192,23 @@ def rule_for_arriving_graphs(rules: Rules, scheduler: Any, check: Before) -> Non
     )
 
 
-def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
-    """Let shuffles and rechunks choose permitted workers for their output.
+def add_shuffle_rule(rules: MethodRules, scheduler: Any) -> None:
+    """Make shuffles and rechunks choose permitted workers for their outputs.
 
-    Dask pins each output to any worker of the cluster, even if the tasks ask for a resource that
-    the worker lacks; they would wait for ever.
+    Dask assigns each output to any worker of the cluster, even if its task requests a resource that
+    the worker does not have. Such a task would wait forever.
     """
     if not (shuffle := scheduler.extensions.get("shuffle")):
         return
 
     def move_outputs(chosen: dict[Any, str], spec: Any) -> dict[Any, str]:
-        from distributed.shuffle._core import barrier_key  # not where poolpart is imported
+        from distributed.shuffle._core import barrier_key  # imported late to save time
 
         valid = scheduler.valid_workers(scheduler.tasks[barrier_key(spec.id)])
-        if not valid:  # any worker, or none
+        if not valid:  # None if any worker is valid, empty if no worker is
             return chosen
         allowed = sorted(worker.address for worker in valid)
-        start = hash(spec.id)  # so that many small shuffles do not all use the first worker
+        start = hash(spec.id)  # distributes small shuffles over the workers
         return {
             output: worker if worker in allowed else allowed[(start + number) % len(allowed)]
             for number, (output, worker) in enumerate(chosen.items())
@@ -203,13 +217,18 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
     rules.call_after(shuffle, "_calculate_worker_for", move_outputs, "spec")
 
 
-def rule_for_fences(
-    rules: Rules, scheduler: Any, closed: set[Any], stop: Callable[[Any], bool]
+def add_fence_rules(
+    rules: MethodRules, scheduler: Any, enclosed: set[Any], keeps_out: Callable[[Any], bool]
 ) -> None:
-    """Keep tasks away from workers behind a fence.
+    """Keep tasks off workers behind a fence.
 
-    `closed` are the states of those workers, read each time; `stop` says whether a task has to stay
-    out. PoolError if this version of Dask places tasks in another way.
+    `enclosed` contains the states of these workers, and may change later. `keeps_out` returns
+    whether a task is not allowed on them.
+
+    Raises
+    ------
+    PoolError
+        If this version of Dask lacks the required private API.
     """
     if not isinstance(getattr(scheduler, "idle_task_count", None), set):
         raise PoolError(
@@ -219,37 +238,40 @@ def rule_for_fences(
         )
 
     def valid_workers(valid: Any, task: Any) -> Any:
-        if not stop(task):
+        if not keeps_out(task):
             return valid
-        remainder = scheduler.running - closed
+        remainder = scheduler.running - enclosed
         if valid is None:
             return remainder
-        allowed = valid - closed
-        # Loose restrictions; without this Dask would then take any worker.
+        allowed = valid - enclosed
+        # With loose restrictions, Dask would use any worker if this set were empty.
         return allowed or (remainder if task.loose_restrictions else allowed)
 
     def rootish(worker: Any, task: Any) -> Any:
-        return (
-            scheduler.decide_worker_non_rootish(task) if worker in closed and stop(task) else worker
-        )
+        if worker in enclosed and keeps_out(task):
+            return scheduler.decide_worker_non_rootish(task)
+        return worker
 
     rules.call_after(scheduler, "valid_workers", valid_workers, "ts")
     rules.call_after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
-    scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
+    scheduler.idle_task_count = _OpenWorkers(enclosed, scheduler.idle_task_count)
 
 
-def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
-    """Let `choose` choose the workers of tasks, unless `choose` returns NotImplemented.
+def add_choice_rule(rules: MethodRules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
+    """Let `choose` select the workers of tasks, unless it returns NotImplemented.
 
-    PoolError if this version of Dask places tasks in another way.
+    Raises
+    ------
+    PoolError
+        If this version of Dask lacks the required private API.
     """
     rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
-def rule_for_failed_fetches(
-    rules: Rules, scheduler: Any, report: Callable[[Any, str], None]
+def add_failed_fetch_rule(
+    rules: MethodRules, scheduler: Any, report: Callable[[Any, str], None]
 ) -> None:
-    """Call `report(task, address)` if a worker could not fetch a result that another worker has."""
+    """Call `report(task, address)` if a worker fails to fetch a result from another worker."""
 
     def look(key: Any, worker: str, **message: Any) -> Any:
         task = scheduler.tasks.get(key)
@@ -261,26 +283,26 @@ def rule_for_failed_fetches(
     rules.call_instead(scheduler, "stimulus_task_erred", look, "key")
 
 
-def take_back_fences(rules: Rules, scheduler: Any) -> None:
-    """Remove the rule for fences from the scheduler."""
-    rules.take_back()
+def remove_fence_rules(rules: MethodRules, scheduler: Any) -> None:
+    """Remove the rules for fences from the scheduler."""
+    rules.remove_all()
     scheduler.idle_task_count = set(scheduler.idle_task_count)
 
 
 def workers_without_fences(scheduler: Any, task: Any) -> Any:
-    """Return the workers that could take a task if there were no fences."""
+    """Return the workers that could run a task if there were no fences."""
     valid = type(scheduler).valid_workers(scheduler, task)
     return scheduler.running if valid is None else valid
 
 
 class _OpenWorkers(set[Any]):
-    """Workers outside fences that have room for tasks from the queue."""
+    """Replacement of the scheduler's set of idle workers that excludes workers behind fences."""
 
-    def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
+    def __init__(self, enclosed: set[Any], workers: Iterable[Any]) -> None:
         super().__init__(workers)
-        self.difference_update(closed)
-        self._closed = closed
+        self.difference_update(enclosed)
+        self._enclosed = enclosed
 
     def add(self, worker: Any) -> None:
-        if worker not in self._closed:
+        if worker not in self._enclosed:
             super().add(worker)

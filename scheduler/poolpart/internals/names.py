@@ -1,8 +1,8 @@
-"""The private names of Dask that poolpart relies on, and a check that this version has them.
+"""List of the private API of Dask that poolpart uses, and checks that it exists.
 
-Names that Dask's documentation does not mention may change with any release. `require` looks a
-feature's names up before the feature is used: what is missing is a `PoolError` that names it, and
-the other features work. docs/pool-partitions.md has a table of `PRIVATE_NAMES`.
+Private names may change in any release of Dask. Before a feature is used, `require_feature` checks
+the names that it needs. If a name is missing, a `PoolError` reports it, and all other features
+continue to work. docs/pool-partitions.md contains a table of `PRIVATE_NAMES`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import distributed
 from ..errors import PoolError
 from .queues import PRIVATE_NAMES as PIPE_NAMES
 
-TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed (`make compat`)
+TESTED = "2025.5.0", "2026.8.0"  # oldest and newest tested version of distributed (`make compat`)
 
 NESTED = "keeping nested tasks in their partition"
 REFUSING = "rejecting tasks that can never run"
@@ -40,12 +40,12 @@ READING = "errors for inputs that cannot be unpickled"
 
 @dataclass(frozen=True)
 class PrivateNames:
-    """Private names of Dask that a feature needs for a purpose."""
+    """Private names of Dask that a feature needs for a certain purpose."""
 
-    feature: str  # does not work without them
-    names: tuple[str, ...]  # "module:object.attribute", with (parameters) of a method
+    feature: str
+    names: tuple[str, ...]  # "module:object.attribute", followed by "(parameters)" for methods
     purpose: str
-    tests: tuple[str, ...]  # paths in tests/poolpart unless a folder is given
+    tests: tuple[str, ...]  # relative to tests/poolpart unless a folder is given
 
 
 _SCHEDULER = "distributed.scheduler:Scheduler"
@@ -329,10 +329,10 @@ PRIVATE_NAMES = (
 )
 
 
-def require(feature: str) -> None:
-    """Check that this version of Dask has the private names of a feature.
+def require_feature(feature: str) -> None:
+    """Check that this version of Dask has the private names that a feature needs.
 
-    The first call in a process also warns if that version was not tested.
+    The first call in a process also warns if this version of Dask was not tested.
 
     Raises
     ------
@@ -350,14 +350,14 @@ def require(feature: str) -> None:
 
 @cache
 def missing_names(feature: str) -> tuple[str, ...]:
-    """Return the private names of a feature that this version of Dask lacks."""
+    """Return the private names of a feature that this version of Dask does not have."""
     names = [name for row in PRIVATE_NAMES if row.feature == feature for name in row.names]
     return tuple(name.partition(":")[2] for name in names if not _exists(name))
 
 
 @cache
 def warn_if_untested() -> None:
-    """Warn once in a process if this version of Dask was not tested."""
+    """Warn if this version of Dask was not tested, once per process."""
     oldest, version, newest = map(_numbers, (TESTED[0], distributed.__version__, TESTED[1]))
     if not oldest <= version <= newest:
         warnings.warn(
@@ -375,12 +375,12 @@ def table_row(row: PrivateNames) -> str:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version such as 2026.8.0 or 2026.8.0+14.g1234abc."""
+    """Return the numbers of a version, for example of 2026.8.0 or 2026.8.0+14.g1234abc."""
     return tuple(int(number) for number in version.partition("+")[0].split(".") if number.isdigit())
 
 
 def _exists(name: str) -> bool:
-    """Return whether an object or an attribute exists, and a method has the parameters."""
+    """Return whether an attribute exists and, if it is a method, has the given parameters."""
     path, _, parameters = name.removesuffix(")").partition("(")
     module_name, _, attributes = path.partition(":")
     try:
@@ -399,7 +399,7 @@ def _exists(name: str) -> bool:
 
 
 def _attributes(owner: Any) -> set[str]:
-    """Return the names of the attributes of an object or of a class and its instances."""
+    """Return the names of all attributes of an object, or of a class and its instances."""
     names = set(dir(owner))
     if isinstance(owner, type):
         for kind in owner.__mro__:
@@ -414,7 +414,7 @@ def _slots(kind: type) -> Iterator[str]:
 
 
 def _assigned(kind: type) -> tuple[str, ...]:
-    """Return the names in the constructor of a class, including unannotated attributes."""
+    """Return the names used in the constructor of a class, which include unannotated attributes."""
     constructor = vars(kind).get("__init__")
     code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
     return code.co_names if code is not None else ()

@@ -1,4 +1,4 @@
-"""What the scheduler knows of tasks and workers when it places a task."""
+"""State of tasks and workers that the scheduler uses to place tasks."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from functools import partial
 from typing import Any
 
 
-def group_of(task: Any) -> tuple[str, float] | None:
-    """Return the only resource that a task asks for, with its quantity, or ("", 1) for none.
+def only_resource_of(task: Any) -> tuple[str, float] | None:
+    """Return the name and amount of the only resource that a task requests, or ("", 1).
 
-    None for a task that is bound to workers or hosts, asks for several resources, or is an actor.
+    The result is None if the task is bound to workers or hosts, requests several resources, or is
+    an actor.
     """
     resources = task.resource_restrictions or {}
     if task.worker_restrictions or task.host_restrictions or task.actor or len(resources) > 1:
@@ -18,41 +19,38 @@ def group_of(task: Any) -> tuple[str, float] | None:
 
 
 def workers_declaring(scheduler: Any, name: str) -> list[Any]:
-    """States of the workers that declare a resource."""
+    """Return the states of the workers that declare a resource."""
     return [scheduler.workers[address] for address in scheduler.resources.get(name, ())]
 
 
 def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
-    """Return whether a worker declares so many slots of a resource.
-
-    Usually the first worker does.
-    """
+    """Return whether any worker declares at least `slots` of a resource."""
     return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
 
 
-def number_declaring(scheduler: Any, name: str) -> int:
+def count_declaring(scheduler: Any, name: str) -> int:
     """Return the number of workers that declare a resource."""
     return len(scheduler.resources.get(name, ()))
 
 
 def free_slots_of(worker: Any, name: str) -> float:
-    """Return the slots of a worker that no task has: of a resource, or threads for ""."""
+    """Return the number of free slots of a worker for a resource, or its free threads for ""."""
     if not name:
         return float(worker.nthreads - len(worker.processing) + len(worker.long_running))
     return float(worker.resources.get(name, 0) - worker.used_resources.get(name, 0))
 
 
-def may_take(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
-    """Return whether a worker runs and declares enough slots of a resource, "" for none."""
+def can_run(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
+    """Return whether a worker is running and declares enough slots of a resource, if any."""
     enough = not name or worker.resources.get(name, 0) >= slots
     return bool(enough and worker in scheduler.running)
 
 
 def holders_of_inputs(task: Any) -> list[Any]:
-    """Workers that hold inputs of a task, each once for each input."""
+    """Return the workers that hold inputs of a task, with one entry per input."""
     return [worker for task_input in task.dependencies for worker in task_input.who_has or ()]
 
 
-def start_first(scheduler: Any, task: Any, workers: list[Any]) -> Any:
-    """Return the worker on which a task is expected to start first, by Dask's own estimate."""
+def earliest_worker(scheduler: Any, task: Any, workers: list[Any]) -> Any:
+    """Return the worker on which Dask expects a task to start first."""
     return min(workers, key=partial(scheduler.worker_objective, task))

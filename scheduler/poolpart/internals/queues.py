@@ -1,4 +1,4 @@
-"""The Queue and the Variable of a pipe, in the extensions of Dask that all clients use."""
+"""Implementation of the Queue and the Variable of a pipe in Dask's scheduler extensions."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 
 from distributed import Client, Future
 
-# Private names of Dask that this module relies on: "module:object.attribute(parameters)".
+# Private names of Dask that this module uses, in the form "module:object.attribute(parameters)".
 PRIVATE_NAMES = (
     "distributed.queues:QueueExtension.queues",
     "distributed.queues:QueueExtension.create(name, maxsize)",
-    "distributed.queues:QueueExtension.put(name)",  # awaits `put` of the queue
-    "distributed.queues:QueueExtension.get(name, batch)",  # awaits `get` of the queue
+    "distributed.queues:QueueExtension.put(name)",  # awaits the queue's `put`
+    "distributed.queues:QueueExtension.get(name, batch)",  # awaits the queue's `get`
     "distributed.queues:QueueExtension.release(name)",
     "distributed.variable:VariableExtension.variables",
-    "distributed.variable:VariableExtension.started",  # condition of `get` before the first `set`
+    "distributed.variable:VariableExtension.started",  # condition on which early `get` calls wait
     "distributed.variable:VariableExtension.set(name, key, data)",
     "distributed.scheduler:Scheduler.extensions",
     "distributed.scheduler:Scheduler.handlers",
@@ -28,47 +28,50 @@ PRIVATE_NAMES = (
     "distributed.client:Client._send_to_scheduler",
 )
 
-VARIABLE_SET = "variable_set"  # the request of `Variable.set`
-LOOK_S = 1.0  # a wait looks so often whether it has ended, even if nothing has changed
+VARIABLE_SET = "variable_set"  # name of the request that `Variable.set` sends
+CHECK_S = 1.0  # interval at which a wait checks its condition without a notification
 
-Record = dict[str, Any]  # an item's record, as Dask's queue extension keeps it
-Packed = bytes | Record  # an item on its way to a client (`unpack`)
-# Type of the items that pipes put. Their value is serialized: the scheduler passes it on, and
-# `Queue.get` of a client returns the object. Clients themselves put types "msgpack" and "Future".
+Record = dict[str, Any]  # record of an item in Dask's queue extension
+Packed = bytes | Record  # item that is sent to a client, which calls `unpack_item`
+# Type of the items that pipes put, in addition to Dask's types "msgpack" and "Future". The
+# scheduler does not deserialize their value, and a client's `Queue.get` returns the object.
 _PICKLED = "pickled"
 
 
 class Waiters:
     """Requests that wait for changes of a queue, or for the end of a task.
 
-    A request looks again whether its condition holds after each `notify`.
+    After each `notify`, a request checks its condition again.
     """
 
     def __init__(self) -> None:
         self._events: set[asyncio.Event] = set()
 
     def notify(self) -> None:
-        """Let the requests look again."""
+        """Make all requests check their conditions again."""
         for event in self._events:
             event.set()
 
     def subscribe(self, event: asyncio.Event) -> None:
-        """Set an event at each change."""
+        """Set an event at each notification from now on."""
         self._events.add(event)
 
     def unsubscribe(self, event: asyncio.Event) -> None:
-        """Do not set the event any more."""
+        """Stop setting an event."""
         self._events.discard(event)
 
     def __len__(self) -> int:
-        """Return the number of requests that wait."""
+        """Return the number of waiting requests."""
         return len(self._events)
 
 
 async def wait_until(
     condition: Callable[[], bool], waiters: Collection[Waiters], seconds: float = math.inf
 ) -> None:
-    """Wait until a condition that depends on queues holds, or for `seconds`."""
+    """Wait until a condition holds, for at most `seconds`.
+
+    The condition is checked after each notification of one of the `waiters`.
+    """
     if condition():
         return
     deadline = time.monotonic() + seconds
@@ -79,7 +82,7 @@ async def wait_until(
         while not condition() and (remaining := deadline - time.monotonic()) > 0:
             event.clear()
             with suppress(TimeoutError):
-                async with asyncio.timeout(min(remaining, LOOK_S)):
+                async with asyncio.timeout(min(remaining, CHECK_S)):
                     await event.wait()
     finally:
         for group in waiters:
@@ -89,18 +92,18 @@ async def wait_until(
 class BoundedQueue:
     """Queue of items whose waits end with an error once the pipe has ended.
 
-    It stands in Dask's queue extension in place of an `asyncio.Queue`: the extension answers
-    `put`, `get` and `qsize` of a `distributed.Queue` by the methods of the same names. So what any
-    client puts or takes is bounded by the capacity, and is noticed by all that wait.
+    It takes the place of an `asyncio.Queue` in Dask's queue extension, which calls its methods
+    `put`, `get` and `qsize` for the methods of a `distributed.Queue`. Therefore, the capacity
+    applies to the items of all clients, and all waiting requests are notified of them.
 
     Parameters
     ----------
     capacity
-        Items that may be queued, except by `extend`.
+        Maximum number of queued items. `extend` ignores it.
     why_no_put
-        Returns the error of a `put` now, or None while the pipe is open.
+        Function that returns the error that a `put` would raise now, or None.
     why_no_get
-        Returns the error of a `get` now, or None while the items may be taken.
+        Function that returns the error that a `get` would raise now, or None.
     """
 
     def __init__(
@@ -113,7 +116,7 @@ class BoundedQueue:
         self.waiters = Waiters()
         self._why_no_put = why_no_put
         self._why_no_get = why_no_get
-        # The extension looks in an attribute of this name for futures, when it deletes a queue.
+        # When the extension deletes a queue, it searches the attribute of this name for futures.
         self._queue: deque[Record] = deque()
 
     def qsize(self) -> int:
@@ -121,41 +124,44 @@ class BoundedQueue:
         return len(self._queue)
 
     def empty(self) -> bool:
-        """Whether the queue has no items."""
+        """Return whether the queue has no items."""
         return not self._queue
 
     @property
-    def room(self) -> int:
-        """Items that may be put now."""
+    def free_capacity(self) -> int:
+        """Number of items that can be put without waiting."""
         return max(0, self.capacity - len(self._queue))
 
     async def put(self, record: Record) -> None:
-        """Wait until the queue has room, then add an item."""
-        await wait_until(lambda: self.room > 0 or self._why_no_put() is not None, [self.waiters])
+        """Add an item after waiting until the queue has space."""
+        await wait_until(
+            lambda: self.free_capacity > 0 or self._why_no_put() is not None, [self.waiters]
+        )
         if (error := self._why_no_put()) is not None:
             raise error
         self.extend([record])
 
     async def get(self) -> Record:
-        """Wait until the queue has an item, then remove the first item."""
+        """Remove and return the first item after waiting until there is one."""
         await wait_until(
             lambda: bool(self._queue) or self._why_no_put() is not None, [self.waiters]
         )
         error = self._why_no_get() if self._queue else self._why_no_put()
         if error is not None:
             raise error
-        return self.take(1)[0]
+        return self.pop_items(1)[0]
 
     def extend(self, records: Iterable[Record]) -> None:
-        """Add items, also beyond the capacity."""
+        """Add items, ignoring the capacity."""
         was_empty = not self._queue
         self._queue.extend(records)
-        if was_empty or not self.room:  # takers wait for the first item, or linger until it is full
+        # Consumers wait for the first item, or linger until the queue is full.
+        if was_empty or not self.free_capacity:
             self.waiters.notify()
 
-    def take(self, number: int) -> list[Record]:
-        """Remove and return the first items, `number` at most."""
-        had_room = self.room > 0
+    def pop_items(self, number: int) -> list[Record]:
+        """Remove and return at most `number` items from the beginning of the queue."""
+        had_room = self.free_capacity > 0
         records = [self._queue.popleft() for _ in range(min(number, len(self._queue)))]
         if records and not had_room:  # producers wait only while the queue is full
             self.waiters.notify()
@@ -163,10 +169,7 @@ class BoundedQueue:
 
 
 class QueueAndVariable:
-    """A `distributed.Queue` of items and a `distributed.Variable` with a common name.
-
-    All clients of the cluster see both. The value of the variable is plain data.
-    """
+    """Queue of items and Variable with plain data under the same name, visible to all clients."""
 
     def __init__(self, scheduler: Any, name: str, queue: BoundedQueue, value: Any) -> None:
         self.name = name
@@ -179,42 +182,42 @@ class QueueAndVariable:
 
     @staticmethod
     def is_used(scheduler: Any, name: str) -> bool:
-        """Whether the cluster has a queue or a variable of a name."""
+        """Return whether the cluster has a queue or a variable with a name."""
         extensions = scheduler.extensions
         return name in extensions["queues"].queues or name in extensions["variables"].variables
 
     @property
     def exists(self) -> bool:
-        """Whether both exist: any client can delete either."""
+        """Whether both the queue and the variable exist. Any client can delete either of them."""
         is_queued = self._queues.queues.get(self.name) is self.queue
         return is_queued and self.name in self._variables.variables
 
     @property
     def value(self) -> Any:
-        """Value of the variable."""
+        """Current value of the variable."""
         return self._variables.variables[self.name]["value"]
 
     def set(self, value: Any) -> None:
-        """Set the variable, and let all waiting requests look at its value."""
+        """Set the variable, and notify all waiting requests."""
         self._variables.variables[self.name] = {"type": "msgpack", "value": value}
         self.queue.waiters.notify()
 
     async def wake_early_readers(self) -> None:
-        """Answer the requests that tried to read the variable before it existed."""
+        """Answer the requests that tried to read the variable before it was created."""
         async with self._variables.started:
             self._variables.started.notify_all()
 
     def put(self, items: Iterable[bytes]) -> None:
-        """Add pickled items to the queue, also beyond its capacity."""
+        """Add pickled items to the queue, ignoring its capacity."""
         self.queue.extend([_record_of(item) for item in items])
 
-    def take(self, limit: int) -> list[Packed]:
-        """Remove the first items, at most `limit`, from the queue, and return them packed."""
-        records = self.queue.take(limit)
+    def pop_items(self, limit: int) -> list[Packed]:
+        """Remove at most `limit` items from the queue, and return them packed."""
+        records = self.queue.pop_items(limit)
         return [_packed(self.name, record) for record in records]
 
     def delete(self) -> None:
-        """Delete queue and variable, and end the waiting requests."""
+        """Delete the queue and the variable, and end all waiting requests."""
         while self._queues.queues.get(self.name) is self.queue:
             self._queues.release(name=self.name)
         self._variables.variables.pop(self.name, None)
@@ -231,15 +234,18 @@ def _record_of(item: bytes) -> Record:
 
 
 def _packed(name: str, record: Record) -> Packed:
-    """Pack an item for a client: the pickled item, or the record of an item of `Queue.put`."""
+    """Pack an item for a client.
+
+    An item of a pipe becomes the pickled item, and an item of `Queue.put` becomes its record.
+    """
     if record["type"] == _PICKLED:
         item: bytes = record["value"].frames[0]
         return item
     return {**record, "queue": name}
 
 
-def unpack(client: Client, packed: Packed) -> Any:
-    """Return an item that a client has got from `QueueAndVariable.take`, as `Queue.get` would."""
+def unpack_item(client: Client, packed: Packed) -> Any:
+    """Return the item that `QueueAndVariable.pop_items` has packed, like `Queue.get` would."""
     from distributed.protocol.pickle import loads
 
     if isinstance(packed, bytes | bytearray | memoryview):
@@ -247,7 +253,7 @@ def unpack(client: Client, packed: Packed) -> Any:
     if packed["type"] != "Future":
         return packed["value"]
     future = Future(packed["value"], client)
-    client._send_to_scheduler(  # the queue need not hold the result any more
+    client._send_to_scheduler(  # the queue no longer needs to keep the result
         {"op": "queue-future-release", "name": packed["queue"], "key": packed["value"]}
     )
     return future
@@ -256,17 +262,17 @@ def unpack(client: Client, packed: Packed) -> Any:
 def intercept_variable_set(
     handlers: dict[str, Any], check: Callable[[str, Any], None], on_change: Callable[[str], None]
 ) -> Callable[[], None]:
-    """Check and follow the variables that clients set, and return a function that ends this.
+    """Intercept all requests that set a variable, and return a function that ends this.
 
     Parameters
     ----------
     handlers
-        Requests that the scheduler answers.
+        Handlers of the scheduler's requests.
     check
-        Is called with the name and the value of a variable that a client sets, None for a future;
-        an error that it raises is the client's.
+        Function that is called with the name and the new value of a variable, where the value is
+        None for a future. The client receives an error that it raises.
     on_change
-        Is called with the name once the variable has its value.
+        Function that is called with the name after the variable was set.
     """
     answer: Callable[..., Awaitable[None]] = handlers[VARIABLE_SET]
 
@@ -276,7 +282,7 @@ def intercept_variable_set(
         on_change(name)
 
     def end() -> None:
-        if handlers[VARIABLE_SET] is set_variable:  # else another library has wrapped it since
+        if handlers[VARIABLE_SET] is set_variable:  # otherwise, another library has wrapped it
             handlers[VARIABLE_SET] = answer
 
     handlers[VARIABLE_SET] = set_variable

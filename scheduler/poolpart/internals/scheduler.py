@@ -1,4 +1,4 @@
-"""What runs in the event loop of a scheduler: placing, moving and retiring, requests, pages."""
+"""Functions that use private API in the scheduler's event loop, mostly to place and move tasks."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from tornado import web
 
 Resources = dict[str, float]
 
-SUBMITTER = "poolpart-submitter"  # annotation of tasks that a task of a partition submits
+SUBMITTER = "poolpart-submitter"  # annotation of nested tasks, a `SubmittingTask`
 
 
-class Submitter(NamedTuple):
-    """A task of a partition that has submitted another: value of the annotation."""
+class SubmittingTask(NamedTuple):
+    """Task of a partition that has submitted another task. This is the value of the annotation."""
 
     key: Any
-    worker: str  # address of the worker that it ran on
+    worker: str  # address of the worker on which it ran when it submitted the other task
 
 
-# -- where the scheduler places tasks ----------------------------------------------------
+# -- placement of tasks ------------------------------------------------------------------
 
 
-def show(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Make the scheduler use only the given resources when it places tasks on a worker."""
+def set_visible_resources(scheduler: Any, worker: Any, resources: Resources) -> None:
+    """Make the scheduler place tasks on a worker only according to the given resources."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -39,26 +39,27 @@ def show(scheduler: Any, worker: Any, resources: Resources) -> None:
         elif not declaring:
             del scheduler.resources[name]
     worker.resources = dict(resources)
-    recount(worker)
+    recount_used_resources(worker)
 
 
-def recount(worker: Any) -> None:
-    """Recount the resources in use.
+def recount_used_resources(worker: Any) -> None:
+    """Recount the resources in use on a worker, which Dask miscounts in two cases.
 
-    Dask forgets them when a worker declares something while it is busy, and counts a task
-    that was moved by work stealing against the worker that it was moved from.
+    Dask resets them when a busy worker declares resources, and attributes a task that was moved by
+    work stealing to the original worker.
     """
-    # Also resources that it no longer declares: a stolen task may still come.
+    # The default is required for undeclared resources, because a stolen task may still arrive.
     worker.used_resources = defaultdict(float, dict.fromkeys(worker.resources, 0))
     for task in worker.processing:
         for name, quantity in (task.resource_restrictions or {}).items():
             worker.used_resources[name] += quantity
 
 
-def wake(scheduler: Any, worker: Any) -> None:
-    """Send a worker the tasks that wait for its resources, as when a worker joins.
+def send_waiting_tasks(scheduler: Any, worker: Any) -> None:
+    """Send a worker the tasks that wait for its resources.
 
-    The scheduler does not when a running worker gets a resource: the tasks would wait for ever.
+    Dask only does this when a worker joins. If a running worker gets a resource, the tasks would
+    wait forever.
     """
     if worker in scheduler.running:
         stimulus = f"poolpart-{worker.address}-{time.time()}"
@@ -67,20 +68,20 @@ def wake(scheduler: Any, worker: Any) -> None:
         )
 
 
-def open_to_all(scheduler: Any, worker: Any) -> None:
-    """Send tasks to a worker that has been behind a fence."""
+def admit_other_tasks(scheduler: Any, worker: Any) -> None:
+    """Send waiting tasks to a worker that is no longer behind a fence."""
     scheduler.check_idle_saturated(worker)
     if worker.status is Status.running:
-        wake(scheduler, worker)
+        send_waiting_tasks(scheduler, worker)
         scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=f"poolpart-opened-{time.time()}")
 
 
 def actor_of_method(scheduler: Any, name: Any) -> Any:
-    """Return the state of an actor by Dask's name for a method that submits tasks, or None.
+    """Return the state of the actor whose method has submitted tasks, or None.
 
-    The name consists of the prefix of the actor's key and the method. None if the name has another
-    form, or if actors with the same prefix ask for different resources, so that the actor is not
-    certain.
+    Dask's name for the submitting method consists of the prefix of the actor's key and the name of
+    the method. The result is None if the name has another form, or if actors with this prefix
+    request different resources, so that the actor is ambiguous.
     """
     prefix, dot, _ = name.rpartition(".") if isinstance(name, str) else ("", "", "")
     if not dot:
@@ -99,58 +100,63 @@ def actor_of_method(scheduler: Any, name: Any) -> Any:
     )
 
 
-def asks_for(task: Any, names: Collection[str]) -> bool:
-    """Return whether a task takes a slot of any of the named partitions."""
+def requires_any(task: Any, names: Collection[str]) -> bool:
+    """Return whether a task takes a slot of one of the named partitions."""
     return not (task.resource_restrictions or {}).keys().isdisjoint(names)
 
 
 def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
-    """Let any worker recompute results that are still held, if they are lost.
+    """Allow any worker to recompute results of dissolved partitions that are still needed.
 
-    No worker has the task's resource any more: the task would wait for ever.
+    Otherwise, lost results would wait forever, because no worker declares their resource anymore.
     """
     for task in scheduler.tasks.values():
-        if asks_for(task, names):
+        if requires_any(task, names):
             restrictions = task.resource_restrictions.items()
             remaining = {name: slots for name, slots in restrictions if name not in names}
             task.resource_restrictions = remaining or None
 
 
-# -- moving waiting tasks, by the protocol of work stealing --------------------------------
+# -- moving waiting tasks with the work stealing protocol -----------------------------------
 #
-# A worker gives up a task on request unless the task runs; then another worker gets it.
+# On request, a worker gives up a task that it has not started, and another worker receives it.
 
 
-def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
-    """Return the keys of tasks with these resources that a worker has or is about to get."""
-    tasks = {task for task in worker.processing if asks_for(task, names)}
+def keys_held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
+    """Return the keys of the tasks on a worker, or on their way to it, that use the partitions."""
+    tasks = {task for task in worker.processing if requires_any(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()
-        tasks |= {task for task, move in moves if move["thief"] is worker and asks_for(task, names)}
+        tasks |= {
+            task for task, move in moves if move["thief"] is worker and requires_any(task, names)
+        }
     return [task.key for task in tasks]
 
 
-def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]) -> None:
-    """Move the tasks of a worker that have not started to further members of their partition.
+def hand_off_tasks(
+    scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]
+) -> None:
+    """Move tasks that have not started from a worker to other members of their partition.
 
-    A task that no other worker may take stays, and ends on this worker.
+    A task that no other worker can run stays on this worker.
 
     Parameters
     ----------
     scheduler, worker
         Their states.
     names
-        Partitions that the worker leaves.
+        Names of the partitions that the worker leaves.
     requested
-        States of the tasks that the worker was asked to give up; extended.
+        States of the tasks that the worker was already asked to give up. This set is updated.
     """
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
         return
-    # {worker: tasks on their way to it}. The scheduler counts a task when the old worker agrees.
+    # {worker: number of tasks that are being moved to it}. The scheduler only counts a task for its
+    # new worker when the old worker has given it up.
     moving = Counter[Any]()
     for task in list(worker.processing - worker.long_running):
-        if task in requested or task.actor or not asks_for(task, names):
+        if task in requested or task.actor or not requires_any(task, names):
             continue
         requested.add(task)
         if candidates := (scheduler.valid_workers(task) or set()) - {worker}:
@@ -159,44 +165,44 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], requested: set
             stealing.move_task_request(task, worker, thief)
 
 
-# -- workers that a cluster gives back ----------------------------------------------------
+# -- closing idle workers -----------------------------------------------------------------
 #
-# Once a worker is found idle, it gets no tasks from this step of the event loop on. What
-# `retire_workers` does comes later: it waits for a lock, and for its turn.
+# Tasks must not be assigned to a worker after it was found idle. `stop_assigning` takes effect in
+# the same step of the event loop, unlike `retire_workers`, which first waits for a lock.
 
 
 def is_idle(scheduler: Any, worker: Any) -> bool:
-    """Return whether a running worker has no task, and no result that no further worker has."""
+    """Return whether a worker is running and has neither tasks nor the only copy of a result."""
     return worker.status is Status.running and holds_nothing(scheduler, worker)
 
 
 def holds_nothing(scheduler: Any, worker: Any) -> bool:
-    """Return whether a worker has no task, and no result that no further worker has.
+    """Return whether a worker has neither tasks nor the only copy of a result.
 
-    It may still run tasks that the scheduler has forgotten.
+    It may still be running tasks that the scheduler has forgotten.
     """
     if worker.processing or worker.actors:
         return False
     stealing = scheduler.extensions.get("stealing")
     moves = stealing.in_flight.values() if stealing else ()
-    if any(move["thief"] is worker for move in moves):  # a task is on its way
+    if any(move["thief"] is worker for move in moves):  # a task is being moved to the worker
         return False
     return all(len(task.who_has) > 1 for task in worker.has_what)
 
 
-def takes_tasks(worker: Any) -> bool:
-    """Return whether a worker gets tasks now, or after joining."""
+def accepts_tasks(worker: Any) -> bool:
+    """Return whether a worker accepts tasks, now or after it has joined."""
     return worker.status in (Status.running, Status.init)
 
 
-def shut(scheduler: Any, worker: Any) -> None:
-    """Let a worker get no further tasks."""
+def stop_assigning(scheduler: Any, worker: Any) -> None:
+    """Stop assigning tasks to a worker."""
     stimulus = f"poolpart-shut-{time.time()}"
     scheduler.handle_worker_status_change(Status.closing_gracefully, worker, stimulus)
 
 
-def reopen(scheduler: Any, worker: Any) -> None:
-    """Let a worker get tasks again after `shut`, or after a retirement that failed."""
+def resume_assigning(scheduler: Any, worker: Any) -> None:
+    """Assign tasks to a worker again after `stop_assigning` or a failed retirement."""
     if scheduler.workers.get(worker.address) is worker:
         stimulus = f"poolpart-reopened-{time.time()}"
         message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
@@ -204,35 +210,38 @@ def reopen(scheduler: Any, worker: Any) -> None:
         scheduler.handle_worker_status_change(Status.running, worker, stimulus)
 
 
-async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
-    """Close workers. Return False if one stays because no other worker can take its results."""
+async def retire_workers(scheduler: Any, workers: Collection[Any]) -> bool:
+    """Close workers, and return whether all of them were closed.
+
+    A worker is not closed if no other worker can store its results.
+    """
     addresses = [worker.address for worker in workers]
     retired = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
     return len(retired) == len(addresses)
 
 
-def turn_away(scheduler: Any, worker: Any) -> None:
-    """Close a joining worker before the worker gets tasks of a partition."""
-    shut(scheduler, worker)
-    # A worker that joins says that it is running before it reads that it has to close.
-    show(scheduler, worker, {})
+def reject_worker(scheduler: Any, worker: Any) -> None:
+    """Close a joining worker before it receives tasks of a partition."""
+    stop_assigning(scheduler, worker)
+    # The worker reports that it is running before it reads the request to close.
+    set_visible_resources(scheduler, worker, {})
     scheduler.close_worker(worker.address)
 
 
-def number_of_transitions(scheduler: Any) -> int:
-    """Return how often tasks have changed their state: equal numbers mean that nothing happened."""
+def count_transitions(scheduler: Any) -> int:
+    """Return the number of task transitions so far, which is unchanged while nothing happens."""
     return int(scheduler.transition_counter)
 
 
 def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
-    """Cancel tasks for a client, by its id, as `Client.cancel` does, and skip unknown tasks."""
+    """Cancel tasks on behalf of a client, like `Client.cancel`, ignoring unknown tasks."""
     scheduler.stimulus_cancel(
         list(keys), client=client, force=False, reason="unknown", msg="by Partition.cancel"
     )
 
 
-async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
-    """Restart a worker through its nanny, or return False if it does not rejoin in time."""
+async def restart_worker(scheduler: Any, worker: Any, seconds: float) -> bool:
+    """Restart a worker through its nanny, and return whether it has rejoined in time."""
     try:
         await scheduler.restart_workers(
             [worker.address], timeout=seconds, stimulus_id=f"poolpart-restart-{time.time()}"
@@ -243,7 +252,7 @@ async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
 
 
 def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
-    """Let a task fail that waits for its inputs on a worker, or run again if it has retries."""
+    """Make a task that waits for its inputs on a worker fail, or retry it if it has retries."""
     from distributed.core import error_message
 
     stimulus = f"poolpart-failed-{time.time()}"
@@ -251,30 +260,32 @@ def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
     scheduler.handle_task_erred(
         key=task.key, stimulus_id=stimulus, worker=worker, run_id=task.run_id, **message
     )
-    if task.state == "erred":  # the worker still waits for the inputs, and would keep the task
+    if task.state == "erred":  # otherwise, the worker would keep the task and wait for its inputs
         free = {"op": "free-keys", "keys": [task.key], "stimulus_id": stimulus}
         scheduler.stream_comms[worker].send(free)
 
 
-def run_again(scheduler: Any, tasks: Collection[Any]) -> None:
-    """Take tasks from their workers, and place them anew."""
+def reschedule_tasks(scheduler: Any, tasks: Collection[Any]) -> None:
+    """Take tasks from their workers and place them again."""
     stimulus = f"poolpart-again-{time.time()}"
     scheduler.transitions({task.key: "waiting" for task in tasks}, stimulus)
 
 
 def is_bound(task: Any) -> bool:
-    """Return whether a task may run on certain workers only."""
+    """Return whether a task can only run on certain workers or hosts."""
     return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
 
 
-def waiting_for_workers(scheduler: Any) -> Collection[Any]:
-    """Return the tasks that could run but have no worker."""
+def unrunnable_tasks(scheduler: Any) -> Collection[Any]:
+    """Return the tasks that are ready to run but for which there is no worker."""
     tasks: Collection[Any] = scheduler.unrunnable
     return tasks
 
 
-async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler, without a client."""
+async def run_on_cluster_scheduler(
+    cluster: Any, function: Callable[..., Any], **arguments: Any
+) -> Any:
+    """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler without a client."""
     from distributed.core import clean_exception
 
     packed = {"function": dumps(function), "args": dumps(()), "kwargs": dumps(arguments)}
@@ -284,10 +295,15 @@ async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments
     return _unpacked(answer["result"])
 
 
-async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call a function in the event loop of a worker, passed as `dask_worker`.
+async def call_worker(
+    scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any
+) -> Any:
+    """Call `function(**arguments, dask_worker=…)` in the event loop of a worker.
 
-    Raises OSError if the worker does not respond or the function raises an exception.
+    Raises
+    ------
+    OSError
+        If the worker does not respond, or if the function raises an exception.
     """
     answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
     if answer["status"] != "OK":
@@ -296,7 +312,7 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
 
 
 def _unpacked(result: Any) -> Any:
-    """Return the object of a reply: serialized, or wrapped by a server of this process."""
+    """Return the object of a reply, which is either serialized or, within a process, wrapped."""
     from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
     if isinstance(result, Serialized):
@@ -304,23 +320,24 @@ def _unpacked(result: Any) -> Any:
     return result.data if isinstance(result, Serialize) else result
 
 
-def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
-    """Add a plugin to all workers, present and future, or remove the plugin if None.
+def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
+    """Add a plugin to all current and future workers, or remove it if `plugin` is None.
 
-    Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
+    Returns the requests in flight, one per worker. Workers that do not respond, for example because
+    the cluster is closing, are ignored.
     """
 
-    # Nested, so that it is sent by value. A worker that is closing removes its plugins itself;
-    # Dask logs a traceback if a plugin was removed before.
+    # The function is nested so that it is pickled by value. A closing worker removes its plugins
+    # itself, and Dask would log a traceback if a plugin had already been removed.
     def remove(dask_worker: Any = None) -> None:
         closing = dask_worker.status.name in ("closing", "closed")
         if not closing and (removed := dask_worker.plugins.pop(name, None)):
             removed.teardown(dask_worker)
 
     async def tell(address: str) -> None:
-        with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print it
+        with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print these errors
             if plugin is None:
-                await call(scheduler, address, remove)
+                await call_worker(scheduler, address, remove)
             else:
                 await getattr(scheduler.rpc(address), "plugin-add")(name=name, plugin=plugin)
 
@@ -328,17 +345,17 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
         scheduler.worker_plugins.pop(name, None)
     else:
         scheduler.worker_plugins[name] = plugin
-    # Each by itself: one that is stopped keeps none of the others.
+    # The requests are independent, so that a stopped worker does not delay the others.
     return [asyncio.ensure_future(tell(address)) for address in scheduler.workers]
 
 
-# -- requests to a scheduler, which pipes are made of -------------------------------------
+# -- handlers for the requests of pipes ---------------------------------------------------
 #
-# `run_on_scheduler` pickles its function for each request, which takes twice the time of a handler.
+# A handler takes half the time of `run_on_scheduler`, which pickles its function for each request.
 
 
 def handlers_of(scheduler: Any) -> dict[str, Any]:
-    """Handlers of a scheduler, by request, which exchange plain data with their callers."""
+    """Return the request handlers of a scheduler by name, which receive and return plain data."""
     handlers: dict[str, Any] = scheduler.handlers
     return handlers
 
@@ -346,11 +363,11 @@ def handlers_of(scheduler: Any) -> dict[str, Any]:
 # -- the scheduler's HTTP server ---------------------------------------------------------
 
 
-def serve(scheduler: Any, application: web.Application) -> None:
+def add_pages(scheduler: Any, application: web.Application) -> None:
     """Add pages to the scheduler's HTTP server."""
     scheduler.http_application.add_application(application)
 
 
-def serve_no_longer(scheduler: Any, application: web.Application) -> None:
+def remove_pages(scheduler: Any, application: web.Application) -> None:
     """Remove pages from the scheduler's HTTP server."""
     scheduler.http_application.applications.remove(application)

@@ -1,4 +1,4 @@
-"""What runs on a worker: the slots that it declares, and those that a task lends."""
+"""Functions that use private API on a worker: declared resources, lent slots, and inputs."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from .scheduler import SUBMITTER, Resources, Submitter
+from .scheduler import SUBMITTER, Resources, SubmittingTask
 
 
 def has_running_tasks(dask_worker: Any = None) -> bool:
-    """Return whether a worker runs a task, even if its scheduler has forgotten the task."""
+    """Return whether a worker runs a task, including tasks that its scheduler has forgotten."""
     return bool(dask_worker.state.all_running_tasks)
 
 
 def running_keys(worker: Any) -> list[Any]:
-    """Return the keys of the tasks that a worker runs, cancelled tasks included."""
+    """Return the keys of the tasks that a worker runs, including canceled tasks."""
     return [task.key for task in worker.state.all_running_tasks]
 
 
-# -- what a worker declares --------------------------------------------------------------
+# -- declared resources ------------------------------------------------------------------
 
 
 class _Available(dict[str, float]):
-    """Available slots by resource: 0, rather than an error, for an undeclared resource.
+    """Available slots by resource, which are 0 for undeclared resources.
 
-    The request to declare and tasks use different connections: a cancelled task may still be on
-    its way, and a worker would break down if it got a task for an unknown resource.
+    The request to declare resources and the tasks use different connections. Therefore, a canceled
+    task may arrive late, and the worker would fail if its resource were unknown.
     """
 
     def __missing__(self, name: str) -> float:
@@ -34,17 +34,15 @@ class _Available(dict[str, float]):
 
 
 def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
-    """Declare exactly these resources.
+    """Declare exactly the given resources, and return whether this was possible.
 
-    Runs on a worker.
-
-    Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
-    still running, and unknown to the scheduler.
+    The result is False if a running task still holds a resource to be removed. The task may be
+    canceled and unknown to the scheduler. Runs on a worker.
     """
     state = dask_worker.state
     total = state.total_resources
     available = state.available_resources
-    # Not what is available: a task may have lent its slots, and takes them back.
+    # The available resources are not used here, because tasks that have lent slots will need them.
     held = {name for task in state.all_running_tasks for name in resources_of(task)}
     if held & (total.keys() - resources.keys()):
         return False
@@ -61,41 +59,38 @@ def resources_of(task: Any) -> Resources:
     return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
 
 
-def resources_here(worker: Any) -> tuple[str, ...]:
-    """Names of the resources that a worker has.
-
-    Runs on the worker.
-    """
+def declared_resources(worker: Any) -> tuple[str, ...]:
+    """Return the sorted names of the resources that a worker has. Runs on the worker."""
     return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
 
 
-# -- slots that a task lends while it waits -------------------------------------------------
+# -- lending of slots -----------------------------------------------------------------------
 #
-# What Dask does when a task secedes and rejoins, also several times: the worker counts it as
-# long-running from the first time to its end, so that a task in its place may start but have to
-# wait for a thread; its resources stay taken throughout.
+# After a task has seceded once, Dask counts it as long-running until it ends, even if it rejoins.
+# Therefore, another task may start in its place and wait for a thread. The resources of a seceded
+# task remain in use.
 
 
-def task_of_thread() -> tuple[Any, Any] | None:
-    """Return the worker and the state of the task of this thread, or None outside tasks."""
+def current_task() -> tuple[Any, Any] | None:
+    """Return the worker and the state of the task that runs in this thread, or None."""
     from distributed.worker import thread_state
 
     if (key := getattr(thread_state, "key", None)) is None:
         return None
     worker = thread_state.execution_state["worker"]
-    task = worker.state.tasks.get(key)  # a call of an actor's method is not a task
+    task = worker.state.tasks.get(key)  # None for a method call of an actor
     return None if task is None else (worker, task)
 
 
-def submitter_of(worker: Any, key: Any) -> Submitter | None:
-    """Return the task that has submitted a task of this worker from inside a partition."""
+def submitter_of(worker: Any, key: Any) -> SubmittingTask | None:
+    """Return the task that has submitted a nested task of this worker, or None."""
     task = worker.state.tasks.get(key)
     submitter = (task.annotations or {}).get(SUBMITTER) if task is not None else None
-    return None if submitter is None else Submitter(*submitter)
+    return None if submitter is None else SubmittingTask(*submitter)
 
 
 def threads_of(worker: Any) -> int:
-    """Return the number of threads that a worker has for tasks."""
+    """Return the number of task threads of a worker."""
     return int(worker.state.nthreads)
 
 
@@ -104,44 +99,48 @@ def is_running(worker: Any, key: Any) -> bool:
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
-def free_slots(worker: Any, slots: Resources) -> None:
-    """Give slots of a worker to its waiting tasks, in its event loop."""
+def release_slots(worker: Any, slots: Resources) -> None:
+    """Make slots of a worker available to its waiting tasks. Runs in its event loop."""
     from distributed.worker_state_machine import UnpauseEvent
 
     for name, number in slots.items():
         worker.state.available_resources[name] += number
-    if worker.state.running:  # or it is paused, and starts them when it goes on
+    if worker.state.running:  # a paused worker starts the tasks when it resumes
         worker.handle_stimulus(UnpauseEvent(stimulus_id=f"poolpart-lent-{time.time()}"))
 
 
-def take_slots(worker: Any, slots: Resources) -> None:
-    """Keep these slots from waiting tasks, even if there are fewer now, in its event loop."""
+def reserve_slots(worker: Any, slots: Resources) -> None:
+    """Reserve slots of a worker, even if fewer are available. Runs in its event loop."""
     for name, number in slots.items():
         worker.state.available_resources[name] -= number
 
 
-def slots_here(worker: Any, name: str) -> tuple[float, float]:
-    """Return the available slots of a worker, below 0 if reserved, and all its slots."""
+def count_slots(worker: Any, name: str) -> tuple[float, float]:
+    """Return the available slots of a worker, negative if reserved, and its total slots."""
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
-def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
-    """Add a handler to a worker that lacks the handler."""
-    worker.handlers.setdefault(question, answer)
+def add_handler(worker: Any, name: str, handler: Callable[..., Any]) -> None:
+    """Add a request handler to a worker unless it already exists."""
+    worker.handlers.setdefault(name, handler)
 
 
 # -- inputs ------------------------------------------------------------------------------
 
 
 async def why_unreadable(key: Any, holder: str, dask_worker: Any = None) -> str:
-    """Return why a worker cannot unpickle a result that another worker holds, or "" if it can.
+    """Return why a worker cannot unpickle a result of another worker, or "" if it can.
 
-    Raises OSError if the holder does not answer.
+    Raises
+    ------
+    OSError
+        If the worker that holds the result does not respond.
     """
     from distributed.core import connect, send_recv
 
-    # Not a connection of the worker's pool. If a result cannot be unpickled, Dask returns the
-    # connection to its pool in the middle of an exchange, so that the next request on it fails.
+    # A new connection is used instead of the worker's connection pool. If a result cannot be
+    # unpickled, Dask returns the connection to the pool in the middle of an exchange, and the next
+    # request on it fails.
     connection = await connect(holder, **dask_worker.connection_args)
     try:
         await send_recv(connection, op="get_data", keys=[key], who=dask_worker.address)
@@ -152,7 +151,7 @@ async def why_unreadable(key: Any, holder: str, dask_worker: Any = None) -> str:
     else:
         reason = ""
     try:
-        await connection.write("OK")  # the holder waits for it
+        await connection.write("OK")  # the holder waits for this message
     finally:
         connection.abort()
     return reason

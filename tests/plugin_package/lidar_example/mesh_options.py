@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from lidarsim.plugins import about, checked_fields
+from lidarsim.plugins import about
 
 
 @dataclass(frozen=True)
-@checked_fields
 class BoxesOptions:
     """Options that apply to .boxes files only."""
 

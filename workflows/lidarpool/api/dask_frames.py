@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from lidarsim.base.validation import checked
+from lidarsim.base.checks import check_type
 from lidarsim.columns.cloud import need_packages
 
 from ..columns.parts import StoredCloud, read_part
 
 
-@checked
 def to_dask(points: StoredCloud) -> Any:
     """Return a Dask DataFrame with all columns of the stored points, and one partition per part.
 
@@ -32,6 +31,7 @@ def to_dask(points: StoredCloud) -> Any:
     LidarError
         If pandas or pyarrow is not installed.
     """
+    check_type("points", points, StoredCloud)
     need_packages("pandas", "pyarrow")
     import dask.dataframe as dd
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.base.checks import check_fits, check_list
 from lidarsim.base.notebook import PICTURE_SIZE, cell_display, image_of, table_of
-from lidarsim.base.validation import checked
 from lidarsim.base.words import plural, scans_in_words
 
 from ..clouds.writing import save_cloud
@@ -37,7 +37,6 @@ class Result(RunResult):
         """Names of the objects, in the order of the column `object`."""
         return self.scene.object_names
 
-    @checked
     def report(
         self,
         folder: str | Path,
@@ -76,14 +75,14 @@ class Result(RunResult):
         from ..clouds.writing import ExportSpec
         from ..report.output import SurveyOutput
 
+        check_list("formats", formats)
         further_formats = [ExportSpec.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_destination(folder), self.survey, further_formats, extent)
-        with output.lock():
+        with output.lock() as locked:
             output.check_existing(self, overwrite=overwrite)
-            output.write(self)
+            output.write(locked, self)
 
-    @checked
     def pictures(
         self,
         folder: str | Path,
@@ -117,10 +116,11 @@ class Result(RunResult):
         """
         from ..report.result_pictures import draw_pictures
 
+        check_list("only", only)
+        check_fits("size", size, tuple[int, int])
         cloud_folder = self._cloud_file.parent
         return list(draw_pictures(self._pictured, cloud_folder, folder, only, size, color))
 
-    @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
         """Show the result in the browser until Ctrl-C, as `lidarpool view` does.
 
@@ -183,11 +183,11 @@ class Result(RunResult):
     @cached_property
     def _images(self) -> str:
         """Pictures of the result as HTML."""
-        from lidarview.cell_pictures import small_png
+        from lidarview.cell_pictures import compress_png
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=PICTURE_SIZE)
-            return "".join(image_of(small_png(path.read_bytes()), path.stem) for path in drawn)
+            return "".join(image_of(compress_png(path.read_bytes()), path.stem) for path in drawn)
 
     def _figures(self) -> Iterator[tuple[str, str]]:
         """Yield names and values of the main figures."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Unpack
+from typing import Unpack
 
-from pydantic import Field
-
+from lidarsim.base.checks import check_number
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.casting.scene_caster import check_backend_here
@@ -49,7 +47,6 @@ _NOT_OF_STREAMS = (
 )
 
 
-@checked
 def simulate(
     scene: Scene,
     survey: Survey,
@@ -158,7 +155,6 @@ def simulate(
 class Campaign(described.CampaignSpec):  # noqa: D101 - as there
     __doc__ = described.CampaignSpec.__doc__
 
-    @checked
     def run(
         self,
         out: str | Path,
@@ -232,10 +228,9 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         with page_of(jobs, run_options.live) as page:
             return run_campaign(target, jobs, run_options, Screen(on_progress), page)
 
-    @checked
     def stream(
         self,
-        ahead: Annotated[int, Field(ge=1)] = 8,
+        ahead: int = 8,
         *,
         split: str | None = None,
         **options: Unpack[RunKeywords],
@@ -274,6 +269,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             If the split is unknown. Iteration raises this error if the cluster lacks a resource or
             is lost.
         """
+        check_number("ahead", ahead, whole=True, ge=1)
         chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             hint = (

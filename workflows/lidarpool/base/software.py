@@ -20,7 +20,7 @@ from distributed import get_worker
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import Plugin, find_plugin
-from raybeam.registry import backend_build
+from raybeam.registry import backend_versions
 
 T = TypeVar("T")
 
@@ -54,7 +54,7 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
     described = {"lidarpool": f"{__version__} (sources {source_hash()})"}
     if backend:
         described["numpy"] = np.__version__
-        described["backend"] = f"{backend} {backend_build(backend)}".strip()
+        described["backend"] = f"{backend} {backend_versions(backend)}".strip()
     for plugin in plugins:
         if (installed := find_plugin(plugin.group, plugin.name)) is not None:
             described[_entry_name(installed)] = _plugin_version(installed)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from lidarscenes.files.lenient_xml import lenient_root
+from lidarscenes.files.lenient_xml import parse_lenient_xml
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import read_input
 from lidarsim.base.plugins import Plugin, find_plugin
@@ -48,7 +48,7 @@ def is_mujoco_model(survey: Path) -> bool:
 def _kind_of(survey: Path) -> str:
     """Return the tag of the outermost element of XML without a namespace, else the ending."""
     with suppress(OSError, LidarError, ValueError):
-        return lenient_root(read_input(survey)).tag.rpartition(":")[2]
+        return parse_lenient_xml(read_input(survey)).tag.rpartition(":")[2]
     return survey.suffix.lower()
 
 

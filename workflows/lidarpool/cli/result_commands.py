@@ -330,12 +330,12 @@ def view(
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
         if film or export:
-            from lidarview.viewer.sharing import share
+            from lidarview.viewer.sharing import export_view
 
             from .terminal import Terminal
 
             shared = open_views(folders, **reading)
-            share(shared, film, export, Terminal().writing)
+            export_view(shared, film, export, Terminal().writing)
         else:
             growing = None
             if len(folders) == 1 and not of_mesh:

@@ -161,7 +161,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     elif survey.suffix.lower() in ENDINGS:
         left_out = import_whole(import_sensor, survey, folder, assets, check)
     else:
-        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).left_out
+        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
     own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())
@@ -437,7 +437,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 
     `paint` gives a generated scene its colors.
     """
-    from lidarscenes.procedural.paint import painted
+    from lidarscenes.procedural.paint import paint_scene
     from lidarscenes.writers.scene_file import check_target, write_scene
 
     check_target(file)
@@ -445,7 +445,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
         raise LidarError(f"{file} already exists. Use another name, or pass `--overwrite`.")
     scene = make()
     if file.suffix.lower() == ".glb":  # other formats hold no colors
-        scene = painted(scene) if paint else scene
+        scene = paint_scene(scene) if paint else scene
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(
             f"{file} would contain {scene.triangles:,} triangles, because only .glb files can "

@@ -8,7 +8,7 @@ from types import EllipsisType
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints, Ints32
-from lidarsim.base.vectors import applied
+from lidarsim.base.vectors import matvec
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
@@ -42,7 +42,7 @@ class Boxes:
         position = sweeps.actor_poses.positions[:, sweep]
         quaternion = sweeps.actor_poses.quaternions[:, sweep]
         lower, upper = sweeps.actor_bounds.transpose(1, 0, 2)
-        middle = applied(matrices(quaternion), (lower + upper) / 2)
+        middle = matvec(matrices(quaternion), (lower + upper) / 2)
         present = sweeps.actor_there[:, sweep] | (sweeps.actor_comes[:, sweep] & (counts > 0))
         return cls(position + middle, quaternion, upper - lower, counts, present)
 

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 
 from ..base.open3d_module import load_open3d
 
 
-@checked
 def to_open3d(cloud: Cloud) -> Any:
     """Convert a cloud to an `open3d.t.geometry.PointCloud` with all columns.
 

@@ -49,7 +49,7 @@ class PacketCapture(CloudFormat):
     def write(self, path: Path, spec: ExportSpec) -> None:
         """Write the folder."""
         sources = [
-            PacketSource.of_sensor(self.sweeps, number)
+            PacketSource.for_sensor(self.sweeps, number)
             for number in range(len(self.sweeps.sensors))
         ]
         encoders = [encoder_of(source) for source in sources]

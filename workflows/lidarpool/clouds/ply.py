@@ -16,7 +16,6 @@ from lidarsim.base.arrays import AnyArray, AnyFloats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
-from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
@@ -291,7 +290,6 @@ def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
     os.ftruncate(file, stop + distance)
 
 
-@checked
 def read_cloud(path: str | Path) -> Cloud:
     """Read a .ply point cloud written by a run or by `save_cloud`, with all its columns.
 

@@ -6,19 +6,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, noinline
 
 TILE_ROWS = 512  # rows per tile, which stays in the L1 cache while all columns are written
 
 
-@stage
+@noinline
 def _scatter(values, fields):
     """Write values to a field of all rows."""
     for k in range(len(fields)):
         fields[k] = values[k]
 
 
-@stage
+@noinline
 def _round_positions(cells, scale, origin, positions):
     """Compute the positions of cells, rounded in the same way as by `part_columns.positions_of`.
 

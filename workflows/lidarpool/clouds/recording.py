@@ -22,7 +22,6 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
-from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.column_names import STRENGTHS, with_standard_names
@@ -146,8 +145,6 @@ class Recording:
     notes: tuple[str, ...] = ()
     # {number of an item: points omitted from it}
     _omitted: dict[int, OmittedPoints] = field(default_factory=dict, init=False)
-
-    __signature__ = ReadableSignature()
 
     def __repr__(self) -> str:
         if self.is_cloud:

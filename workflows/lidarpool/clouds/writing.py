@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from lidarsim.base.declared import about
+from lidarsim.base.checks import check_fields
+from lidarsim.base.declared import FileSection, about
 from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
-from lidarsim.base.validation import checked, checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.base.words import alternatives, joined
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.survey.survey import Survey
@@ -41,8 +42,7 @@ _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  
 
 
 @dataclass(frozen=True)
-@checked_fields
-class ExportSpec:
+class ExportSpec(FileSection):
     """A format to which a cloud is exported, with its options.
 
     In YAML, the name of the format is sufficient.
@@ -103,7 +103,10 @@ class ExportSpec:
         ),
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         for option in _OPTIONS:  # LidarError for an unknown format
             is_set = getattr(self, option) not in (False, None)
             if is_set and not self.cloud_format.supports(option):
@@ -383,7 +386,6 @@ def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:
                 )
 
 
-@checked
 def save_cloud(
     cloud: Cloud | StoredCloud,
     path: str | Path,

@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, noinline
 
 
-@stage
+@noinline
 def _fill(values, value):
     for k in range(len(values)):
         values[k] = value

@@ -15,8 +15,6 @@ from matplotlib.colors import LogNorm, Normalize
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import explained
 from lidarsim.base.even_samples import even_indices
-from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
@@ -53,8 +51,6 @@ MIN_DISTANCE_M = 0.001  # end of the scale of distances
 class Comparison:
     """Result of `compare`, which is printed as a table."""
 
-    __signature__ = ReadableSignature()
-
     figures: dict[str, Any]  # content of compare.json; lengths in meters, None for unknown
     images: RangeImages | None  # images of the first pair of sweeps that has any
     residuals: Floats  # (k,): of all cells with a return in both, or of a choice, meters
@@ -67,7 +63,6 @@ class Comparison:
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")
 
-    @checked
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and the pictures, and return their paths.
 
@@ -149,9 +144,9 @@ def draw_ranges(comparison: Comparison) -> Page:
         page.heading(axes, words)
     ramp = np.linspace(0, 1, 256)
     frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
-    page.color_bar(theme.mapped(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
+    page.color_bar(theme.apply_colormap(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
     frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
-    page.color_bar(theme.mapped(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
+    page.color_bar(theme.apply_colormap(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
     return page
 
 
@@ -165,7 +160,7 @@ def _range_scale(images: RangeImages) -> LogNorm:
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     """Return the colors (r, c, …) of the ranges of A (0) or B (1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
-    colors = theme.mapped(theme.RANGE_COLORS, scale(ranges).filled(0))
+    colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
     colors[~images.returned[index]] = NO_RETURN
     return colors
 
@@ -174,7 +169,7 @@ def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
     """Return the colors (r, c, …) of the residuals, and of cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
     in_a, in_b = images.returned
-    colors = theme.mapped(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
+    colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
     colors[~in_a & ~in_b] = NO_RETURN
     colors[in_a & ~in_b] = ONLY_A
     colors[~in_a & in_b] = ONLY_B
@@ -355,7 +350,7 @@ def draw_above(comparison: Comparison) -> Page:
         page.heading(axes, ("A, distance to B", "B, distance to A")[number])
     frame = (0.875, 0.12, 0.014, chart_height)
     page.color_bar(
-        theme.mapped(DISTANCE_COLORS, np.linspace(0, 1, 256)), scale, "distance, m", frame
+        theme.apply_colormap(DISTANCE_COLORS, np.linspace(0, 1, 256)), scale, "distance, m", frame
     )
     return page
 

@@ -7,17 +7,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from lidarsim._version import __version__
 from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.checks import check_choice, check_number
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
-from lidarsim.base.validation import checked
-from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
@@ -36,7 +34,6 @@ MAX_POINTS = 10_000_000  # points of each cloud in memory
 MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken
 
 
-@checked
 def compare(
     a: str | Path | Cloud | StoredCloud,
     b: str | Path | Cloud | StoredCloud,
@@ -47,12 +44,12 @@ def compare(
     sensor_b: str | None = None,
     intensity_a: str | None = None,
     intensity_b: str | None = None,
-    unit_a: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
-    unit_b: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    unit_a: str | None = None,
+    unit_b: str | None = None,
     keep_noise: bool = False,
-    azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
+    azimuth_deg: float | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
-    max_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
+    max_points: int = MAX_POINTS,
 ) -> Comparison:
     """Compare two clouds or recordings of the same scene.
 
@@ -104,6 +101,10 @@ def compare(
         If A or B cannot be read, is empty, or has a coordinate system that distorts lengths, such
         as Web Mercator, or if A and B have no quantity in common that can be compared.
     """
+    check_choice("match", match, ("order", "time"))
+    check_number("max_points", max_points, whole=True, ge=1000)
+    if azimuth_deg is not None:
+        check_number("azimuth_deg", azimuth_deg, gt=0, le=90)
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(
             f"`distances_m` is {list(distances_m)}; it must contain positive lengths in meters."

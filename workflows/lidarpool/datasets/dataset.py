@@ -19,10 +19,11 @@ import numpy as np
 
 from lidarsim._version import __version__
 from lidarsim.base.archives import packed
+from lidarsim.base.checks import check_fields
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.named_files import leads_outside
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
@@ -77,7 +78,6 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 
 
 @dataclass(frozen=True)
-@checked_fields
 class DataSet:
     """The files of many jobs in a folder or storage.
 
@@ -122,6 +122,11 @@ class DataSet:
     compensated_actors: bool = False
     pose_rate_hz: float | None = None
     made_with: Mapping[str, Any] = field(default_factory=dict)
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def spec(self) -> ExportSpec:

@@ -15,16 +15,15 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import islice, tee
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.archives import open_archive
+from lidarsim.base.checks import check_list, check_number
 from lidarsim.base.errors import LidarError, as_sentence
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -233,14 +232,13 @@ class _OpenJob:
         return sweep_of_job(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
 
-@checked
 def sweeps(
     location: str | Path,
     *,
     split: str | Sequence[str] | None = None,
     jobs: Sequence[int | str] | None = None,
     sensors: Sequence[str] | None = None,
-    shuffle: Annotated[int, Field(ge=0)] | None = None,
+    shuffle: int | None = None,
 ) -> SavedSweeps:
     """Open the sweeps of a data set written by a campaign.
 
@@ -271,6 +269,11 @@ def sweeps(
         If the data set is missing, unfinished or damaged, if a package that its format requires is
         not installed, or if the split, job or sensor is unknown.
     """
+    for name, names in (("jobs", jobs), ("sensors", sensors)):
+        if names is not None:
+            check_list(name, names)
+    if shuffle is not None:
+        check_number("shuffle", shuffle, whole=True, ge=0)
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)
     dataset = DataSet(storage, head["format"], head["layout"], head["compensated"])

@@ -10,21 +10,19 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 from distributed import Client
-from pydantic import Field
 
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.checks import check_number
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import need
-from lidarsim.base.signatures import ReadableSignature
-from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
@@ -120,8 +118,6 @@ class Twin:
         Statistics and texts of the report. Lengths are in meters.
     """
 
-    __signature__ = ReadableSignature()
-
     scene: Scene
     poses: Floats
     times_s: Floats
@@ -135,7 +131,6 @@ class Twin:
     def __repr__(self) -> str:
         return rendered("twin.txt", report=self.figures).rstrip("\n")
 
-    @checked
     def save(self, folder: str | Path) -> list[Path]:
         """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
 
@@ -223,13 +218,12 @@ class Twin:
         return head + yaml.safe_dump(scenario, sort_keys=False, default_flow_style=None)
 
 
-@checked
 def twin(
     recording: str | Path | Cloud | StoredCloud | Recording,
     *,
     model: str | Path | None = None,
     trajectory: str | Path | None = None,
-    voxel_m: Annotated[float, Field(gt=0, le=10)] = DEFAULT_VOXEL_M,
+    voxel_m: float = DEFAULT_VOXEL_M,
     sensor: str | None = None,
     intensity: str | None = None,
     client: Client | None = None,
@@ -287,6 +281,7 @@ def twin(
         and `model` is not set; if an extra is missing; or if the folder contains the steps of a
         different twin.
     """
+    check_number("voxel_m", voxel_m, gt=0, le=10)
     need("scipy", "twin", "Reconstructing a recording")
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):

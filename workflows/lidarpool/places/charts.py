@@ -125,7 +125,7 @@ def draw_sweep(sweep: SweepImages) -> Page:
         frame = (_LEFT, bottom / height, _CHART_WIDTH, _IMAGE_HEIGHT / height)
         axes = page.chart(frame, ylabel="ring")
         known = np.nan_to_num(one.values, nan=1.0)
-        drawn = theme.mapped(one.colors, np.asarray(one.scale(known).data))
+        drawn = theme.apply_colormap(one.colors, np.asarray(one.scale(known).data))
         drawn[~np.isfinite(one.values)] = _NO_RETURN
         extent = (180, -180, one.values.shape[0] - 0.5, -0.5)
         axes.imshow(drawn[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)

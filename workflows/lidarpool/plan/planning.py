@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import check_fields
 from lidarsim.base.declared import Seed, about
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 
 from .geometry import segment_distances
 
@@ -38,7 +39,6 @@ class Search:
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Planning(Search):
     """Search for a 2D path from `start` to `target` that avoids all discs.
 
@@ -73,7 +73,10 @@ class Planning(Search):
     centers: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (m, 2), meters
     radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), meters
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         start, target = ((float(x), float(y)) for x, y in (self.start, self.target))
         if start == target:
             raise LidarError(

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.checks import check_list, check_number
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.base.words import name_hint
 from lidarsim.media.materials import rows_named
 from lidarsim.scene.scene import Scene
@@ -137,17 +136,16 @@ class SurveyCoverage:
     covered_m2: Floats  # (objects,) area of that with a point of the cloud nearby
 
 
-@checked
 def plan_stations(
     scene: Scene,
     sensor: Sensor,
     *,
     targets: Sequence[str] = (),
-    count: Annotated[int | None, Field(ge=1, le=MAX_STATIONS)] = None,
-    coverage: Annotated[float | None, Field(gt=0, le=1)] = None,
-    height_m: Annotated[float, Field(gt=0, le=1e6)] = 1.7,
-    spacing_m: Annotated[float | None, Field(gt=0, le=1e6)] = None,
-    slant_deg: Annotated[float, Field(gt=0, le=90)] = 80.0,
+    count: int | None = None,
+    coverage: float | None = None,
+    height_m: float = 1.7,
+    spacing_m: float | None = None,
+    slant_deg: float = 80.0,
 ) -> StationPlan:
     """Choose stations for a terrestrial scan.
 
@@ -191,6 +189,15 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarError("`count` and `coverage` cannot be combined.")
+    check_list("targets", targets)
+    if count is not None:
+        check_number("count", count, whole=True, ge=1, le=MAX_STATIONS)
+    if coverage is not None:
+        check_number("coverage", coverage, gt=0, le=1)
+    if spacing_m is not None:
+        check_number("spacing_m", spacing_m, gt=0, le=1e6)
+    check_number("height_m", height_m, gt=0, le=1e6)
+    check_number("slant_deg", slant_deg, gt=0, le=90)
     is_target = _target_mask(scene.names, targets)  # a wrong name is reported at once
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
     sight = Sight(scene, sensor, slant_deg)

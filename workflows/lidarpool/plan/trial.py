@@ -10,7 +10,6 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.value_texts import one_line
 
 from .cost import PathCost
@@ -99,8 +98,6 @@ class Plan:
     trials
         Number of trials.
     """
-
-    __signature__ = ReadableSignature()
 
     path: Floats
     length: float

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
+from lidarsim.base.checks import check_choice
 from lidarsim.base.errors import LidarError, MissingFileError
-from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
@@ -71,14 +70,13 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
     }
 
 
-@checked
 def open_recording(
     source: str | Path | Cloud | StoredCloud,
     sensor: str | None = None,
     intensity: str | None = None,
     *,
     name: str = "the cloud",
-    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
     """Open a recording or cloud in any format, which is read sweep by sweep.
@@ -112,6 +110,8 @@ def open_recording(
         If the source does not exist or is not supported, if it contains several sensors and none is
         chosen, or if its coordinate system distorts lengths.
     """
+    if unit is not None:
+        check_choice("unit", unit, UNITS_M)
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
             raise LidarError(f"{name} is always in meters. Remove the unit {unit!r}.")

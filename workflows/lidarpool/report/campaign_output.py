@@ -6,10 +6,11 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained, message_of
 from lidarsim.base.storage import Storage
@@ -71,54 +72,50 @@ def run_campaign(
     page: RunPage,
 ) -> CampaignRun:
     """Cast the jobs of a campaign, write the data set, and return a summary."""
-    output = DataSetOutput(target, campaign, options, screen, page)
-    with output.lock():
-        if (finished := output.check_existing()) is not None:
-            return finished
+    storage = replace(Storage.at(target), durable=False)
+    dataset = DataSet(storage, **asdict(campaign.keep))
+    output = DataSetOutput(dataset, campaign, options, screen, page)
+    dataset.check_installed()
+    with result_folder(target):
+        earlier = output.check_existing()
+        if earlier.is_complete:
+            return output.finished(earlier)
         with (
             ClusterConnection(campaign, options, screen) as connection,
             open_store(campaign, options, screen) as store,
         ):
-            output.compare_with_store(store)
-            committed = cast(store, connection, Listener(page), output.dataset)
+            output.compare_with_store(earlier, store)
+            committed = cast(store, connection, Listener(page), dataset)
             return output.publish(committed)
+
+
+class FinishedDataSet(NamedTuple):
+    """A finished data set that a run continues.
+
+    `record` is the content of CAMPAIGN_FILE; it is empty if there is no such data set, or the file
+    is damaged, as `note` reports. `wrong` are faults of jobs, {number: a clause}.
+    """
+
+    record: Mapping[str, Any] = MappingProxyType({})
+    rows: Sequence[JobRow] = ()
+    wrong: Mapping[int, str] = MappingProxyType({})
+    is_complete: bool = False
+    note: str = ""
 
 
 @dataclass(eq=False)
 class DataSetOutput:
-    """The data set of a campaign in a folder or storage, as the output of a run."""
+    """The data set of a campaign as the output of a run."""
 
-    target: Path | Storage
+    dataset: DataSet
     campaign: CampaignSpec
     options: RunOptions
     screen: Screen
     page: RunPage
-    dataset: DataSet = field(init=False)
+    begun_at: float = field(default_factory=time.monotonic)  # seconds
 
-    def __post_init__(self) -> None:
-        self._begun_at = time.monotonic()
-        storage = replace(Storage.at(self.target), durable=False)
-        self.dataset = DataSet(storage, **asdict(self.campaign.keep))
-        # Of a finished data set: its record, rows, and faults of jobs, {number: a clause}.
-        self._record: Mapping[str, Any] | None = None
-        self._rows: list[JobRow] = []
-        self._wrong: dict[int, str] = {}
-        self._lost_record = ""  # a note, if the record was damaged
-
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Lock the target while the body runs."""
-        self.dataset.check_installed()
-        with result_folder(self.target):
-            yield
-
-    # -- existing files -----------------------------------------------------------------------
-
-    def check_existing(self) -> CampaignRun | None:
-        """Refuse, remove or check a finished data set.
-
-        Returns its sums if no job is left to do.
-        """
+    def check_existing(self) -> FinishedDataSet:
+        """Refuse, remove or check a finished data set, and return it if the run continues it."""
         storage = self.dataset.storage
         options = self.options
         run_folder = storage.below(RUN_FOLDER)
@@ -135,65 +132,54 @@ class DataSetOutput:
             if starts_anew:
                 _remove_dataset(storage, run_folder)
         if not options.may_continue or CAMPAIGN_FILE not in entries or unfinished:
-            return None
+            return FinishedDataSet()
         try:
-            self._record = check_same(storage, self.campaign)
+            record = check_same(storage, self.campaign)
         except DamagedRecordError:  # the manifests name the campaign of the jobs
-            self._lost_record = f"{CAMPAIGN_FILE} was damaged and has been recreated"
-            return None
-        self._check_shards(self._record["shards"])
-        if not self._is_complete(self._record, verify=options.verify):
-            return None
-        if RUN_FOLDER in entries:  # a killed run may leave files
-            remove_run(run_folder)
-        if (files := file_hashes(self.campaign.files)) != [*map(tuple, self._record["files"])]:
-            # `_check_jobs` has found no job of an older file
-            write_record(storage, {**self._record, "files": files})
-        return self._finished()
-
-    def _check_shards(self, shards: Sequence[str]) -> None:
-        """Raise LidarError unless a finished data set has the shards of this run."""
-        if shards != [str(self.campaign.shard)]:
-            held = listed([*map(describe_shard, shards)]) or "no shards"
+            return FinishedDataSet(note=f"{CAMPAIGN_FILE} was damaged and has been recreated")
+        shard = str(self.campaign.shard)
+        if record["shards"] != [shard]:
+            held = listed([*map(describe_shard, record["shards"])]) or "no shards"
             raise LidarError(
-                f"{self.dataset.storage} contains {held}, but this run is "
-                f"{describe_shard(str(self.campaign.shard))}. Specify another folder with "
-                "`--out`."
+                f"{storage} contains {held}, but this run is {describe_shard(shard)}. Specify "
+                "another folder with `--out`."
             )
+        finished = self._check_finished(record)
+        if finished.is_complete:
+            if RUN_FOLDER in entries:  # a killed run may leave files
+                remove_run(run_folder)
+            if (files := file_hashes(self.campaign.files)) != [*map(tuple, record["files"])]:
+                # `_check_jobs` has found no job of an older file
+                write_record(storage, {**record, "files": files})
+        return finished
 
-    def _is_complete(self, record: Mapping[str, Any], *, verify: bool) -> bool:
-        """Read the rows of a finished data set, and return True if all jobs are intact."""
+    def _check_finished(self, record: Mapping[str, Any]) -> FinishedDataSet:
+        """Read the rows of a finished data set, and check its jobs."""
         storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
-            rows = (row for row, _ in self.dataset.rows())
             seconds = known_seconds(storage)
-            self._rows += sorted(
-                (replace(row, seconds=seconds.get(row.number)) for row in rows),
+            rows = sorted(
+                (replace(row, seconds=seconds.get(row.number)) for row, _ in self.dataset.rows()),
                 key=lambda row: row.number,
             )
-        has_table = _is_tabled(storage, self._rows)
-        intact_count, self._wrong = _check_jobs(self.dataset, self._rows, verify, self.campaign)
-        numbers = {row.number for row in self._rows}
+        wrong = _check_jobs(self.dataset, rows, self.options.verify, self.campaign)
+        numbers = {row.number for row in rows}
         for number in self.campaign.shard.jobs(record["campaign"]["count"]):
             if number not in numbers:
                 name = self.campaign.name(number)
-                self._wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
-        has_all = intact_count == len(self.campaign.numbers)
-        return has_table and has_all and _is_indexed(storage, intact_count)
+                wrong[number] = f"job {name} ({manifest_file(name)} is missing or damaged)"
+        has_all = not wrong and len(rows) == len(self.campaign.numbers)
+        return FinishedDataSet(record, rows, wrong, has_all and _has_shared_files(storage, rows))
 
-    def _finished(self) -> CampaignRun:
+    def finished(self, complete: FinishedDataSet) -> CampaignRun:
         """Report that the data set is complete, and return its sums."""
         self.screen.tell(f"{self.dataset.storage} is already complete")
-        for row in self._rows:
+        for row in complete.rows:
             self.page.ended(row)
-        notes = (*self._warnings_of_empty_jobs(self._rows),)
-        sums = CampaignRun.from_rows(self._rows, self._seconds(), notes=notes)
+        notes = (*self._warnings_of_empty_jobs(complete.rows),)
+        sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
         return sums
-
-    def _seconds(self) -> float:
-        """Return the wall time of the run so far."""
-        return time.monotonic() - self._begun_at
 
     def _warnings_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
         """Warn if jobs have no points, and return the warning, if any."""
@@ -208,27 +194,28 @@ class DataSetOutput:
         self.screen.warn(warning)
         return [warning]
 
-    def compare_with_store(self, store: RunStore) -> None:
+    def compare_with_store(self, earlier: FinishedDataSet, store: RunStore) -> None:
         """Compare existing jobs with the run's store, and add jobs that the store lacks."""
         options = self.options
-        storage = self.dataset.storage
-        if self._record is not None:
-            store.cast_with(self._record["backend"], self._record["casting"])
-            rows = [row for row in self._rows if row.number in self.campaign.numbers]
-            store.adopt(rows, sensors=json.dumps(self._record["sensors"]))
+        if record := earlier.record:
+            store.cast_with(record["backend"], record["casting"])
+            rows = [row for row in earlier.rows if row.number in self.campaign.numbers]
+            store.adopt(rows, sensors=json.dumps(record["sensors"]))
         elif options.may_continue:
-            store.notes += [self._lost_record] * bool(self._lost_record)
+            store.notes += [earlier.note] * bool(earlier.note)
             self._take_over(store)
         # Some jobs were perhaps taken over.
-        dataset_files(storage, begun=store.begun or bool(store.committed_in_words))
-        if self._record is None:
-            _, self._wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
+        begun = store.begun or bool(store.committed_in_words)
+        dataset_files(self.dataset.storage, begun=begun)
+        wrong = earlier.wrong
+        if not record:
+            wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.committed_in_words:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
-        store.forget([*self._wrong, *retried])
-        if self._wrong:
-            store.notes.append(f"these jobs are run again: {listed([*self._wrong.values()])}")
+        store.forget([*wrong, *retried])
+        if wrong:
+            store.notes.append(f"these jobs are run again: {listed([*wrong.values()])}")
         for row in store.rows():
             self.page.ended(row)
 
@@ -247,12 +234,10 @@ class DataSetOutput:
                     rows.append(replace(row, seconds=seconds.get(row.number)))
         store.adopt(rows)
 
-    # -- the end ------------------------------------------------------------------------------
-
     def publish(self, committed: Committed) -> CampaignRun:
         """Write the shared files, and remove the run unless jobs have failed."""
         store = committed.store
-        seconds = self._seconds()
+        seconds = time.monotonic() - self.begun_at
         notes = committed.notes
         warnings = self._warnings_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
@@ -271,11 +256,16 @@ class DataSetOutput:
             replayed=committed.replayed,
             notes=notes,
         )
-        record: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
-        record |= {"fields": dict(store.fields)}
-        record |= {"backend": store.backend, "sensors": sums.sensors}
-        record |= {"files": file_hashes(self.campaign.files), "campaign": self.campaign.described}
-        record |= {"shards": [str(self.campaign.shard)]}
+        record: dict[str, Any] = {
+            "identity": dict(store.identity),
+            "casting": store.casting,
+            "fields": dict(store.fields),
+            "backend": store.backend,
+            "sensors": sums.sensors,
+            "files": file_hashes(self.campaign.files),
+            "campaign": self.campaign.described,
+            "shards": [str(self.campaign.shard)],
+        }
         write_record(self.dataset.storage, record)  # before the files that it assigns to a campaign
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
         sums, _ = write_shared(self.dataset, record, sums, store.rows)
@@ -299,10 +289,7 @@ def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
 
 
 def read_record(storage: Storage) -> dict[str, Any]:
-    """Read CAMPAIGN_FILE.
-
-    DamagedRecordError if the file is damaged or edited; LidarError if there is none.
-    """
+    """Read CAMPAIGN_FILE, or raise DamagedRecordError, or LidarError if there is none."""
     check_exists(storage, "specify the output folder of a campaign")
     try:
         record = unseal_json(storage.read(CAMPAIGN_FILE))
@@ -324,19 +311,21 @@ def read_record(storage: Storage) -> dict[str, Any]:
     return record
 
 
-def _is_tabled(storage: Storage, rows: Sequence[JobRow]) -> bool:
-    """Return True if the table of jobs has these rows, and the checksum in `dataset.json`."""
+def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
+    """Return True if the job table has these rows, and the last file lists as many jobs.
+
+    The last file has the checksum of the table.
+    """
     with suppress(LidarError):
-        table = read_table(storage, read_index(storage)["table"])
-        return {row.number: row.sha256 for row in table} == {row.number: row.sha256 for row in rows}
+        index = read_index(storage)
+        table = {row.number: row.sha256 for row in read_table(storage, index["table"])}
+        has_table = table == {row.number: row.sha256 for row in rows}
+        return has_table and len(index["jobs"]) == len(rows)
     return False
 
 
 def read_notes(storage: Storage) -> list[str]:
-    """Return the notes in the report of a data set.
-
-    A note says if the report is unusable.
-    """
+    """Return the notes in the report of a data set, or a note that the report is unusable."""
     try:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
@@ -371,22 +360,17 @@ def write_shared(
     write_table(storage, campaign["names"], rows)
     write_record(storage, record)  # behind the table, which has the jobs of all shards in it
     dataset.finish(rows())
-    sums = replace(sums, notes=(*sums.notes, *_renamed_sensors(dataset)))
-    saved = sweeps(storage.url)
-    picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
-    sums = replace(sums, classes=saved.classes)
-    versions = record["casting"] or software()
-    return sums, write_card(storage, campaign, sums, rows(), versions, picture)
-
-
-def _renamed_sensors(dataset: DataSet) -> list[str]:
-    """Return notes on the sensors of finished jobs that have other names in the data set."""
+    # Notes on sensors that have other names in the data set.
     cloud_format = load_format(DATA_SETS[dataset.format])
-    sensors_of_jobs = read_index(dataset.storage)["jobs"].values()
-    notes = (
+    sensors_of_jobs = read_index(storage)["jobs"].values()
+    renamed = (
         note for sensors in sensors_of_jobs for note in cloud_format.renaming_notes([*sensors])
     )
-    return list(dict.fromkeys(notes))
+    saved = sweeps(storage.url)
+    picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
+    sums = replace(sums, notes=(*sums.notes, *dict.fromkeys(renamed)), classes=saved.classes)
+    versions = record["casting"] or software()
+    return sums, write_card(storage, campaign, sums, rows(), versions, picture)
 
 
 def _check_jobs(
@@ -394,24 +378,19 @@ def _check_jobs(
     rows: Iterable[JobRow],
     contents: bool,
     campaign: CampaignSpec | None = None,
-) -> tuple[int, dict[int, str]]:
-    """Count the intact jobs, and describe the faults of the rest, {number: a clause}.
+) -> dict[int, str]:
+    """Describe the faults of jobs, {number: a clause}.
 
     LidarError if a file of the campaign differs from the file that intact jobs are made of.
     """
-    intact_count = 0
     wrong = dict[int, str]()
-    jobs_of_file: dict[
-        tuple[str, str], list[str]
-    ] = {}  # {name and hash of a file: jobs made of it}
+    # {name and hash of a file: jobs made of it}
+    jobs_of_file: dict[tuple[str, str], list[str]] = {}
     with explained(f"{dataset.storage} cannot be read"):
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
-                share = (
-                    ""
-                    if campaign.shard == ALL
-                    else f" in total and this run is shard {campaign.shard}"
-                )
+                share = f" in total and this run is shard {campaign.shard}"
+                share *= campaign.shard != ALL
                 raise LidarError(
                     f"{dataset.storage} contains job {row.name}, which is not part of this "
                     f"run, because the campaign has {plural(campaign.count, 'job')}{share}. "
@@ -421,7 +400,6 @@ def _check_jobs(
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
                 continue
-            intact_count += 1
             for file in manifest["made_of"]:
                 jobs_of_file.setdefault(tuple(file), []).append(row.name)
     current_files = file_hashes(campaign.files) if campaign is not None and jobs_of_file else []
@@ -432,14 +410,7 @@ def _check_jobs(
                 f"{name}: {listed(jobs)}. Restore that version, or specify another folder "
                 "with `--out`."
             )
-    return intact_count, wrong
-
-
-def _is_indexed(storage: Storage, jobs: int) -> bool:
-    """Return True if the last file of a data set is intact and lists a number of jobs."""
-    with suppress(LidarError):
-        return len(read_index(storage)["jobs"]) == jobs
-    return False
+    return wrong
 
 
 def verify(storage: Storage, number: int | None = None) -> str:
@@ -455,7 +426,7 @@ def verify(storage: Storage, number: int | None = None) -> str:
     wrong = {} if is_complete else {-1: f"{TABLE_FILE} and {INDEX_FILE} list different jobs"}
     if number is None and CAMPAIGN_FILE in storage.sizes():
         read_record(storage)
-    wrong |= _check_jobs(dataset, rows, True)[1]
+    wrong |= _check_jobs(dataset, rows, True)
     if wrong:
         raise LidarError(
             f"{storage} is damaged: {listed([*wrong.values()])}. To run these jobs again, "
@@ -507,10 +478,7 @@ def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
 
 
 def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
-    """Remove a data set and its run.
-
-    Raises LidarError, before any removal, for further files.
-    """
+    """Remove a data set and its run, unless LidarError names further files."""
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
     files = dataset_files(storage, begun=begun)
     with explained(f"{storage} cannot be removed"):

@@ -16,7 +16,7 @@ from lidarsim.base.words import plural, rounded, shortened
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
-from lidarview.render.coloring import colors_of
+from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import Figures, Varied
@@ -75,7 +75,7 @@ def draw_varied(figures: Figures) -> Page | None:
         if scale is informative:
             bars = theme.object_colors(len(scale.labels))
         _draw_counts(upper, scale, failures, bars)
-        _draw_points(page, lower, scale, _JobDots(points, failures, colors))
+        _draw_points(page, lower, scale, points, failures, colors)
         lower.set_ylim(limits)
         layout.label_charts(page, number, scale, upper, lower)
     page.title(
@@ -133,14 +133,6 @@ class _Layout(NamedTuple):
         lower.tick_params(labelleft=is_first)
         name = shortened(scale.name, int(self.width / 13.8))
         page.heading(upper, name, weight="bold", pad=4 * page.unit)
-
-
-class _JobDots(NamedTuple):
-    """Jobs as dots, (jobs,) each."""
-
-    points: Floats
-    failures: Bools
-    colors: Floats  # (jobs, 3)
 
 
 def _dot_colors(informative: Varied | None, count: int) -> Floats:
@@ -257,11 +249,13 @@ def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colors: Iterable[An
     axes.set_ylim(0, 1.1 * max(1, np.max(counts)))
 
 
-def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
-    """Draw a dot for each job, with failed jobs at the bottom, and percentiles."""
+def _draw_points(
+    page: Page, axes: Axes, scale: Varied, points: Floats, failures: Bools, colors: Floats
+) -> None:
+    """Draw a dot for each job, in `colors` (jobs, 3), with failed jobs at the bottom."""
     unit = page.unit
     is_known = np.isfinite(scale.values)
-    done_jobs = np.flatnonzero(is_known & ~dots.failures)
+    done_jobs = np.flatnonzero(is_known & ~failures)
     drawn = done_jobs[even_indices(len(done_jobs), MAX_DOTS)]
     x = scale.values.copy()
     if scale.labels:  # spread over the bar, the same in each picture of the same jobs
@@ -270,16 +264,16 @@ def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
     alpha = float(np.clip(16 / np.sqrt(max(len(drawn), 1)), 0.25, 0.85))
     axes.scatter(
         x[drawn],
-        dots.points[drawn],
+        points[drawn],
         s=size,
-        c=dots.colors[drawn],
+        c=colors[drawn],
         alpha=alpha,
         linewidths=0,
         clip_on=False,
         rasterized=True,
     )
-    _draw_percentiles(axes, scale, x, dots.points, done_jobs, 1.6 * unit)
-    failed = np.flatnonzero(is_known & dots.failures)
+    _draw_percentiles(axes, scale, x, points, done_jobs, 1.6 * unit)
+    failed = np.flatnonzero(is_known & failures)
     failed = failed[even_indices(len(failed), MAX_DOTS)]
     axes.scatter(
         x[failed],
@@ -387,11 +381,10 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     rows = slice(None, None, max(1, -(-len(sweep) // SWEEP_DOTS)))
     points = sweep.points[rows]
     classes = None if sweep.classes is None else sweep.classes[rows]
+    known = [(name, value) for name, value in sweep.values.items() if value is not None]
     values = [
         f"{name} {rounded(value, 4) if isinstance(value, float) else shortened(str(value))}"
-        for name, value in [item for item in sweep.values.items() if item[1] is not None][
-            :MAX_VALUES
-        ]
+        for name, value in known[:MAX_VALUES]
     ]
     page.title(
         f"A sweep of job {sweep.job}",
@@ -399,11 +392,11 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        coloring = colors_of(classes, TABLE["class"], value_names({0: "none", **names}))
+        coloring = make_coloring(classes, TABLE["class"], value_names({0: "none", **names}))
         page.legend(coloring.labels, "sensor")
         painted = coloring.paint(classes)
     else:
-        painted = colors_of(points[:, 2], Z).paint(points[:, 2])
+        painted = make_coloring(points[:, 2], Z).paint(points[:, 2])
     reach = 1.0
     if len(points):
         reach = float(np.percentile(np.abs(points[:, :2]).max(axis=1), 100 * SWEEP_SHARE))

@@ -62,7 +62,6 @@ class CloudCounts:
         self.limits: dict[str, tuple[float, float]] = {}
         self._precision_m = precision_m
         self._origin = origin
-        self._box: Ints | None = None  # lowest and highest cells, (2, 3); None without points
         self._squares = GridCounts(_SQUARES)
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
@@ -79,15 +78,13 @@ class CloudCounts:
             )
 
     def _add_limits(self, name: str, lower: float, upper: float) -> None:
-        """Widen the limits of a column."""
         limits = self.limits.get(name, (np.inf, -np.inf))
         # Of 0.0 and -0.0, which are equal, the one that comes first would be the limit.
         self.limits[name] = (min(limits[0], lower) + 0, max(limits[1], upper) + 0)
 
     def widen(self, cell_box: Ints) -> None:
         """Make room for points between lowest and highest cells, (2, 3), before they are added."""
-        self._box = _joined_box(self._box, cell_box)
-        self._squares.widen(cell_box[:, :2])
+        self._squares.widen(cell_box)
 
     def add_positions(self, cells: Sequence[Ints32]) -> None:
         """Add points by their cells along x and y, (n,) each; further axes are ignored.
@@ -104,8 +101,6 @@ class CloudCounts:
         self.by_material += other.by_material
         for name, (lower, upper) in other.limits.items():
             self._add_limits(name, lower, upper)
-        if other._box is not None:
-            self._box = _joined_box(self._box, other._box)
         self._squares.merge(other._squares)
 
     @property
@@ -116,9 +111,9 @@ class CloudCounts:
     @property
     def bounds(self) -> Floats:
         """Lowest and highest coordinates in the world, (2, 3), meters, or zeros without points."""
-        if self._box is None:
+        if self._squares.box is None:
             return np.zeros((2, 3))
-        return positions_of(self._box, self._precision_m, self._origin)
+        return positions_of(self._squares.box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
@@ -160,13 +155,6 @@ class CloudCounts:
         return Density(squares.mean / cell_m**2, squares.median / cell_m**2, cell_m)
 
 
-def _joined_box(box: Ints | None, other: Ints) -> Ints:
-    """Return the box, lowest and highest cells (2, n), around two boxes."""
-    if box is None:
-        return other
-    return np.stack([np.minimum(box[0], other[0]), np.maximum(box[1], other[1])])
-
-
 class GridCounts:
     """Numbers of points in a grid of squares, which are larger where points are far apart.
 
@@ -186,13 +174,16 @@ class GridCounts:
     def __init__(self, across: int) -> None:
         self._across = across
         self._level = 0
-        self.box: Ints | None = None  # lowest and highest cells, (2, 2); None without points
+        # Lowest and highest cells along x, y and perhaps further axes, (2, n); None without points.
+        self.box: Ints | None = None
         self._array = np.zeros((across, across), np.int64)
 
     def widen(self, cell_box: Ints) -> None:
-        """Make room for points between lowest and highest cells, (2, 2)."""
+        """Make room for points between lowest and highest cells, (2, n)."""
         earlier = self.box
-        cell_box = _joined_box(earlier, cell_box)
+        if earlier is not None:
+            lowest = np.minimum(earlier[0], cell_box[0])
+            cell_box = np.stack([lowest, np.maximum(earlier[1], cell_box[1])])
         while (np.diff(_numbers(cell_box, self._level), axis=0) >= self._across).any():
             if earlier is None:
                 self._level += 1
@@ -271,5 +262,5 @@ class GridCounts:
 
 
 def _numbers(cells: Ints, level: int) -> Ints:
-    """Return the numbers of parts of axes that contain cells."""
-    return (cells + SHIFT) >> level
+    """Return the numbers of the parts of x and y that contain cells, (…, n), as (…, 2)."""
+    return (cells[..., :2] + SHIFT) >> level

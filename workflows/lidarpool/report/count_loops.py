@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raybeam.compiled import compiled, stage
+from raybeam.compiled import compiled, noinline
 
 # Added to coordinates, in binary 101…0101. Multiples of no power of two are near it, so that no
 # grid has a boundary at zero, where walls often are: their points would be in two rows.
@@ -15,7 +15,7 @@ _SHIFT = np.int32(SHIFT)
 _TILE = 1024  # points at a time: their indices stay in the first cache
 
 
-@stage
+@noinline
 def _find_parts(cells, level, bits, indices):
     """Append the number of the part of an axis that contains each cell to the bits of an index."""
     mask = np.int32((1 << bits) - 1)

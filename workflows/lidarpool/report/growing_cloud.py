@@ -5,19 +5,19 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Ints
+from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.table import AXES
 from lidarsim.scene.scene import Scene
@@ -43,93 +43,59 @@ _BLOCK_ROWS = 1 << 16
 _LOOK_EVERY_S = 0.05
 
 
-class _Part(NamedTuple):
-    """A committed part of a job."""
-
-    first: int  # number of its first scan
-    stop: int  # number of the scan after its last scan
-    name: str  # name in the storage of the parts
-    point_count: int
-    cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
-
-
-class _RowsOfPart(NamedTuple):
-    """A part that is written to a file."""
-
-    name: str
-    row_count: int
-    cell_box: Ints  # lowest and highest cells of its points or of more points, (2, 3)
-    offset: int = 0  # of its first row in the file, bytes; 0 for the first part
-    is_flushed: bool = False  # True if the file is flushed after the part
-
-
 class _PartWriter:
-    """Writes parts to a file, one at a time, in memory that is used again, and counts their points.
+    """Writes parts to a file, one at a time, and counts their points. Each thread has its own."""
 
-    Each thread has its own.
-
-    Parameters
-    ----------
-    file
-        The file.
-    points
-        Points of the survey.
-    counts
-        Counts of the points.
-    """
-
-    def __init__(self, file: PlyAppender, points: StoredCloud, counts: CloudCounts) -> None:
-        self.counts = counts
+    def __init__(self, file: PlyAppender, points: StoredCloud, scene: Scene) -> None:
+        self.counts = CloudCounts(
+            points.table,
+            len(scene.object_names),
+            len(scene.material_names),
+            points.precision_m,
+            points.origin,
+        )
         self._file = file
         self._points = points
-        self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)
+        self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)  # used again for each part
         self._row_encoder: PlyRowEncoder | None = None  # once the file has its layout
 
-    def write(self, part: _RowsOfPart) -> None:
-        """Write the points of a part block by block; the first part of a file gives it its layout.
+    def write(self, name: str, row_count: int, cell_box: Ints, offset: int = 0) -> None:
+        """Write the points of a part block by block.
 
-        LidarError if the part cannot be used, OSError if the disk is full.
+        `offset` of the first row in the file is 0 for the first part, which gives the file its
+        layout. LidarError if the part cannot be used, OSError if the disk is full.
         """
-        self.counts.widen(part.cell_box)
-        offset = part.offset
-        for columns in read_blocks(self._points.storage, part.name, part.row_count, self._memory):
+        is_first = not offset
+        self.counts.widen(cell_box)
+        for columns in read_blocks(self._points.storage, name, row_count, self._memory):
             self.counts.add(columns)
             self.counts.add_positions([columns[axis.name] for axis in AXES])
+            rows_in_block = len(columns[AXES[0].name])
             if not self._file.has_layout:
-                self._write_first(columns)
+                positions = self._points.positions_of(columns)
+                values = ((column.name, columns[column.name]) for column in self._points.table)
+                self._file.append(rows_in_block, chain(positions, values))
                 continue
-            rows = self._rows_of(columns)
-            if not part.offset:  # the number of first points is known by now
-                offset = self._file.extend(len(columns[AXES[0].name]))
+            if self._row_encoder is None:
+                self._row_encoder = PlyRowEncoder(
+                    self._file.row,
+                    self._points.table,
+                    self._memory,
+                    self._points.precision_m,
+                    self._points.origin,
+                )
+            rows = self._row_encoder.encode(columns)
+            if is_first:  # the number of first points is known by now
+                offset = self._file.extend(rows_in_block)
             self._file.write_rows(rows, offset)
             offset += len(rows)
-        if part.is_flushed:
-            self._file.flush()
-
-    def _write_first(self, columns: Mapping[str, AnyArray]) -> None:
-        """Write the first points of a file."""
-        positions = self._points.positions_of(columns)
-        values = ((column.name, columns[column.name]) for column in self._points.table)
-        self._file.append(len(columns[AXES[0].name]), chain(positions, values))
-
-    def _rows_of(self, columns: Mapping[str, AnyArray]) -> memoryview:
-        """Return the rows of a block."""
-        if self._row_encoder is None:
-            self._row_encoder = PlyRowEncoder(
-                self._file.row,
-                self._points.table,
-                self._memory,
-                self._points.precision_m,
-                self._points.origin,
-            )
-        return self._row_encoder.encode(columns)
 
 
 class CloudWriter:
     """Writes the points of parts to a PLY file, and counts the points in the same pass.
 
     Parts are appended in scan order, so that the offset of a part is known. Several threads write
-    them, a part each. An error of a thread is raised by the next call.
+    them, a part each. An error of a thread is raised by a later call.
 
     Parameters
     ----------
@@ -157,18 +123,12 @@ class CloudWriter:
         self.file = PlyAppender(path, points.table, position_type, sweeps, expected_count)
         self._flushed_bytes = 0  # size of the file at the last flush
         self.threads = min(processor_count(), _MAX_THREADS)
+        self._part_writers = [_PartWriter(self.file, points, scene) for _ in range(self.threads)]
         self._idle = SimpleQueue[_PartWriter]()
-        for _ in range(self.threads):
-            counts = CloudCounts(
-                points.table,
-                len(scene.object_names),
-                len(scene.material_names),
-                points.precision_m,
-                points.origin,
-            )
-            self._idle.put(_PartWriter(self.file, points, counts))
+        for part_writer in self._part_writers:
+            self._idle.put(part_writer)
         self._executor = ThreadPoolExecutor(self.threads, "write cloud")
-        self._errors: list[BaseException] = []
+        self._being_written = deque[Future[None]]()  # one for each part, at most one per thread
 
     def __enter__(self) -> CloudWriter:
         return self
@@ -195,65 +155,48 @@ class CloudWriter:
         OSError
             If the disk is full, or the file cannot be written for another reason.
         """
-        part_writer = self._idle.get()  # bounds the parts in memory
-        part = _RowsOfPart(name, row_count, cell_box)
-        if self.file.has_layout and not self._errors:
-            part = part._replace(
-                offset=self.file.extend(row_count), is_flushed=self._is_flush_due()
-            )
-            self._executor.submit(self._write, part_writer, part)
-        else:
-            self._write(part_writer, part)
-        self._raise_error()
-
-    def _is_flush_due(self) -> bool:
-        """Return True once for each `_FLUSH_BYTES` of the file."""
-        is_due = self.file.size - self._flushed_bytes > _FLUSH_BYTES
-        if is_due:
+        if not self.file.has_layout:
+            self._write(name, row_count, cell_box)
+            return
+        if len(self._being_written) == self.threads:  # bounds the parts in memory
+            self._being_written.popleft().result()
+        offset = self.file.extend(row_count)
+        is_flushed = self.file.size - self._flushed_bytes > _FLUSH_BYTES
+        if is_flushed:
             self._flushed_bytes = self.file.size
-        return is_due
+        self._being_written.append(
+            self._executor.submit(self._write, name, row_count, cell_box, offset, is_flushed)
+        )
 
-    def _write(self, part_writer: _PartWriter, part: _RowsOfPart) -> None:
-        """Write a part, unless there was an error, and note an error."""
+    def _write(
+        self, name: str, row_count: int, cell_box: Ints, offset: int = 0, is_flushed: bool = False
+    ) -> None:
+        part_writer = self._idle.get()
         try:
-            if not self._errors:
-                part_writer.write(part)
-        except BaseException as error:  # raised by the thread that appends parts
-            self._errors.append(error)
+            part_writer.write(name, row_count, cell_box, offset)
+            if is_flushed:
+                self.file.flush()
         finally:
             self._idle.put(part_writer)
 
-    def _raise_error(self) -> None:
-        """Raise the first error of a thread."""
-        if self._errors:
-            raise self._errors[0]
-
-    def wait(self) -> list[_PartWriter]:
-        """Wait until no thread writes, and return the writers of all threads.
-
-        Raises the errors of `append`.
-        """
-        part_writers = [self._idle.get() for _ in range(self.threads)]
-        for part_writer in part_writers:
-            self._idle.put(part_writer)
-        self._raise_error()
-        return part_writers
+    def wait(self) -> None:
+        """Wait until no thread writes, or raise the errors of `append`."""
+        while self._being_written:
+            self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
-        """Complete the file, and return the counts of its points.
-
-        Raises the errors of `append`.
-        """
-        first, *others = self.wait()
+        """Complete the file and return the counts of its points, or raise errors of `append`."""
+        self.wait()
         self.file.finish()
-        for part_writer in others:
-            first.counts.merge(part_writer.counts)
-        if first.counts.point_count != self.file.count:
+        counts, *others = (part_writer.counts for part_writer in self._part_writers)
+        for other in others:
+            counts.merge(other)
+        if counts.point_count != self.file.count:
             raise LidarError(
-                f"only {first.counts.point_count:,} of {self.file.count:,} points belong to an "
+                f"only {counts.point_count:,} of {self.file.count:,} points belong to an "
                 "object of the scene or to no object, so the parts belong to a different scene."
             )
-        return first.counts
+        return counts
 
     def close(self) -> None:
         """Wait until no thread writes, and close the file."""
@@ -303,41 +246,37 @@ class GrowingCloud:
         self._sweeps = Sweeps.from_survey(job.job.survey, job.job.scene)
         # With the cells of appended parts; only their bounds are used.
         self._points = replace(job.points(), cells=None)
-        self._next_scan = job.scans.start  # first scan of the next part
-        self._waiting: dict[int, _Part] = {}  # {first scan: part}, for earlier parts
-        self._appended: list[_Part] = []
+        self._next_scan = job.scans.start  # first scan of the next part to be appended
+        self._appended: list[Receipt] = []
         self._appended_rows = 0
+        self._appended_bytes = 0  # of their files
         self._writer: CloudWriter | None = None
         self._is_complete = False  # True once all parts that were added are appended
         self._is_stopped = False
-        self._committed_scans = 0
-        self._committed_bytes = 0
-        self._queue = SimpleQueue[list[_Part] | None]()  # None ends the thread
+        self._queue = SimpleQueue[Receipt | None]()  # parts in scan order; None ends the thread
         self._thread = Thread(target=self._run, name="grow cloud", daemon=True)
 
     def __enter__(self) -> GrowingCloud:
-        self.add(self._job.parts.ordered)
+        self._thread.start()
+        self.add()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the thread, and remove the file unless it is finished."""
         self._is_stopped = True
         self._queue.put(None)
-        if self._thread.ident is not None:
-            self._thread.join()
+        self._thread.join()
         self._discard()
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
-        """Append committed parts once all earlier scans are appended, and return at once."""
-        if not receipts:
-            return
-        self._committed_scans += sum(part.stop - part.first for part in receipts)
-        self._committed_bytes += sum(part.size for part in receipts)
-        self._queue.put(
-            [_Part(p.first, p.stop, p.name, p.point_count, p.cell_box) for p in receipts]
-        )
-        if self._thread.ident is None:
-            self._thread.start()
+    def add(self, _: Sequence[Receipt] = ()) -> None:
+        """Append the committed parts that are next in scan order, and return at once."""
+        parts = self._job.parts
+        with suppress(KeyError):  # the next scan is not committed yet
+            while True:
+                part = parts.part_of(self._next_scan)
+                self._next_scan = part.stop
+                if part.point_count:
+                    self._queue.put(part)
 
     def finish(self, path: Path, points: StoredCloud) -> CloudCounts | None:
         """Move the file to a path once it has all `points`, and return their counts.
@@ -372,9 +311,8 @@ class GrowingCloud:
         try:
             # Errors are met again, and shown, when `write_cloud` writes all points.
             with suppress(LidarError, OSError):
-                while (parts := self._queue.get()) is not None:
-                    self._waiting |= {part.first: part for part in parts}
-                    self._append_waiting()
+                while (part := self._queue.get()) is not None and not self._is_stopped:
+                    self._append(part)
                 if self._writer is not None:
                     self._writer.wait()  # errors of its threads are errors of the file, too
                 self._is_complete = True
@@ -382,18 +320,9 @@ class GrowingCloud:
             if not self._is_complete:
                 self._discard()
 
-    def _append_waiting(self) -> None:
-        """Append the parts that are next in scan order."""
-        while not self._is_stopped and (part := self._waiting.pop(self._next_scan, None)):
-            self._next_scan = part.stop
-            if part.point_count:
-                self._append(part)
-
-    def _append(self, part: _Part) -> None:
-        """Append a part with points.
-
-        If the positions need another type, the file is begun anew.
-        """
+    def _append(self, part: Receipt) -> None:
+        """Append a part with points, or begin anew if the positions need another type."""
+        self._appended.append(part)
         self._check_room(part)
         cells = np.array(part.cell_box, np.int64).reshape(2, 3)
         if self._points.cells is not None:
@@ -401,35 +330,26 @@ class GrowingCloud:
             cells = np.stack([np.minimum(cells[0], earlier[0]), np.maximum(cells[1], earlier[1])])
         self._points = replace(self._points, cells=cells)
         position_type = position_dtype(self._points.bounds, self._points.precision_m)
-        self._appended.append(part)
         parts = [part]
         if self._writer is None or self._writer.file.position_type != position_type:
             self._discard()
             self._appended_rows = 0
             parts = self._appended
-            self._writer = self._new_writer(position_type)
+            rows = sum(part.point_count for part in parts)
+            expected_count = rows * len(self._job.scans) // (part.stop - self._job.scans.start)
+            self._writer = CloudWriter(
+                self._path,
+                self._points,
+                self._sweeps,
+                self._job.job.scene,
+                position_type,
+                expected_count,
+            )
         for appended in parts:
             self._writer.append(appended.name, appended.point_count, cells)
             self._appended_rows += appended.point_count
 
-    def _new_writer(self, position_type: np.dtype[np.floating]) -> CloudWriter:
-        """Return the writer of a new file.
-
-        Its number of points is estimated from the parts.
-        """
-        rows = sum(part.point_count for part in self._appended)
-        scans = self._next_scan - self._job.scans.start
-        expected_count = rows * len(self._job.scans) // scans
-        return CloudWriter(
-            self._path,
-            self._points,
-            self._sweeps,
-            self._job.job.scene,
-            position_type,
-            expected_count,
-        )
-
-    def _check_room(self, part: _Part) -> None:
+    def _check_room(self, part: Receipt) -> None:
         """Raise OSError unless the disk has room for a part here and for the parts to come.
 
         Else the disk would be full before all scans are stored.
@@ -437,14 +357,14 @@ class GrowingCloud:
         rows_bytes = 0
         if self._writer is not None:  # as many parts as there are threads may not be written yet
             rows_bytes = part.point_count * self._writer.file.row.itemsize * self._writer.threads
-        scans_left = len(self._job.scans) - self._committed_scans
-        bytes_left = self._committed_bytes * scans_left // self._committed_scans
+        self._appended_bytes += part.size
+        appended_scans = part.stop - self._job.scans.start
+        bytes_left = self._appended_bytes * self._job.committed.missing_count // appended_scans
         free_bytes = shutil.disk_usage(self._path.parent).free
         if free_bytes < rows_bytes + bytes_left:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
     def _discard(self) -> None:
-        """Remove the file."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None

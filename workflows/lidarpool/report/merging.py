@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import heapq
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
-from itertools import groupby
-from operator import attrgetter
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from lidarsim.base.checks import check_list, check_type
 from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import listed
 
 from ..base.field_words import describe_changes
@@ -55,6 +52,7 @@ from .campaign_output import (
 from .output import SurveyOutput
 
 MAX_NAMED = 20  # shards or files in a message
+_BATCH_ROWS = 1000  # rows of jobs in a transaction
 _MISSING = "these shards are missing: "  # begins a note
 
 
@@ -62,32 +60,29 @@ _MISSING = "these shards are missing: "  # begins a note
 class _ShardFolder:
     """Shards of a run in a folder.
 
-    `record` is the content of CAMPAIGN_FILE of a data set.
-
-    `run_size` is the number of all jobs or scans of the run; `told` are the notes of its report;
-    points and trials are of a survey.
+    `record` is the content of CAMPAIGN_FILE of a data set, and `run_size` the number of all jobs or
+    scans of the run. `notes` are the notes of its report. Only surveys have parts and trials.
     """
 
     storage: Storage
     record: Mapping[str, Any]
     shards: Sequence[Shard]
     run_size: int
-    told: Sequence[str]
-    points: Sequence[Receipt] = ()
+    notes: Sequence[str]
+    parts: Sequence[Receipt] = ()
     trials: Sequence[Trial] = ()
 
-    @property
-    def notes(self) -> list[str]:
-        """Remarks for the user, without that on missing shards."""
-        return [
-            note
-            for note in self.told
-            if not note.startswith(_MISSING) and NO_POINTS not in note  # notes of an earlier merge
-        ]
-
     def numbers(self, shard: Shard) -> range:
-        """Return the numbers of the jobs or scans of a shard."""
         return (shard.jobs if "campaign" in self.record else shard.scans)(self.run_size)
+
+    @cached_property
+    def ranges(self) -> Sequence[range]:
+        """Numbers of the jobs or scans of each shard."""
+        return [self.numbers(shard) for shard in self.shards]
+
+    def has(self, number: int) -> bool:
+        """Return True if a job or scan is in one of the shards."""
+        return any(number in numbers for numbers in self.ranges)
 
     @property
     def common(self) -> dict[str, Any]:
@@ -95,14 +90,13 @@ class _ShardFolder:
         record = self.record
         properties = {"kind": [*record["identity"]]} | record["identity"]
         properties |= {f"the file {name}": digest for name, digest in record["files"]}
-        if record["casting"]:  # empty if the shard has cast no rays
-            properties |= {
-                f"the {name} of the workers": value for name, value in record["casting"].items()
-            }
+        # No software is recorded if the shard has cast no rays.
+        properties |= {
+            f"the {name} of the workers": value for name, value in record["casting"].items()
+        }
         return properties | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
-@checked
 def merge(
     shards: Sequence[str | Path | Storage],
     out: str | Path | Storage,
@@ -141,25 +135,26 @@ def merge(
         If shards are missing, damaged, passed twice or unfinished, or come from different runs or
         software versions. The message names the shards.
     """
+    check_list("shards", shards)
+    check_type("out", out, str, Path, Storage)
     target = output_destination(str(out))
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
     _check_apart(Storage.at(target), shard_storages)
+    is_survey_shard = False
+    with suppress(LidarError):  # the result would have the place of the shard's points
+        is_survey_shard = "made_of" in _read_folder(Storage.at(target)).record
+    if is_survey_shard:
+        raise LidarError(
+            f"{target} contains a shard of a survey. Specify another folder with `--out`."
+        )
     shard_folders = list[_ShardFolder]()
     mistakes = Mistakes()
     for storage in shard_storages.values():
         with mistakes.noted():
             shard_folders.append(_read_folder(storage))
-    mistakes.lines += (
-        []
-        if shard_storages
-        else ["There are no shards to merge. Specify the folders of the shards."]
-    )
-    with suppress(LidarError):  # the result would have the place of the shard's points
-        if "made_of" in _read_folder(Storage.at(target)).record:
-            message = f"{target} contains a shard of a survey. Specify another folder with `--out`."
-            shard_folders = []
-            mistakes.lines = [message]
+    if not shard_storages:
+        mistakes.lines = ["There are no shards to merge. Specify the folders of the shards."]
     if not (partial and shard_folders):
         mistakes.tell()
     if "made_of" in shard_folders[0].record:
@@ -177,7 +172,7 @@ def _real_path(storage: Storage) -> str:
 
 
 def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
-    """Check that `target` is apart from all places of shards, {as of `_real`: place}."""
+    """Check that `target` is apart from all places of shards, {`_real_path`: place}."""
     path = _real_path(target)
     for real, storage in shard_storages.items():
         relation = ""
@@ -195,10 +190,7 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
 
 
 def _read_folder(storage: Storage) -> _ShardFolder:
-    """Read a finished shard, or data set of several shards.
-
-    Raises LidarError if damaged or unfinished.
-    """
+    """Read a finished shard or a data set of several shards, or raise LidarError."""
     check_exists(storage, "specify the output folder of `lidarpool run --shard`")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
@@ -215,16 +207,14 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
-    """Read a data set of shards.
-
-    A complete data set has the `shard_count` shards.
-    """
+    """Read a data set of shards, which are `shard_count` shards if it is complete."""
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
         shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
-    told = read_notes(storage) if LAST_FILE in storage.sizes() else ()
-    return _ShardFolder(storage, record, shards, record["campaign"]["count"], told)
+    notes = read_notes(storage) if LAST_FILE in storage.sizes() else []
+    notes = [note for note in notes if not note.startswith(_MISSING) and NO_POINTS not in note]
+    return _ShardFolder(storage, record, shards, record["campaign"]["count"], notes)
 
 
 def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
@@ -241,25 +231,16 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
             with closing(RunDatabase(path, durable=False)) as db:
                 meta = {"casting": "{}", "fields": "{}"} | db.meta
                 texts = ("identity", "fields", "casting", "made_of")
-                told = json.loads(meta["notes"])
                 record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
                 shard = Shard.parse(record["identity"].pop("shard"))
                 scan_count = record["made_of"]["scans"]
-                scans = shard.scans(scan_count)
-                job = CommittedResults(0, scans)
+                job = CommittedResults(0, shard.scans(scan_count))
                 db.read(job)
                 if job.missing_count:
                     raise LookupError("scans are missing")
+                notes = json.loads(meta["notes"])
                 parts = job.parts.ordered
-                return _ShardFolder(
-                    storage=storage,
-                    record=record,
-                    shards=[shard],
-                    run_size=scan_count,
-                    told=told,
-                    points=parts,
-                    trials=job.trials,
-                )
+                return _ShardFolder(storage, record, [shard], scan_count, notes, parts, job.trials)
         except DamagedError as error:
             raise LidarError(
                 f"{run.path(FILE)} is damaged. Run its shard again with `--resume`, which "
@@ -267,82 +248,66 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
             ) from error
 
 
-def _check(
-    shard_folders: Sequence[_ShardFolder], partial: bool, earlier: _ShardFolder | None = None
-) -> list[str]:
-    """Check that shard folders are of the same run and, unless `partial`, complete.
+def _check_same_run(
+    shard_folders: Sequence[_ShardFolder], earlier: _ShardFolder | None = None
+) -> None:
+    """Raise LidarError, which names wrong folders, unless folders have shards of the same run.
 
-    Returns all notes.
-
-    Shards of the `earlier` data set may be in further folders, too. LidarError names wrong folders.
+    Shards of the `earlier` data set may be in further folders, too.
     """
     mistakes = Mistakes()
     expected = software()
     first = "the installed software"
     first_fields: Mapping[str, str] = {}
     folders_by_shard = dict[int, _ShardFolder]()
-    for shard_folder in sorted(
-        shard_folders, key=lambda shard_folder: not shard_folder.record["casting"]
-    ):
-        common = shard_folder.common
-        if (
-            shard_folder.shards == [ALL]
-            and shard_folder is not earlier
-            and len(shard_folders) > 1 + bool(earlier)
-        ):
+    for folder in sorted(shard_folders, key=lambda folder: not folder.record["casting"]):
+        is_alone = len(shard_folders) == 1 + bool(earlier)
+        if folder.shards == [ALL] and folder is not earlier and not is_alone:
             mistakes.lines.append(
-                f"{shard_folder.storage} is a complete run. Specify it alone, or omit it."
+                f"{folder.storage} is a complete run. Specify it alone, or omit it."
             )
             continue
-        if differs := [
-            name for name in expected if common.get(name, expected[name]) != expected[name]
-        ]:
-            changed = (
-                describe_changes(first_fields, shard_folder.record["fields"])
-                if first_fields
-                else ""
-            )
-            message = f"{shard_folder.storage} and {first} differ in {differs[0]}"
-            message += f" ({changed})" * bool(changed)
+        common = folder.common
+        fields = folder.record["fields"]
+        differs = [name for name in expected if common.get(name, expected[name]) != expected[name]]
+        if differs:
+            changed = describe_changes(first_fields, fields) if first_fields else ""
             mistakes.lines.append(
-                f"{message}. Merge only shards of a single run that used the same software."
+                f"{folder.storage} and {first} differ in "
+                f"{differs[0]}{f' ({changed})' * bool(changed)}. Merge only shards of a single run "
+                "that used the same software."
             )
         elif len(common) > len(expected):
             expected = common
-            first = str(shard_folder.storage)
-            first_fields = shard_folder.record["fields"]
-        if shard_folder is earlier:
-            continue
-        for shard in shard_folder.shards:
-            if (
-                first_folder := folders_by_shard.setdefault(shard.number, shard_folder)
-            ) is not shard_folder:
-                twice = (
-                    f"Shard {shard} is in both {first_folder.storage} and {shard_folder.storage}."
+            first = str(folder.storage)
+            first_fields = fields
+        for shard in folder.shards if folder is not earlier else ():
+            other = folders_by_shard.setdefault(shard.number, folder)
+            if other is not folder:
+                mistakes.lines.append(
+                    f"Shard {shard} is in both {other.storage} and {folder.storage}. Specify only "
+                    "one of these folders."
                 )
-                mistakes.lines.append(f"{twice} Specify only one of these folders.")
     mistakes.tell()
-    notes = [*dict.fromkeys(note for shard_folder in shard_folders for note in shard_folder.notes)]
+
+
+def _notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
+    """Return the notes of all folders and on missing shards, which need `partial`."""
+    notes = [*dict.fromkeys(note for folder in shard_folders for note in folder.notes)]
     if not (missing := _missing(shard_folders)):
         return notes
     message = f"{_MISSING}{listed([*map(str, missing)], MAX_NAMED)}"
-    if not partial:
-        grown = any(
-            shard in shard_folder.shards for shard_folder in shard_folders for shard in missing
-        )
-        advice = (
-            "Run them again with the larger count and `--resume`"
-            if grown
-            else "Specify their folders as well"
-        )
-        raise LidarError(
-            f"{as_sentence(message)} {advice}, or merge only the existing shards with `--partial`."
-        )
-    return [*notes, message]
+    if partial:
+        return [*notes, message]
+    advice = "Specify their folders as well"
+    if any(shard in folder.shards for folder in shard_folders for shard in missing):
+        advice = "Run them again with the larger count and `--resume`"
+    raise LidarError(
+        f"{as_sentence(message)} {advice}, or merge only the existing shards with `--partial`."
+    )
 
 
 def _missing_or_damaged(names: Sequence[str]) -> str:
-    """Return the message about files of shards that cannot be merged."""
     return (
         f"These files are missing or damaged: {listed(names, MAX_NAMED)}. Run their shards "
         "again with `--resume`, or campaigns with `--verify`, and merge again."
@@ -352,60 +317,60 @@ def _missing_or_damaged(names: Sequence[str]) -> str:
 def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
     """List the shards that are missing, or lack jobs that the campaign has gained."""
     shard_count = shard_folders[-1].shards[0].total
-    shard_folders = sorted(shard_folders, key=lambda shard_folder: shard_folder.run_size)
+    folders = sorted(shard_folders, key=lambda folder: folder.run_size)
     have = {
-        shard.number: len(shard_folder.numbers(shard))
-        for shard_folder in shard_folders
-        for shard in shard_folder.shards
+        shard.number: len(folder.numbers(shard)) for folder in folders for shard in folder.shards
     }
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, shard_count) for number in range(1, shard_count + 1))
-    return [
-        shard
-        for shard in every
-        if have.get(shard.number, 0) < len(shard_folders[-1].numbers(shard))
-    ]
+    return [shard for shard in every if have.get(shard.number, 0) < len(folders[-1].numbers(shard))]
 
 
 def _merge_dataset(
     shard_folders: Sequence[_ShardFolder], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
-    """Take the jobs of all folders into a data set, and write its shared files."""
     begun = CAMPAIGN_FILE in target.sizes()
     dataset_files(target, begun=begun)
     earlier = _read_dataset(target, shard_count=shard_folders[0].shards[0].total) if begun else None
     all_folders = [earlier, *shard_folders] if earlier else shard_folders
-    notes = _check(all_folders, partial, earlier)
+    _check_same_run(all_folders, earlier)
+    notes = _notes(all_folders, partial=partial)
     record = _merged_record(all_folders, shard_folders[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
     if earlier is None:  # the files belong to the campaign now
         write_record(target, record | {"shards": []})
-    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        files = [_RowFile(Path(folder, str(index))) for index in range(len(all_folders))]
+    with (
+        tempfile.TemporaryDirectory(prefix="lidarpool-") as folder,
+        closing(RunDatabase(Path(folder, FILE), durable=False)) as db,
+    ):
+
+        def rows() -> Iterator[JobRow]:
+            return map(JobRow.from_json, db.job_rows())
+
         damaged = list[str]()
         with explained(f"{target} cannot be merged"):
-            for shard_folder, file in zip(shard_folders, files[-len(shard_folders) :], strict=True):
-                file.write(
-                    shard_folder,
-                    _take_jobs(shard_folder, dataset, damaged),
-                    _seconds(shard_folder, notes),
-                )
+            seconds = dict[int, float]()
             if earlier:  # after a killed merge without casting times: no note
-                files[0].write(earlier, _rows_of(earlier, dataset), known_seconds(target))
-        if not damaged:
-            damaged += _lacking(all_folders, _merged(files))
+                seconds |= known_seconds(target)
+                earlier_rows = (row for row, _ in dataset.rows() if earlier.has(row.number))
+                _add_rows(db, earlier, earlier_rows, seconds)
+            for shard_folder in shard_folders:
+                taken = _take_jobs(shard_folder, dataset, damaged)
+                seconds |= _seconds(shard_folder, notes)
+                _add_rows(db, shard_folder, taken, seconds)
+        damaged = damaged or _lacking(all_folders, db)
         if damaged:
             raise LidarError(_missing_or_damaged(damaged))
         lacking = _missing(all_folders)
         shards = {shard for shard_folder in all_folders for shard in shard_folder.shards}
         record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
-        if empty := [row for row in _merged(files) if row.done and not row.points]:
+        if empty := [row for row in rows() if row.done and not row.points]:
             notes.append(empty_jobs_warning(empty, ""))
             screen.warn(notes[-1])
-        fields = {"sensors": record["sensors"], "notes": tuple(notes)}
-        run = CampaignRun.from_rows(_merged(files), 0.0, 0, **fields)
-        report = write_shared(dataset, record, run, lambda: _merged(files))[1]
+        sensors = record["sensors"]
+        run = CampaignRun.from_rows(rows(), 0.0, 0, sensors=sensors, notes=tuple(notes))
+        report = write_shared(dataset, record, run, rows)[1]
     if earlier:  # a run with failed jobs would continue with its knowledge of these jobs
         remove_run(target.below(RUN_FOLDER))
     return report
@@ -417,66 +382,54 @@ def _merged_record(shard_folders: Sequence[_ShardFolder], fallback: _ShardFolder
     The software is the software of a shard folder with cast rays, else of the fallback.
     """
     sensors = dict[str, str]()
-    for shard_folder in shard_folders:
-        sensors = with_sensors(sensors, shard_folder.record["sensors"].items())
-    cast = next(
-        (shard_folder for shard_folder in shard_folders if shard_folder.record["casting"]), fallback
-    )
-    campaign = max(shard_folders, key=lambda shard_folder: shard_folder.run_size).record["campaign"]
+    for folder in shard_folders:
+        sensors = with_sensors(sensors, folder.record["sensors"].items())
+    cast = next((folder for folder in shard_folders if folder.record["casting"]), fallback)
+    campaign = max(shard_folders, key=lambda folder: folder.run_size).record["campaign"]
     return {**cast.record, "sensors": sensors, "campaign": campaign}
 
 
-class _RowFile:
-    """Rows of the jobs of a shard folder in a temporary file: manifests are read only once."""
+def _add_rows(
+    db: RunDatabase,
+    shard_folder: _ShardFolder,
+    rows: Iterable[JobRow],
+    seconds: Mapping[int, float],
+) -> None:
+    """Add the rows of a shard folder, with casting times {number: seconds}, to those of all jobs.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._offsets: dict[int, int] = {}  # {number of a job: first byte of its row}
-
-    def write(
-        self, shard_folder: _ShardFolder, rows: Iterator[JobRow], seconds: Mapping[int, float]
-    ) -> None:
-        """Write rows with their casting times, {number: seconds}.
-
-        LidarError if the shard folder cannot have such a job, or two manifests are of one job.
-        """
-        ranges = [shard_folder.numbers(shard) for shard in shard_folder.shards]
-        with self._path.open("wb") as file:
-            for row in rows:
-                path = shard_folder.storage.path(manifest_file(row.name))
-                number = row.number
-                if not any(number in numbers for numbers in ranges):
-                    raise LidarError(
-                        f"{path} belongs to job {number}, which is not in shard "
-                        f"{listed([*map(str, shard_folder.shards)])} of "
-                        f"{shard_folder.run_size:,} jobs. Move the file elsewhere, and merge "
-                        "again."
-                    )
-                if number in self._offsets:
-                    raise LidarError(
-                        f"{path} belongs to job {number}, which has another manifest. Move "
-                        "one of the manifests elsewhere, and merge again."
-                    )
-                row = replace(row, seconds=seconds.get(number))
-                self._offsets[number] = file.tell()
-                file.write(json.dumps(asdict(row)).encode() + b"\n")
-
-    def rows(self) -> Iterator[JobRow]:
-        """Yield the rows in the order of numbers."""
-        if self._offsets:
-            with self._path.open("rb") as file:
-                for _, offset in sorted(self._offsets.items()):
-                    file.seek(offset)
-                    yield JobRow.from_json(json.loads(file.readline()))
+    A job that has failed there stays as it is. LidarError if the shard folder cannot have such a
+    job, or two manifests are of one job.
+    """
+    added = set[int]()
+    batch = list[tuple[int, bool, dict[str, Any]]]()  # a transaction for each row would be slow
+    for row in rows:
+        number = row.number
+        path = shard_folder.storage.path(manifest_file(row.name))
+        if not shard_folder.has(number):
+            raise LidarError(
+                f"{path} belongs to job {number}, which is not in shard "
+                f"{listed([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} jobs. "
+                "Move the file elsewhere, and merge again."
+            )
+        if number in added:
+            raise LidarError(
+                f"{path} belongs to job {number}, which has another manifest. Move one of the "
+                "manifests elsewhere, and merge again."
+            )
+        added.add(number)
+        if row.done or not db.ended(number):
+            row = replace(row, seconds=seconds.get(number))
+            batch.append((number, bool(row.error), asdict(row)))
+        if len(batch) == _BATCH_ROWS:
+            db.end_jobs(batch)
+            batch.clear()
+    db.end_jobs(batch)
 
 
 def _take_jobs(
     shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
 ) -> Iterator[JobRow]:
-    """Take the jobs of a shard folder into a data set.
-
-    Yields their rows, and adds files to `damaged`.
-    """
+    """Copy the jobs of a shard folder, yield their rows, and add files to `damaged`."""
     for _, row, wrong in dataset.take(
         shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
     ):
@@ -485,19 +438,8 @@ def _take_jobs(
             yield row
 
 
-def _rows_of(earlier: _ShardFolder, dataset: DataSet) -> Iterator[JobRow]:
-    """Yield the rows of the shards that a data set had before the merge."""
-    ranges = [earlier.numbers(shard) for shard in earlier.shards]
-    for row, _ in dataset.rows():
-        if any(row.number in numbers for numbers in ranges):
-            yield row
-
-
 def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
-    """Return the casting times of the jobs of a shard folder, {number: seconds}.
-
-    A note says if they are lost.
-    """
+    """Return the casting times of jobs, {number: seconds}, or add a note that they are lost."""
     if not shard_folder.shards:
         return {}
     try:
@@ -507,27 +449,15 @@ def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float
     return {}
 
 
-def _lacking(shard_folders: Sequence[_ShardFolder], rows: Iterator[JobRow]) -> list[str]:
+def _lacking(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
     """List the jobs of shard folders that have no row, as a folder and a number."""
-    numbers = {row.number for row in rows}
     return [
-        f"the manifest of job {number} in {shard_folder.storage}"
-        for shard_folder in shard_folders
-        for shard in shard_folder.shards
-        for number in shard_folder.numbers(shard)
-        if number not in numbers
+        f"the manifest of job {number} in {folder.storage}"
+        for folder in shard_folders
+        for numbers in folder.ranges
+        for number in numbers
+        if not db.ended(number)
     ]
-
-
-def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number.
-
-    Of a job in several folders, a row that is done is taken.
-    """
-    number = attrgetter("number")
-    tables = [file.rows() for file in files]
-    for _, rows in groupby(heapq.merge(*tables, key=number), number):
-        yield max(rows, key=lambda row: (row.done, row.seconds or 0.0))
 
 
 def _merge_survey(
@@ -538,7 +468,8 @@ def _merge_survey(
     screen: Screen,
 ) -> dict[str, Any]:
     """Build the survey again, and write its result from the points of all folders."""
-    notes = _check(shard_folders, partial)
+    _check_same_run(shard_folders)
+    notes = _notes(shard_folders, partial=partial)
     record = shard_folders[0].record
     made_of = record["made_of"]
     path = Path(scenario or made_of["path"])
@@ -561,23 +492,20 @@ def _merge_survey(
         )
     output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], prepared.scenario)
     options = RunOptions(folder=Storage.at(out).below(RUN_FOLDER), resume=True)
-    with output.lock():
+    with output.lock() as folder:
         if not options.continues_run:
             output.check_existing(jobs)
         with open_store(jobs, options, screen) as store:
             _take_points(store, shard_folders, notes)
             load_open3d()
             result = Committed(store).result(screen)
-            return output.publish(result, store, screen)[1]
+            return output.publish(folder, result, store, screen)[1]
 
 
 def _take_points(
     store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
 ) -> None:
-    """Take the points of all folders into the store of a run.
-
-    Raises LidarError that names damaged files.
-    """
+    """Take the points of all folders into a store, or raise LidarError for damaged files."""
     damaged = list[str]()
     only = store.only_job
     mark = store.db.meta["mark"]
@@ -592,10 +520,7 @@ def _take_points(
         ):
             store.storage.take(source, part_file.name, name)
             receipt = only.receipt(name)
-            if (
-                receipt is not None
-                and replace(receipt, name=part_file.name, summaries=b"") == part_file
-            ):
+            if receipt and replace(receipt, name=part_file.name, summaries=b"") == part_file:
                 return receipt
             store.storage.remove([name])
         return None
@@ -608,7 +533,7 @@ def _take_points(
         source = parts_of(shard_folder.storage.below(RUN_FOLDER), shard_folder.record["parts"])
         missing = (
             receipt
-            for receipt in shard_folder.points
+            for receipt in shard_folder.parts
             if only.parts.missing(receipt.first, receipt.stop)
         )
         for expected, receipt in read_ahead(partial(take, source), missing):

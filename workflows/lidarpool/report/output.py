@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
 from ..run.cluster.cluster import Cluster, ClusterConnection
-from ..run.job_source import Identified, OneJob
+from ..run.job_source import OneJob
 from ..run.listener import Listener
 from ..run.options import RunOptions
 from ..run.progress import Screen
@@ -68,24 +68,26 @@ def run_survey(
     `cloud.ply` grows while the survey is cast. `compare` returns a note on the result, or raises an
     error before the result is written.
     """
-    with output.lock():
+    with output.lock() as folder:
         if not options.continues_run:
             output.check_existing(jobs, overwrite=options.overwrite)
         with (
             ClusterConnection(jobs, options, screen) as connection,
             open_store(jobs, options, screen, output.target) as store,
-            output.growing_cloud(store) as cloud,
+            staging(folder, output.target) as staged,
         ):
-            load_open3d()  # writes the cloud in the end; a missing library is reported at the start
-            committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
-            result = committed.result(screen)
-            page.finish(result.seconds, result)
-            if compare is not None and (note := compare(result)):
-                result = replace(result, notes=(*result.notes, note))
-            if not output.in_pieces:
-                connection.close()
-                timeline.mark(timeline.STOPPED)
-            return output.publish(result, store, screen, connection.cluster)
+            assert store.only_job is not None, "of a survey"
+            with GrowingCloud(staged / CLOUD, store.only_job) as cloud:
+                load_open3d()  # writes the cloud in the end; reported at the start if it is missing
+                committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
+                result = committed.result(screen)
+                page.finish(result.seconds, result)
+                if compare is not None and (note := compare(result)):
+                    result = replace(result, notes=(*result.notes, note))
+                if not output.in_pieces:
+                    connection.close()
+                    timeline.mark(timeline.STOPPED)
+                return output.publish(folder, result, store, screen, connection.cluster, cloud)
 
 
 @dataclass(eq=False)
@@ -103,7 +105,6 @@ class SurveyOutput:
     scenario: Scenario | None = None
 
     def __post_init__(self) -> None:
-        self._growing: GrowingCloud | None = None
         self.formats = [
             output_format for output_format in self.formats if output_format.format != "ply"
         ]
@@ -114,25 +115,20 @@ class SurveyOutput:
         return any(output_format.has_many_files for output_format in self.formats)
 
     @property
-    def _has_page(self) -> bool:
-        """True if the page, which shows the points from above, is written."""
-        return self.extent != "cloud"
-
-    @property
     def _requested(self) -> Sequence[str]:
         """Columns that the user asked for, without those that only formats need."""
         columns = self.survey.columns if self.scenario is None else self.scenario.cloud.columns
         return [column.name for column in optional_columns(columns)]
 
     @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Lock the folder while the body runs."""
+    def lock(self) -> Iterator[Path]:
+        """Lock the folder while the body runs, and yield the folder that files are written to."""
         for output_format in self.formats:
             output_format.check_installed()
-        with result_folder(self.target) as self._folder:
-            yield
+        with result_folder(self.target) as folder:
+            yield folder
 
-    def check_existing(self, inputs: Identified, *, overwrite: bool = False) -> None:
+    def check_existing(self, inputs: OneJob | RunResult, *, overwrite: bool = False) -> None:
         """Refuse a target that holds the result of another survey, or files of no result.
 
         LidarError if there is a result of another scene or survey, a damaged result, or a file that
@@ -169,22 +165,18 @@ class SurveyOutput:
             raise LidarError(f"{lists} {advice}")
         check_foreign_files(storage, _formats({*further, *listed}))
 
-    @contextmanager
-    def growing_cloud(self, store: RunStore) -> Iterator[GrowingCloud]:
-        """Begin the cloud, with the points of an earlier run; parts are added while casting."""
-        assert store.only_job is not None, "of a survey"
-        with (
-            staging(self._folder, self.target) as folder,
-            GrowingCloud(folder / CLOUD, store.only_job) as self._growing,
-        ):
-            yield self._growing
-
     def publish(
-        self, result: RunResult, store: RunStore, screen: Screen, cluster: Cluster | None = None
+        self,
+        folder: Path,
+        result: RunResult,
+        store: RunStore,
+        screen: Screen,
+        cluster: Cluster | None = None,
+        growing: GrowingCloud | None = None,
     ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result of a run, remove the run, and return the result and its report.
 
-        LIDAR workers of the cluster write formats in pieces.
+        LIDAR workers of the cluster write formats in pieces. `growing` may have the points already.
         """
         workers = LidarWorkers(cluster) if cluster is not None and self.in_pieces else None
         is_in_place = False
@@ -201,7 +193,7 @@ class SurveyOutput:
         }
         try:
             with screen.writing(f"writing the cloud{extents[self.extent]}") as show:
-                return result, self.write(result, on_written, workers, show)
+                return result, self.write(folder, result, on_written, workers, growing, show)
         except BaseException as error:
             if is_in_place:
                 error.add_note(f"The result in {self.target} is complete.")
@@ -209,30 +201,33 @@ class SurveyOutput:
 
     def write(
         self,
+        folder: Path,
         result: RunResult,
         on_written: Callable[[], object] = lambda: None,
         workers: LidarWorkers | None = None,
+        growing: GrowingCloud | None = None,
         show: WritingProgress = lambda *_: None,
     ) -> dict[str, Any]:
-        """Write cloud, pictures and report into the held target, and return the report.
+        """Write cloud, pictures and report into the target, and return the report.
 
-        Files are written to a temporary folder within the folder and moved into place once all are
-        on the disk, so that an earlier result stays intact if a file cannot be written. Pictures of
-        an earlier result that this result lacks are removed. `on_written` is called when all files
-        are in place, before a pending interrupt is raised. `workers` write formats of many files,
-        and `show` shows the progress of each file.
+        Files are written to a temporary folder within `folder`, which `lock` yields, and moved into
+        place once all are on the disk, so that an earlier result stays intact if a file cannot be
+        written. Pictures of an earlier result that this result lacks are removed. `on_written` is
+        called when all files are in place, before a pending interrupt is raised. `workers` write
+        formats of many files, and `show` shows the progress of each file.
 
         If `target` is a storage, all files are put into it, report.json last. Files of workers go
         there directly, and an earlier result is removed before.
 
         LidarError if a file cannot be written.
         """
-        folder = self._folder
-        storage = self.target if isinstance(self.target, Storage) else None
-        destination = Storage.at(storage or folder)
-        earlier = _earlier(destination).files
+        target = Storage.at(self.target)
+        earlier = _earlier(target).files
         further = _further_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
+        sent: list[ExportSpec] = []  # formats that workers write to the storage
+        if workers is not None and isinstance(self.target, Storage):
+            sent = [entry for entry in self.formats if entry.has_many_files]
         with (
             explained(
                 f"The result cannot be written to {self.target}",
@@ -240,12 +235,18 @@ class SurveyOutput:
             ),
             staging(folder, self.target) as staged,
         ):
-            check_foreign_files(destination, _formats({*further, *earlier}))
-            clear = cache(partial(_clear, destination, further, earlier))  # at most once
+            check_foreign_files(target, _formats({*further, *earlier}))
             sweeps = _write_sweeps(staged, result, sweeps)
-            counts = self._write_cloud(staged / CLOUD, result, sweeps, show)
+            points = _shown_points(result, CLOUD, show)
+            counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
             timeline.mark(timeline.CLOUD_WRITTEN)
-            full_scales = self._write_formats(staged, result, sweeps, clear, workers, show)
+            others = [entry for entry in self.formats if entry not in sent]
+            full_scales = _write_formats(others, staged, result, sweeps, workers, show)
+            if workers and sent:
+                _clear(target, further, earlier)
+                for output_format in sent:
+                    points = _shown_points(result, output_format.row.file, show)
+                    output_format.write_to_storage(target, points, sweeps, workers)
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, counts)
@@ -253,68 +254,20 @@ class SurveyOutput:
                 report["notes"] += output_format.notes(result.points, sweeps, self._requested)
             if full_scales:
                 report["intensity_full_scale"] = full_scales
-            if self._has_page:
+            if self.extent != "cloud":
                 self._report(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
-            if storage is None:
-                _move(staged, folder, report["files"], earlier, on_written)
-            else:
-                clear()
-                _put(staged, storage, further)
+            if isinstance(self.target, Storage):
+                if not sent:
+                    _clear(target, further, earlier)
+                _put(staged, target, further)
                 with deferred_interrupts():
                     on_written()
+            else:
+                _move(staged, folder, report["files"], earlier, on_written)
         timeline.mark(timeline.IN_PLACE)
         return report
-
-    def _write_cloud(
-        self, path: Path, result: RunResult, sweeps: Sweeps, show: WritingProgress
-    ) -> CloudCounts:
-        """Write the cloud, or move the file there that has grown.
-
-        Returns the counts of points.
-        """
-        points = _shown_points(result, CLOUD, show)
-        with explained(f"{path} cannot be written"):
-            if self._growing is not None:
-                counts = self._growing.finish(path, points)
-                if counts is not None:
-                    return counts
-            return write_cloud(path, points, sweeps, result.scene)
-
-    def _write_formats(
-        self,
-        staged: Path,
-        result: RunResult,
-        sweeps: Sweeps,
-        clear: Callable[[], object],
-        workers: LidarWorkers | None,
-        show: WritingProgress,
-    ) -> dict[str, float]:
-        """Write the further formats to a temporary folder, or through workers to a storage.
-
-        Returns the intensity that each format with integer intensities stores as its highest
-        integer. `clear` removes an earlier result.
-        """
-        storage = self.target if isinstance(self.target, Storage) else None
-        full_scales: dict[str, float] = {}
-        for output_format in sorted(self.formats, key=lambda entry: entry.has_many_files):
-            file = output_format.row.file
-            points = _shown_points(result, file, show)
-            if storage and workers and output_format.has_many_files:
-                clear()
-                output_format.write_to_storage(storage, points, sweeps, workers)
-                continue
-            full_scale = output_format.write(
-                staged / file,
-                points,
-                sweeps,
-                workers=None if storage else workers,
-                content=partial(picture_content, result),
-            )
-            if full_scale is not None:
-                full_scales[output_format.format] = full_scale
-        return full_scales
 
     def _report(
         self,
@@ -334,6 +287,45 @@ class SurveyOutput:
             from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
 
             list(draw_pictures(shown, staged, staged, show=show))
+
+
+def _write_cloud(
+    path: Path,
+    points: StoredCloud,
+    sweeps: Sweeps,
+    result: RunResult,
+    growing: GrowingCloud | None,
+) -> CloudCounts:
+    """Write the cloud, or move the file there that has grown, and return the counts of points."""
+    with explained(f"{path} cannot be written"):
+        counts = None if growing is None else growing.finish(path, points)
+        return counts or write_cloud(path, points, sweeps, result.scene)
+
+
+def _write_formats(
+    formats: Sequence[ExportSpec],
+    staged: Path,
+    result: RunResult,
+    sweeps: Sweeps,
+    workers: LidarWorkers | None,
+    show: WritingProgress,
+) -> dict[str, float]:
+    """Write formats to a temporary folder, those of many files last.
+
+    Returns the intensity that each format with integer intensities stores as its highest integer.
+    """
+    full_scales: dict[str, float] = {}
+    for output_format in sorted(formats, key=lambda entry: entry.has_many_files):
+        full_scale = output_format.write(
+            staged / output_format.row.file,
+            _shown_points(result, output_format.row.file, show),
+            sweeps,
+            workers=workers,
+            content=partial(picture_content, result),
+        )
+        if full_scale is not None:
+            full_scales[output_format.format] = full_scale
+    return full_scales
 
 
 def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
@@ -421,10 +413,7 @@ def _move(
     earlier: Collection[str],
     on_written: Callable[[], object],
 ) -> None:
-    """Move all files of a result into place, the report last.
-
-    If the process is killed in between, --resume continues from the run's folder.
-    """
+    """Move all files of a result into place, the report last; a killed run can be resumed."""
     for name in files:  # before its name: parts, the other copy of the points, are removed then
         flush(staged / name)
     with deferred_interrupts():

@@ -72,6 +72,10 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     for stage in result.stages:
         for name, count in stage.resources.items():
             tasks.setdefault(name, {})[stage.stage] = count
+    has_materials = any(column.name == "material" for column in cloud.table)
+    counts = cloud.by_material.tolist()
+    by_material = dict(zip(scene.material_names, counts, strict=True))
+    density = cloud.density if survey.coordinates == "world" else None  # None without points, too
     return {
         "versions": versions(),
         "identity": dict(result.identity),
@@ -94,8 +98,8 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
         "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
         **({"class_names": dict(survey.classes)} if survey.classes else {}),
-        **_points_by_material(scene, cloud),
-        "points_per_m2": _density(cloud) if survey.coordinates == "world" else None,
+        **({"points_by_material": by_material} if has_materials else {}),
+        "points_per_m2": density and density._asdict(),
         "columns": _columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
@@ -111,20 +115,6 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "resumed_scans": result.resumed,
         "planning": _planning(result),
     }
-
-
-def _density(cloud: CloudCounts) -> dict[str, float] | None:
-    """Return the density of points seen from above, or None without points."""
-    density = cloud.density
-    return None if density is None else density._asdict()
-
-
-def _points_by_material(scene: Scene, cloud: CloudCounts) -> dict[str, Any]:
-    """Return the points of each material, if the cloud has the column `material`."""
-    if not any(column.name == "material" for column in cloud.table):
-        return {}
-    counts = cloud.by_material.tolist()
-    return {"points_by_material": dict(zip(scene.material_names, counts, strict=True))}
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
@@ -175,7 +165,6 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
 
 
 def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
-    """Describe the columns of the cloud except x, y and z."""
     return [
         {
             "name": column.name,
@@ -265,5 +254,4 @@ def _planning(result: RunResult) -> dict[str, Any] | None:
 
 
 def _finite(value: float) -> float | None:
-    """Return a number, or None if infinite or NaN."""
     return value if math.isfinite(value) else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -27,11 +27,11 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
-from lidarview.render.coloring import with_composed
+from lidarview.render.coloring import add_composed_columns
 from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
-from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
-from lidarview.render.surface import unit
+from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
+from lidarview.render.surface import normalize
 
 from ..plan.stations import Sight, StationPlan
 from .page.rendering import put_picture
@@ -105,10 +105,7 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures.
-
-    The file `cloud` is read on demand.
-    """
+    """Return functions that draw pictures, and read the file `cloud` on demand."""
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
@@ -139,17 +136,15 @@ def _picture_makers(
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
-        columns_by_name = with_composed(
+        columns_by_name = add_composed_columns(
             {name: c for c in (Z, X, Y, *file.table) for name in (c.name, c.in_files)}
         )
         if color not in columns_by_name:
-            available = list(dict.fromkeys(c.name for c in columns_by_name.values()))
+            names = dict.fromkeys(column.name for column in columns_by_name.values())
+            available = f" Available columns: {', '.join(names)}."
             raise LidarError(
                 f"{cloud} has no column {color!r}."
-                + (
-                    did_you_mean(color, columns_by_name)
-                    or f" Available columns: {', '.join(available)}."
-                )
+                f"{did_you_mean(color, columns_by_name) or available}"
             )
         column = columns_by_name[color]
         return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
@@ -284,7 +279,6 @@ def _limits(
 
 
 def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
-    """Mark and name start and target."""
     halo = [withStroke(linewidth=2.2 * page.unit, foreground=theme.GROUND)]
     middle = sum(axes.get_xlim()) / 2
     for name, position, marker, size in (
@@ -321,7 +315,7 @@ def draw_stations(plan: StationPlan) -> Page:
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
-    page.numbers(axes, shot)
+    page.number_sensors(axes, shot)
     names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())
     page.legend([*zip(names, COLORS, strict=False)], "station")
@@ -339,20 +333,20 @@ def draw_stations(plan: StationPlan) -> Page:
 def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     """Return the shot with COVERED, UNCOVERED, HIDDEN or OTHER in place of triangles."""
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
-    visibility = _PixelVisibility.from_shot(shot, plan)
+    visible_from_any = _pixel_visibility(shot, plan)
     kinds, surface = _initial_kinds(shot, plan, shot.pixel_samples)
-    covered = visibility.from_any(stations, shot.pixel_samples, surface)
+    covered = visible_from_any(stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
     uncovered = surface[~covered]
     # To test all pixels would take minutes: only one pixel of each triangle in a block is tested.
     tested, group = _pixels_of_blocks(shot, uncovered)
-    visible = visibility.from_any(candidates, shot.pixel_samples, uncovered[tested])
+    visible = visible_from_any(candidates, shot.pixel_samples, uncovered[tested])
     kinds[uncovered[visible[group]]] = UNCOVERED
     edge_kinds, edge_surface = _initial_kinds(shot, plan, shot.edge_samples)
     samples_per_edge = len(edge_kinds) // max(len(shot.edges), 1)
     pixel_kinds = np.repeat(kinds[shot.edges], samples_per_edge)
     edge_kinds[(edge_kinds == HIDDEN) & (pixel_kinds == UNCOVERED)] = UNCOVERED
-    is_covered = visibility.from_any(stations, shot.edge_samples, edge_surface)
+    is_covered = visible_from_any(stations, shot.edge_samples, edge_surface)
     edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
         shot,
@@ -361,7 +355,7 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     )
 
 
-def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: Samples) -> tuple[Ints, Ints]:
+def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) -> tuple[Ints, Ints]:
     """Return HIDDEN or OTHER for each sample (n,), and the indices of samples of targets."""
     is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # of triangles
     on_surface = samples.triangle >= 0
@@ -381,37 +375,35 @@ def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
     return chosen, group
 
 
-def _painted(samples: Samples, kinds: Ints) -> Samples:
+def _painted(samples: RaySamples, kinds: Ints) -> RaySamples:
     """Return samples with kinds (n,) in place of triangles."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
-@dataclass(frozen=True, eq=False)
-class _PixelVisibility:
-    """Visibility of the surfaces in pixels of a shot, by the same rules as in the plan's table."""
+def _pixel_visibility(
+    shot: SurfaceView, plan: StationPlan
+) -> Callable[[Floats, RaySamples, Ints], Bools]:
+    """Return a function for the visibility of samples, by the same rules as in the plan's table.
 
-    sight: Sight
-    eye: Floats  # (3,)
-    face_normals: Floats  # (f, 3), of unit length
+    The function returns a mask (k,) of samples, given by their indices (k,), whose drawn side is
+    visible from any position (p, 3).
+    """
+    # The shot has moved the objects a little, so its rays must meet the moved triangles. The
+    # normals of small triangles would turn: the plan's scene has them as they are. The normals
+    # of samples do not serve, because they are smoothed for shading.
+    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
+    a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
+    face_normals = normalize(np.cross(b - a, c - a))
 
-    @classmethod
-    def from_shot(cls, shot: SurfaceView, plan: StationPlan) -> _PixelVisibility:
-        """Prepare a shot of the scene of a plan."""
-        # The shot has moved the objects a little, so its rays must meet the moved triangles. The
-        # normals of small triangles would turn: the plan's scene has them as they are. The normals
-        # of samples do not serve, because they are smoothed for shading.
-        sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
-        a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
-        return cls(sight, shot.camera.eye, unit(np.cross(b - a, c - a)))
-
-    def from_any(self, positions: Floats, samples: Samples, indices: Ints) -> Bools:
-        """Return a mask (k,) of samples whose drawn side is visible from any position (p, 3)."""
+    def visible_from_any(positions: Floats, samples: RaySamples, indices: Ints) -> Bools:
         points = samples.position[indices].astype(np.float64)
-        normals = self.face_normals[samples.triangle[indices]]
-        facing_away = np.einsum("ij,ij->i", normals, points - self.eye) > 0
+        normals = face_normals[samples.triangle[indices]]
+        facing_away = np.einsum("ij,ij->i", normals, points - shot.camera.eye) > 0
         normals = np.where(facing_away[:, None], -normals, normals)
         hidden = np.arange(len(indices))
         for position in positions:
-            sides = self.sight.sides(position, points[hidden], normals[hidden])
+            sides = sight.sides(position, points[hidden], normals[hidden])
             hidden = hidden[sides <= 0]
         return ~np.isin(np.arange(len(indices)), hidden)
+
+    return visible_from_any

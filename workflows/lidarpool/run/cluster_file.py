@@ -19,7 +19,7 @@ from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.base.words import did_you_mean, plural
 from lidarsim.base.yamlfile import read_yaml
 from poolpart.deploy import start_partitions
-from poolpart.deploy.clusters import INFORMATION
+from poolpart.deploy.clusters import INFO_MARK
 
 from .pipeline.stage_names import GPU, LIDAR, OTHER
 
@@ -30,10 +30,7 @@ _CONNECT_TIMEOUT = "30s"  # limit for a host to answer
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition.
-
-    Extra fields override arguments of the cluster.
-    """
+    """Workers of a partition; extra fields override arguments of the cluster."""
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
@@ -157,7 +154,7 @@ class ClusterFile(BaseModel):
             # The messages of jobqueue go on with all arguments.
             message = str(error).partition(" Very likely")[0]
             message = ": ".join(
-                [message, *[line for line in ssh_lines if INFORMATION not in line][-1:]]
+                [message, *[line for line in ssh_lines if INFO_MARK not in line][-1:]]
             )
             reason = " ".join(f"{type(error).__name__}: {message}".split())[:400]
             raise LidarError(
@@ -167,10 +164,7 @@ class ClusterFile(BaseModel):
             yield cluster
 
     def _factory(self) -> Any:
-        """Import and return the class of the cluster.
-
-        Raises LidarError if the name is not of such a class.
-        """
+        """Return the class of the cluster, or raise LidarError for another name."""
         package, _, name = self.cluster.rpartition(".")
         try:
             # Keeps the signal handlers of this process: dask-jobqueue installs its own.

@@ -16,12 +16,10 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
-from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import joined
 from lidarsim.columns.cloud import CHUNK_POINTS
-from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.sensor.noise import Noise
 from lidarsim.sensor.optics import Returns
@@ -85,7 +83,8 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    formats = job.outputs
+    scene = job.scene
+    survey = job.survey
     mistakes = Mistakes()
     notes: list[str] = []
     warnings: list[str] = []
@@ -98,51 +97,59 @@ def forecast(
         except LidarError as error:
             notes.append(str(error).rstrip("."))
             occupied = True
-    for file_format in formats:
+    for file_format in job.outputs:
         with mistakes.noted():
             file_format.check_installed()
     cluster = _cluster_of(job, options, client, mistakes, notes)
     backend = cluster.backend
     estimate = None
     # Casting in this process needs as much memory as on a worker: it would fail or be killed.
-    if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
-        estimate = sample_survey(job.scene, job.survey)
+    if _worker_bytes(job) + cast_bytes(scene, survey) <= MEMORY_LIMIT:
+        estimate = sample_survey(scene, survey)
         if not estimate["hits"]:
-            warnings.append(f"{EMPTY}: {empty_cloud_reason(job.scene, job.survey)}")
+            warnings.append(f"{EMPTY}: {empty_cloud_reason(scene, survey)}")
     # Without an estimate every ray may hit.
-    points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
+    points = estimate["points"] if estimate else survey.ray_count // survey.keep_every
     # Scans of the largest batches; small batches take less memory.
     scans_per_batch = max_scans_per_batch(
-        scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=backend == "cuda"),
-        job.survey.scan_count,
+        scans_that_fit(scene, survey, options.batch_mb * MB, on_device=backend == "cuda"),
+        survey.scan_count,
         max(1, cluster.slots[GPU]["there"]),
     )
-    disk = _disk(job, points, scans_per_batch, len(formats), folder)
-    mistakes.lines += _disk_mistakes(disk, stored=isinstance(folder, Storage))
-    local = options.starts_workers and client is None
-    required_bytes = _bytes_needed(job, points, scans_per_batch, cluster, local=local)
-    mistakes.lines += _memory_mistakes(cluster.memory, required_bytes)
+    disk = _disk(job, points, scans_per_batch, len(job.outputs), folder)
+    required_bytes = _worker_bytes(job) + cast_bytes(
+        scene, survey, scans_per_batch, on_device=backend == "cuda"
+    )
+    if options.starts_workers and client is None:
+        required_bytes *= cluster.casters
+        required_bytes += _rest_bytes(
+            job, points, cluster.slots[OTHER]["there"] if job.planning else 0
+        )
+    mistakes.lines += _shortages(
+        disk, cluster.memory, required_bytes, stored=isinstance(folder, Storage)
+    )
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
         "occupied": occupied,  # True if the folder of the result holds another result
         "notes": notes,
         "warnings": warnings,
-        "objects": len(job.scene.object_names),
-        "triangles": job.scene.triangles,
-        "masked": list(job.scene.masked),
-        "performance": _performance(job.survey),  # {name of a sensor: "ideal" or "datasheet"}
+        "objects": len(scene.object_names),
+        "triangles": scene.triangles,
+        "masked": list(scene.masked),
+        "performance": _performance(survey),  # {name of a sensor: "ideal" or "datasheet"}
         "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
-        "bounds": _bounds_in_scenario(job.scene).tolist(),
-        "epsg": job.survey.epsg,
-        "world_origin": job.scene.world_origin.tolist(),
-        "poses": job.survey.path.stations,
-        "drive": _drive(job.survey),
-        "scans": job.survey.scan_count,
-        "sweeps": job.survey.sweep_count,
-        "rays": job.survey.ray_count,
+        # In the coordinates of the scenario: world coordinates are these plus `world.origin`.
+        "bounds": (scene.bounds + (scene.origin - scene.world_origin)).tolist(),
+        "epsg": survey.epsg,
+        "world_origin": scene.world_origin.tolist(),
+        "poses": survey.path.stations,
+        "drive": _drive(survey),
+        "scans": survey.scan_count,
+        "sweeps": survey.sweep_count,
+        "rays": survey.ray_count,
         "estimate": estimate,
-        "precision_m": job.survey.precision_m,
+        "precision_m": survey.precision_m,
         "trials": job.trials,
         "backend": backend,
         "casters": cluster.casters,
@@ -150,15 +157,6 @@ def forecast(
         "memory": {"needed": required_bytes, "there": cluster.memory or None},
         "disk": disk,
     }
-
-
-def _bounds_in_scenario(scene: Scene) -> Floats:
-    """Return the bounds of a scene in the coordinates of its scenario, (2, 3), in meters.
-
-    World coordinates are these plus `world.origin`.
-    """
-    bounds: Floats = scene.bounds + (scene.origin - scene.world_origin)
-    return bounds
 
 
 class _Cluster(NamedTuple):
@@ -173,7 +171,6 @@ class _Cluster(NamedTuple):
 def _cluster_of(
     job: Job, options: RunOptions, client: Client | None, mistakes: Mistakes, notes: list[str]
 ) -> _Cluster:
-    """Return the cluster of `client`, or the cluster that `options` describe."""
     required = slots_needed(options, planning=job.planning is not None)
     casting = None
     backend = None
@@ -213,19 +210,6 @@ def _cluster_of(
     return _Cluster(slots, casters, backend, memory)
 
 
-def _bytes_needed(
-    job: Job, points: int, scans_per_batch: int, cluster: _Cluster, *, local: bool
-) -> int:
-    """Return the memory of a casting worker, or of all processes of a local cluster, in bytes."""
-    on_device = cluster.backend == "cuda"
-    worker = _worker_bytes(job) + cast_bytes(
-        job.scene, job.survey, scans_per_batch, on_device=on_device
-    )
-    if not local:
-        return worker
-    return worker * cluster.casters + _rest_bytes(job, points, cluster.slots)
-
-
 def _disk(
     job: Job, points: int, scans_per_batch: int, exports: int, result: Path | Storage
 ) -> dict[str, Any]:
@@ -253,28 +237,29 @@ def _disk(
     return {"parts": run_bytes, "result": result_bytes, "free": free, "folder": str(folder)}
 
 
-def _disk_mistakes(disk: dict[str, Any], *, stored: bool) -> list[str]:
-    """Return a message if the disk is too small for the result, `stored` or in a folder."""
-    required_bytes = disk["result"] + (0 if stored else disk["parts"])
-    if disk["free"] >= required_bytes:
-        return []
-    return [
-        f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, but the run needs "
-        f"about {format_bytes(required_bytes)}. Free disk space, choose a different folder with "
-        f"{'`TMPDIR`' if stored else '`--out`'}, or increase `keep_every`."
-    ]
+def _shortages(
+    disk: dict[str, Any], available_bytes: int, required_bytes: int, *, stored: bool
+) -> list[str]:
+    """Return messages if the disk or the memory is too small.
 
-
-def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
-    """Return a message if the memory is too small, where 0 available bytes are unknown."""
-    if not available_bytes or available_bytes >= required_bytes:
-        return []
-    return [
-        f"{format_bytes(available_bytes)} of memory are available, but the run needs about "
-        f"{format_bytes(required_bytes)}. Use a smaller scene, reduce the number of casting "
-        "workers (`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or use "
-        "a machine with more memory."
-    ]
+    The result is `stored` or in a folder. 0 available bytes of memory are unknown.
+    """
+    messages = []
+    disk_bytes = disk["result"] + (0 if stored else disk["parts"])
+    if disk["free"] < disk_bytes:
+        messages.append(
+            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, but the run "
+            f"needs about {format_bytes(disk_bytes)}. Free disk space, choose a different folder "
+            f"with {'`TMPDIR`' if stored else '`--out`'}, or increase `keep_every`."
+        )
+    if 0 < available_bytes < required_bytes:
+        messages.append(
+            f"{format_bytes(available_bytes)} of memory are available, but the run needs about "
+            f"{format_bytes(required_bytes)}. Use a smaller scene, reduce the number of casting "
+            "workers (`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or "
+            "use a machine with more memory."
+        )
+    return messages
 
 
 def _performance(survey: Survey) -> dict[str, str]:
@@ -292,10 +277,7 @@ def _performance(survey: Survey) -> dict[str, str]:
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:
-    """Return the names of the objects that sensors do not see.
-
-    The result lacks sensors that see all.
-    """
+    """Return the names of the objects that a sensor does not see, without sensors that see all."""
     scene = job.scene
     pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
     names = scene.object_names
@@ -353,10 +335,7 @@ def _existing(folder: Path) -> Path:
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:
-    """Return notes on the folder of a result.
-
-    Raises LidarError if the folder cannot be written.
-    """
+    """Return notes on the folder of a result, or raise LidarError if it is not writable."""
     if isinstance(location, Storage):
         location.claim()  # leaves nothing
     elif not (folder := _existing(location)).is_dir():
@@ -378,7 +357,7 @@ def _worker_bytes(job: Job) -> int:
     return PROCESS_BYTES + rig_bytes(job.scene, job.survey)
 
 
-def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
+def _rest_bytes(job: Job, points: int, planners: int) -> int:
     """Return the memory of all processes of a machine but casting workers, in bytes."""
     scene = job.scene
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
@@ -390,9 +369,8 @@ def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
         shown_triangles = min(scene.triangles, shown_triangles)
     driver = 2 * SCENE_TRIANGLE * shown_triangles + INSTANCE * len(scene.instances or ())
     driver += chunk_bytes + SCAN_BYTES * job.survey.scan_count
-    return planning * slots.get(OTHER, {"there": 0})["there"] + driver + 2 * PROCESS_BYTES
+    return planning * planners + driver + 2 * PROCESS_BYTES
 
 
 def _point_bytes(job: Job) -> int:
-    """Return the bytes of a point in a part."""
     return sum(np.dtype(column.dtype).itemsize for column in job.survey.stored_columns)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
 from ..plan import Planning
+from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
@@ -74,77 +75,6 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
     return dict(describe_fields(values))
 
 
-class Identified(Protocol):
-    """Inputs that results depend on, as hashes and in words."""
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Hashes of all inputs that the results depend on, by name."""
-        ...
-
-    @property
-    def fields(self) -> Mapping[str, str]:
-        """Fields that the results depend on, in words, to name those that differ."""
-        ...
-
-
-class Jobs(Identified, Protocol):
-    """The jobs of a run: `OneJob` of a survey, or a campaign."""
-
-    @property
-    def only_job(self) -> Job | None:
-        """The job of a survey, whose points and frames the run returns, or None for a campaign."""
-        ...
-
-    @property
-    def shard(self) -> Shard:
-        """The share of the jobs, or of the scans of the only job, that the run does."""
-        ...
-
-    @property
-    def numbers(self) -> range:
-        """Numbers of the jobs that the run does."""
-        ...
-
-    @property
-    def title(self) -> str:
-        """Title of all jobs, for pages, or no text."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the values that differ from job to job."""
-        ...
-
-    @property
-    def changeable(self) -> str:
-        """A sentence on what may change before a run is continued."""
-        ...
-
-    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job with additional columns.
-
-        `cache` has scenes that jobs share.
-        """
-        ...
-
-    def name(self, number: int) -> str:
-        """Return the name of a job in files."""
-        ...
-
-    def split(self, number: int) -> str:
-        """Return the name of a job's split, or no text without splits."""
-        ...
-
-    def values(self, number: int) -> Mapping[str, Value | None]:
-        """Return the values of a job that differ from job to job, by name."""
-        ...
-
-    def without_folders(self, message: str) -> str:
-        """Return a message without the folders of the jobs' files on this machine."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class OneJob:
     """A survey as the only job of its run, which does the scans of a shard."""
@@ -173,29 +103,13 @@ class OneJob:
         job = self.survey_job
         return fields_of(job.scene, job.survey, job.planning)
 
-    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Return the only job, which has its columns."""
-        return self.only_job
 
-    def name(self, number: int) -> str:
-        """Return the name of the only job."""
-        return self.survey_job.name
-
-    def split(self, number: int) -> str:
-        """Return the split of the only job."""
-        return self.survey_job.split
-
-    def values(self, number: int) -> Mapping[str, Value | None]:
-        """Return the values of the only job."""
-        return self.survey_job.values
-
-    def without_folders(self, message: str) -> str:
-        """Return a message as it is: no data set has it."""
-        return message
+Jobs = OneJob | CampaignSpec  # the jobs of a run
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
-    """Return the row of a job that has failed, and perhaps cannot be made."""
+    """Return the row of a job of a campaign that has failed, and perhaps cannot be made."""
+    assert isinstance(jobs, CampaignSpec), "surveys end with their job"
     values: Mapping[str, Value | None] = {}
     with suppress(Exception):  # the values themselves may be the cause
         values = jobs.values(number)
@@ -204,14 +118,15 @@ def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
 
 
 class JobMaker:
-    """Makes jobs with their sweeps in a thread, a few ahead.
+    """Makes the jobs of a campaign with their sweeps in a thread, a few ahead.
 
     `numbers` are the numbers of the remaining jobs, and `columns` names of the columns that the
     data set needs.
     """
 
     def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str]) -> None:
-        self._jobs = jobs
+        assert isinstance(jobs, CampaignSpec), "surveys have their job"
+        self._campaign = jobs
         self._numbers = numbers
         self._columns = columns
         self._cache = SceneCache()
@@ -253,7 +168,7 @@ class JobMaker:
 
     def _make(self, number: int) -> Job | JobRow:
         try:
-            job = self._jobs.job(number, self._cache, self._columns)
+            job = self._campaign.job(number, self._cache, self._columns)
             _ = job.sweeps  # computed in this thread, for they take a while
             return job
         except MemoryError:
@@ -261,7 +176,7 @@ class JobMaker:
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             reason = str(error) if isinstance(error, LidarError) else repr(error)
-            return failed_row(self._jobs, number, reason)
+            return failed_row(self._campaign, number, reason)
 
     def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
         """Put an entry into the queue, and return False if the maker was stopped before."""

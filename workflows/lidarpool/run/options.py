@@ -11,10 +11,11 @@ from typing import Annotated, Any, Literal, TypedDict
 from distributed import Client
 from pydantic import Field
 
+from lidarsim.base.checks import check_fields
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.base.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
 from lidarsim.base.words import did_you_mean
 
@@ -28,7 +29,6 @@ Live = bool | Literal["page", "foxglove", "rerun"]
 
 
 @dataclass(frozen=True, kw_only=True)
-@checked_fields
 class RunOptions(TaskOptions):
     """Options of casting, of the cluster, and of the treatment of an earlier run.
 
@@ -58,7 +58,10 @@ class RunOptions(TaskOptions):
     pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames; 1 is that of the scanner
     stay: bool = True  # False if the live page, or viewer, ends with the run
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if (self.restart or self.overwrite) and self.may_continue:
             raise LidarError(
                 "The options `restart` and `overwrite` cannot be combined with `resume`, "

@@ -7,7 +7,7 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 from ..plan import Planning, Trial, run_trial
 from .cluster.tasks import Tasks
@@ -82,14 +82,14 @@ class TrialPump:
         waiting = {
             key for key, location in locations.tasks.items() if location.state == "no-worker"
         }
-        lost = [f for f in running if f.key in waiting or locations.out_of_reach(f.key)]
+        lost = [f for f in running if f.key in waiting or locations.is_unreachable(f.key)]
         for index, future in enumerate(lost if responding else []):
             self._submit(running.pop(future), responding[index % len(responding)])
 
-    def _look(self) -> TaskLocations:
+    def _look(self) -> PartitionSnapshot:
         self._looked_at = time.monotonic()
         locations = self.tasks.look()
         # A trial waits behind each running trial: no slot idles, and a dying worker loses few.
         # Waiting trials make an adaptive partition start workers.
-        self._max_running = 2 * max(1, locations.most_slots)
+        self._max_running = 2 * max(1, locations.max_slots)
         return locations

@@ -86,10 +86,7 @@ class Pace:
         return (count - first_count) / (seconds - start_s) if seconds > start_s else 0.0
 
     def time_left(self, seconds: float, count: int, total: int) -> str:
-        """Return the remaining time in words.
-
-        The text is empty until the estimate is good, and at the end.
-        """
+        """Return the remaining time in words, or no text before a good estimate and at the end."""
         rate = self.rate(seconds, count)
         sure = rate and (count >= SURE_SHARE * total or seconds >= SURE_S) and count < total
         return time_in_words((total - count) / rate) if sure else ""
@@ -109,10 +106,7 @@ def waiting_reason(progress: Progress) -> str:
 
 @contextmanager
 def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
-    """Progress bars, created on first update.
-
-    Yields `update(name, count, total, unit)`.
-    """
+    """Show progress bars from their first `update(name, count, total, unit)`, which is yielded."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -133,10 +127,7 @@ def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Progress bars of the stages with rates and remaining time.
-
-    Yields their update function.
-    """
+    """Show progress bars with rates and remaining time, and yield their update function."""
     paces = {label: Pace() for label, _, _ in STAGES}
     with progress_rows(console) as move:
 
@@ -180,11 +171,9 @@ class Screen:
         Warnings that were reported, without duplicates.
     """
 
-    warnings: list[str]
-
     def __init__(self, on_progress: Callable[[Progress], None] | None = None) -> None:
         self._on_progress = on_progress
-        self.warnings = []
+        self.warnings: list[str] = []
 
     def tell(self, words: str) -> None:
         """Log a note for the user."""
@@ -201,17 +190,11 @@ class Screen:
         return nullcontext()
 
     def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
-        """Return a context that shows the progress of writing.
-
-        Its value is the update function.
-        """
+        """Return a context that shows the progress of writing, and yields its update function."""
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
-        """Return a context that shows the progress of a run.
-
-        Its value is the update function.
-        """
+        """Return a context that shows the progress of a run, and yields its update function."""
         return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
 
     def starting(

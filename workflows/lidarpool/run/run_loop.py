@@ -361,7 +361,7 @@ class RunLoop:
         self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
         # End the request for slots that was made before there were tasks: from now on, waiting
         # trials let an adaptive partition grow.
-        self._trials.tasks.partition.want(0)
+        self._trials.tasks.partition.request_slots(0)
 
     def _cast(self, stored: StoredJob) -> None:
         job = stored.job

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 from lidarsim.base.arrays import Floats32, Ints
-from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.scene import Scene
@@ -55,8 +54,6 @@ class RunResult:
     replayed
         Number of batches that were cast or sent more than once.
     """
-
-    __signature__ = ReadableSignature()
 
     scene: Scene
     survey: Survey
@@ -135,8 +132,6 @@ class CampaignRun:
         Notes for the user, the sensors of the finished jobs as {name: models and rates}, and the
         names of semantic classes as {number: name}.
     """
-
-    __signature__ = ReadableSignature()
 
     failed: tuple[JobRow, ...]
     done: int

@@ -42,7 +42,7 @@ MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
 class WriteRequest(NamedTuple):
-    """Input for writing a job. `row` lacks the counts of points."""
+    """Input for writing a job, whose `row` lacks the counts of points."""
 
     row: JobRow
     cloud: StoredCloud
@@ -53,21 +53,11 @@ class WriteRequest(NamedTuple):
 JobOutcome = JobRow | LidarError
 
 
-class Probe(NamedTuple):
-    """A file by which a worker finds out whether the worker sees a storage."""
-
-    storage: Storage
-    name: str
-    content: bytes
-
-    @property
-    def is_seen(self) -> bool:
-        """True if this process finds the file with its content."""
-        return self.storage.sees(self.name, self.content)
+Probe = tuple[Storage, str, bytes]  # a storage, and the name and content of a file in it
 
 
 def write_jobs(
-    dataset: DataSet, probes: tuple[Probe, Probe], jobs: Sequence[WriteRequest]
+    dataset: DataSet, probes: Sequence[Probe], jobs: Sequence[WriteRequest]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
     """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
 
@@ -75,7 +65,7 @@ def write_jobs(
     the rows if the worker does not see both files. The record of the task counts scans.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(probe.is_seen for probe in probes):
+    if not all(storage.sees(name, content) for storage, name, content in probes):
         return None, recorder.finish()
     outcomes = [_write_job(dataset, job) for job in jobs]
     scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # one past the last scan of each
@@ -101,10 +91,8 @@ def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
 class DataSetWriter:
     """Has LIDAR workers write jobs into a data set.
 
-    The driver writes jobs that they cannot see.
-
     `parts_probe` is a file among the parts of the `store`, name and content: a worker that does not
-    see this file, or a similar file in the data set, writes no job.
+    see this file, or a similar file in the data set, writes no job. The driver writes such jobs.
     """
 
     def __init__(
@@ -119,11 +107,12 @@ class DataSetWriter:
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
         # The name of a temporary file: later writers remove the file of a killed run.
-        dataset_probe = Probe(storage, f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
-        self._probes = dataset_probe, Probe(store.storage, *parts_probe)
+        self._probe_name = f"{TEMPORARY}dataset-{mark[:8]}"
+        dataset_probe = storage, self._probe_name, mark.encode()
+        self._probes: Sequence[Probe] = (dataset_probe, (store.storage, *parts_probe))
         with explained(f"{storage} cannot be written"):
             storage.prepare()
-            storage.write(dataset_probe.name, dataset_probe.content)
+            storage.write(self._probe_name, mark.encode())
         self._waiting = deque[WriteRequest]()
         self._due_at = 0.0  # when the waiting jobs are to be written
         self._driver_writes: dict[Future[JobOutcome], WriteRequest] = {}
@@ -201,7 +190,7 @@ class DataSetWriter:
             self._moved_at = now_s
             locations = self.tasks.look()
             if any(
-                location.started and not locations.out_of_reach(key)
+                location.started and not locations.is_unreachable(key)
                 for key, location in locations.tasks.items()
             ):
                 return
@@ -219,9 +208,8 @@ class DataSetWriter:
         with suppress(Exception):  # report the first error
             self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
-        dataset_probe, _ = self._probes
         with suppress(OSError):
-            dataset_probe.storage.remove([dataset_probe.name])
+            self.dataset.storage.remove([self._probe_name])
 
 
 LOOK_EVERY_S = 0.01

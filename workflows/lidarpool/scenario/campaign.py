@@ -11,16 +11,14 @@ from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field
 
-from lidarsim.base.declared import Seed
+from lidarsim.base.checks import check_list, check_number
 from lidarsim.base.error_sentences import sentences
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.input_files import not_found, read_input_text
-from lidarsim.base.validation import checked
 from lidarsim.base.yamlfile import read_yaml
 
 from ..base.field_words import describe_fields
@@ -87,18 +85,18 @@ class CampaignSpec:
     shard = ALL  # whose jobs a run does
     only_job: None = None  # surveys have one (`lidarpool.run.job_source.Jobs`)
 
-    @checked
     def __init__(
         self,
         make: Callable[[int, np.random.Generator], Job],
-        count: Annotated[int, Field(ge=1, le=MAX_JOBS)],
+        count: int,
         *,
-        seed: Seed = 0,
+        seed: int = 0,
         keep: str | Keep | Mapping[str, Any] = "kitti",
         splits: Mapping[str, float] = MappingProxyType({}),
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> None:
+        check_number("count", count, whole=True, ge=1, le=MAX_JOBS)
         head = _head(keep=keep, splits=splits, seed=seed, license=license, title=title)
         self._begin(FunctionJobs(make, count, seed), head)
 
@@ -118,7 +116,6 @@ class CampaignSpec:
     changeable = "Only `pool` and `count` may change, and `count` must not decrease."
 
     @classmethod
-    @checked
     def load(cls, path: str | Path) -> CampaignSpec:
         """Read a campaign file with its bases and tables.
 
@@ -141,14 +138,13 @@ class CampaignSpec:
         return self
 
     @classmethod
-    @checked
     def of_scenarios(
         cls,
         paths: Iterable[str | Path],
         *,
         keep: str | Keep | Mapping[str, Any] = "folder",
         splits: Mapping[str, float] = MappingProxyType({}),
-        seed: Seed = 0,
+        seed: int = 0,
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> CampaignSpec:
@@ -161,6 +157,7 @@ class CampaignSpec:
         LidarError
             If a file cannot be used, or an argument is not valid.
         """
+        check_list("paths", paths)
         jobs = ScenarioJobs([Path(path) for path in paths])
         self = cls.__new__(cls)
         self._begin(jobs, _head(keep=keep, splits=splits, seed=seed, license=license, title=title))

@@ -29,7 +29,9 @@ from pydantic import (
     model_validator,
 )
 
+from lidarsim.base.checks import check_fields
 from lidarsim.base.declared import (
+    FileSection,
     MinMax,
     Seed,
     Several,
@@ -49,7 +51,7 @@ from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.section_fields import sections_in
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.base.words import did_you_mean_each, in_yaml, joined, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
@@ -401,8 +403,7 @@ def _in_table(value: Any, position: int) -> Value | None:
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Keep:
+class Keep(FileSection):
     """The format of a data set.
 
     LidarError for an unknown format or layout.
@@ -444,7 +445,10 @@ class Keep:
         ),
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         _ = self.of_jobs  # LidarError if its fields do not fit together
 
     @property

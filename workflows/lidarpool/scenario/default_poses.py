@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from lidarscenes.procedural.floor import heights_at, room_at, triangles_reaching
-from lidarscenes.procedural.surroundings import Surroundings, in_the_way, is_open
+from lidarscenes.procedural.floor import floor_and_ceiling, surface_heights, triangles_in_box
+from lidarscenes.procedural.surroundings import PlacementChecker, is_obstructed, is_open
 from lidarsim.base.arrays import Floats
 from lidarsim.base.words import plural
 from lidarsim.media.materials import rows_named
@@ -104,22 +104,22 @@ def place_sensor(
     lower_m, upper_m = scene.bounds + scene.origin
     middle = (lower_m + upper_m) / 2
     drawn = _draw_instances(scene, middle - scene.origin)
-    if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
+    if landscape and not len(surface_heights(drawn, middle[0], middle[1])):  # a hole
         ground_scene = _select_objects(drawn, roads) or drawn
         ground = ground_scene.vertices[ground_scene.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
     standing = _poses_above_floor(drawn, middle)
     surroundings = None if landscape else _surroundings(drawn)
     building_scene = _select_objects(drawn, buildings)
-    if building_scene and len(heights_at(building_scene, middle[0], middle[1])):
+    if building_scene and len(surface_heights(building_scene, middle[0], middle[1])):
         standing = _poses_beside(drawn, middle, buildings)
         is_object = not standing
     else:
         is_object = surroundings is not None and surroundings.is_object(
-            surroundings.views(_local_positions(standing, scene))
+            surroundings.cast_around(_local_positions(standing, scene))
         )
     if not is_object:
-        if in_the_way(drawn, _local_positions(standing, scene)):
+        if is_obstructed(drawn, _local_positions(standing, scene)):
             standing = _poses_beside(drawn, middle, buildings) or standing
         positions = _local_positions(standing, scene)
         return Placing(standing, _inside_note(surroundings, positions, scene, carried))
@@ -148,7 +148,9 @@ def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -
     return note
 
 
-def _narrow_grid(scene: Scene, surroundings: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
+def _narrow_grid(
+    scene: Scene, surroundings: PlacementChecker, poses: Sequence[Pose]
+) -> dict[str, Any]:
     """Return arguments of `Sensor.grid` for about `_POINTS` points on an object."""
     placed = [
         *zip(_local_positions(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)
@@ -179,7 +181,7 @@ def _narrow_grid(scene: Scene, surroundings: Surroundings, poses: Sequence[Pose]
 def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
     """Return poses above the floor at x and y of a position (3,), world coordinates."""
     x, y, _ = position.tolist()
-    floor, ceiling = room_at(scene, x, y)
+    floor, ceiling = floor_and_ceiling(scene, x, y)
     heights = [*_HEIGHTS_M]
     if floor + heights[-1] > ceiling - _BELOW_M:
         heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
@@ -206,7 +208,7 @@ def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
     local = middle - scene.origin
-    in_reach = triangles_reaching(scene, local - reach, local + reach)
+    in_reach = triangles_in_box(scene, local - reach, local + reach)
     surroundings = replace(
         scene, faces=scene.faces[in_reach], face_object=scene.face_object[in_reach]
     )
@@ -217,11 +219,12 @@ def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -
             if (np.abs(step[:2]) < half[:2]).all():
                 x, y, _ = middle + step
                 if building_scene and (
-                    len(heights_at(building_scene, x, y)) or not len(heights_at(surroundings, x, y))
+                    len(surface_heights(building_scene, x, y))
+                    or not len(surface_heights(surroundings, x, y))
                 ):
                     continue
                 poses = _poses_above_floor(surroundings, middle + step)
-                if not in_the_way(surroundings, _local_positions(poses, scene)):
+                if not is_obstructed(surroundings, _local_positions(poses, scene)):
                     return poses
     return ()
 
@@ -231,16 +234,16 @@ def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
     return np.array([pose.position for pose in poses]) - scene.origin
 
 
-def surroundings_of(scene: Scene, positions: ArrayLike) -> Surroundings | None:
+def surroundings_of(scene: Scene, positions: ArrayLike) -> PlacementChecker | None:
     """Return the surroundings of local positions (k, 3), or None if the scene is too large."""
     return _surroundings(_draw_instances(scene, positions))
 
 
 def _inside_note(
-    surroundings: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
+    surroundings: PlacementChecker | None, positions: ArrayLike, scene: Scene, carried: Mounted
 ) -> str:
     """Return a note if a local position (k, 3) lies inside a closed body, else an empty string."""
-    if surroundings is None or not surroundings.views(positions).in_a_body:
+    if surroundings is None or not surroundings.cast_around(positions).is_inside_body:
         return ""
     return (
         "the sensor is inside a closed body. It hits only the back faces of surfaces. "
@@ -248,13 +251,15 @@ def _inside_note(
     )
 
 
-def free_above(scene: Scene, surroundings: Surroundings, position: Floats) -> Floats | None:
+def free_above(scene: Scene, surroundings: PlacementChecker, position: Floats) -> Floats | None:
     """Return the lowest free local position (3,) above a surface at x and y of a position, or None.
 
     It is as high above the surface as the second of the default poses.
     """
     x, y, _ = position + scene.origin
-    for height in np.sort(heights_at(_draw_instances(scene, position), x, y)) - scene.origin[2]:
+    for height in (
+        np.sort(surface_heights(_draw_instances(scene, position), x, y)) - scene.origin[2]
+    ):
         above = np.array([*position[:2], height + _HEIGHTS_M[1]])
         if surroundings.is_free(above):
             return above
@@ -340,9 +345,9 @@ def _draw_instances(scene: Scene, positions: ArrayLike) -> Scene:
     ).scene
 
 
-def _surroundings(scene: Scene) -> Surroundings | None:
+def _surroundings(scene: Scene) -> PlacementChecker | None:
     """Return the surroundings in a scene, or None if the scene has too many triangles."""
     count = len(scene.faces)
     if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):
         return None
-    return Surroundings(scene)
+    return PlacementChecker(scene)

@@ -11,8 +11,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from lidarsim.base.checks import check_fields, check_type
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked_fields
+from lidarsim.base.value_texts import one_line
 from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.actors import check_spray
 from lidarsim.scene.scene import Scene
@@ -30,7 +31,6 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Job:
     """A survey of a scene, optionally with path planning.
 
@@ -70,7 +70,13 @@ class Job:
     outputs: Sequence[ExportSpec] = ()
     made_of: Sequence[tuple[str, str]] = ()
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_type(
+            "scene", self.scene, Scene, advice=" To read a file, use Scene.load('hall.glb')."
+        )
+        check_fields(self)
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)

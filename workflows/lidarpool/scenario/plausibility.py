@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarscenes.procedural.surroundings import Body, Surroundings
+from lidarscenes.procedural.surroundings import EnclosingBody, PlacementChecker
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import as_scenario, printable, rounded
@@ -122,7 +122,10 @@ def _sample_positions(survey: Survey) -> list[_SensorPosition]:
 
 
 def _position_warnings(
-    scene: Scene, survey: Survey, surroundings: Surroundings | None, samples: list[_SensorPosition]
+    scene: Scene,
+    survey: Survey,
+    surroundings: PlacementChecker | None,
+    samples: list[_SensorPosition],
 ) -> Iterator[str]:
     """Warn of positions under the scene, or inside its bodies or actors that the sensor sees."""
     unseen = unseen_objects(scene, survey)
@@ -131,7 +134,7 @@ def _position_warnings(
         seen_by = _surroundings_of_sensors(scene, surroundings, samples, unseen)
         pairs = [(seen_by[sample.sensor], sample.position) for sample in samples]
         under = np.array([seen is not None and seen.is_covered(xyz) for seen, xyz in pairs])
-        inside = np.array([seen is not None and seen.in_a_body(xyz) for seen, xyz in pairs])
+        inside = np.array([seen is not None and seen.is_inside_body(xyz) for seen, xyz in pairs])
         if under.any():
             first = samples[int(under.argmax())]
             seen = seen_by[first.sensor]
@@ -146,7 +149,7 @@ def _position_warnings(
             first = samples[int(inside.argmax())]
             seen = seen_by[first.sensor]
             assert seen is not None  # it is inside a body of these
-            body = seen.body_around(first.position)
+            body = seen.find_enclosing_body(first.position)
             way_out = _way_out(scene, survey, seen, first, body)
             yield (
                 f"the sensor is inside the closed body {printable(body.name)!r}{where(inside)}. It "
@@ -165,11 +168,15 @@ def _position_warnings(
 
 
 def _way_out(
-    scene: Scene, survey: Survey, seen: Surroundings, first: _SensorPosition, body: Body
+    scene: Scene,
+    survey: Survey,
+    seen: PlacementChecker,
+    first: _SensorPosition,
+    body: EnclosingBody,
 ) -> str:
     """Return sentences, starting with a period, on a pose outside a body around a position."""
     if not survey.path.moves:
-        if (free := seen.free_position(first.position)) is not None:
+        if (free := seen.find_free_position(first.position)) is not None:
             return _moved_pose(scene, survey, first, free)
         if body.is_whole_scene:
             return f". {seen_from(scene, survey.carried[0])}"
@@ -191,15 +198,15 @@ def _moved_pose(scene: Scene, survey: Survey, sample: _SensorPosition, free: Flo
 
 def _surroundings_of_sensors(
     scene: Scene,
-    surroundings: Surroundings,
+    surroundings: PlacementChecker,
     samples: list[_SensorPosition],
     unseen: Sequence[Bools | None],
-) -> list[Surroundings | None]:
+) -> list[PlacementChecker | None]:
     """Return the surroundings that each sensor sees, or None if a sensor sees nothing.
 
     `surroundings` belong to all objects, and `unseen` the masks of the sensors.
     """
-    known: dict[bytes, Surroundings | None] = {b"": surroundings}
+    known: dict[bytes, PlacementChecker | None] = {b"": surroundings}
     keys = [static_key(scene, mask) for mask in unseen]
     for key, mask in zip(keys, unseen, strict=True):
         if mask is not None and key not in known:
@@ -235,18 +242,18 @@ def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
     lower_m, upper_m = actor.mesh.bounds
     in_bounds = np.flatnonzero(((local > lower_m) & (local < upper_m)).all(axis=1))
     if len(in_bounds):
-        surroundings = Surroundings(Scene.from_meshes([actor.mesh]))
-        inside[in_bounds] = [surroundings.views(local[k]).in_a_body for k in in_bounds]
+        surroundings = PlacementChecker(Scene.from_meshes([actor.mesh]))
+        inside[in_bounds] = [surroundings.cast_around(local[k]).is_inside_body for k in in_bounds]
     return inside
 
 
 # -- noise -----------------------------------------------------------------------------------
 
 
-def _sight_m(scene: Scene, surroundings: Surroundings | None, positions: Floats) -> float:
+def _sight_m(scene: Scene, surroundings: PlacementChecker | None, positions: Floats) -> float:
     """Return the range of a sensor without a limit of range, meters."""
     if surroundings is not None:
-        distances = surroundings.views(positions).distance
+        distances = surroundings.cast_around(positions).distance
         if len(distances := distances[np.isfinite(distances)]):
             return float(np.percentile(distances, _FAR_PERCENT))
     return float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
@@ -291,7 +298,7 @@ def _motion(survey: Survey) -> _Motion:
 
 
 def _flies(
-    scene: Scene, survey: Survey, surroundings: Surroundings | None, positions: Floats
+    scene: Scene, survey: Survey, surroundings: PlacementChecker | None, positions: Floats
 ) -> bool:
     """Return whether the carrier is airborne, judged by its sensors and its height above ground."""
     if any(isinstance(carried.sensor, LineSensor) for carried in survey.carried):

@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.allowance import bytes_of, memory
 from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Ints
+from lidarsim.base.checks import check_choice
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, rounded
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS
@@ -50,14 +49,13 @@ _MEASURED_LOSS = "4 to 40 % in scenes from one to three scans of a city"
 _WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
-@checked
 def scene_of_points(
     path: str | Path,
     *,
     voxel_m: float | None = None,
     size: float = 1.0,
-    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
-    epsg: Annotated[int, Field(ge=1024, le=32767)] | None = None,
+    unit: str | None = None,
+    epsg: int | None = None,
     keep_noise: bool = False,
     color: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
@@ -110,6 +108,10 @@ def scene_of_points(
         coordinate system without lengths or with lengths that are not true, as Web Mercator, cannot
         be brought to `epsg`, or needs too much memory.
     """
+    if unit is not None:
+        check_choice("unit", unit, UNITS_M)
+    if color is not None:
+        check_choice("color", color, ("rgb", "intensity"))
     return points_to_scene(
         Path(path),
         voxel_m=voxel_m,

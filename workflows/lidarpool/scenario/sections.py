@@ -20,6 +20,7 @@ from pydantic import (
 )
 
 from lidarsim.base.declared import (
+    STRICT,
     AngleDeg,
     Coordinate,
     Four,
@@ -40,7 +41,6 @@ from lidarsim.base.declared import (
 )
 from lidarsim.base.errors import LidarError
 from lidarsim.base.section_fields import fields_of
-from lidarsim.base.validation import STRICT
 from lidarsim.base.vocabulary import BACKENDS
 from lidarsim.media.materials import SemanticClass
 from lidarsim.motion.trajectory import Pose

@@ -1,1 +1,1 @@
-"""Readers of OpenUSD, Collada, 3MF, MagicaVoxel, rasters of heights and CityJSON."""
+"""Read OpenUSD, COLLADA, 3MF, IFC, CityJSON, AMAPVox, and elevation rasters."""

@@ -1,8 +1,8 @@
-"""Files read by libraries that may end their process, in a separate process.
+"""Read files in a separate process with libraries that may crash.
 
-A script of this package is that process. Its standard output has frames, each a line of JSON and
-the bytes of the arrays of its field `arrays`, a list of data types and shapes. A frame whose field
-`what` is "error" has a `reason`, and is the last.
+The process runs a script of this package. The script writes frames to standard output: a line of
+JSON, followed by the bytes of the arrays whose data types and shapes are listed in the field
+`arrays`. If the field `what` is "error", the frame has a `reason` and is the last one.
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ from lidarsim.base.arrays import AnyArray
 Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
-class Child(NamedTuple):
+class ReaderProcess(NamedTuple):
     """A process that reads a file.
 
     Attributes
     ----------
     script
-        The script, which takes the file and the request as JSON, and imports nothing of ours.
+        Script that receives the path of the file and the request as JSON. It must not import
+        anything from lidarpool.
     library
-        Name of the library, for errors.
+        Name of the library for error messages.
     max_bytes
-        Memory that the process may take, bytes: the field `memory` of the request.
+        Memory limit of the process, which the script receives as the field `memory` of the request.
     folder
         Working directory.
     hidden
-        Beginnings of the names of environment variables that the process does not get.
+        Prefixes of environment variables that the process does not receive.
     environment
-        Further environment variables.
+        Additional environment variables.
     """
 
     script: Path
@@ -56,16 +57,16 @@ class Child(NamedTuple):
     ) -> Generator[Frame]:
         """Read a file, and yield the frames.
 
-        `take` is called with a frame and the bytes of each of its arrays, before they are read.
+        `take` is called with the frame and the size of each array before the array is read.
 
         Raises
         ------
         ValueError
-            If the library refuses the file, ends the process, or takes too long or too much memory.
+            If the library refuses the file or crashes, or needs too much time or memory.
         """
         message = json.dumps(request | {"memory": self.max_bytes}, default=str)
         with subprocess.Popen(
-            # -P: our modules must not take the place of the library's.
+            # With -P, modules of this package cannot shadow those of the library.
             [sys.executable, "-P", self.script, path.absolute(), message],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -90,11 +91,11 @@ class Child(NamedTuple):
         variables = {
             name: text for name, text in os.environ.items() if not name.startswith(self.hidden)
         }
-        # Threads take memory, and would be waited for if it is refused.
+        # Threads need memory, and the library would wait for threads that cannot start.
         return variables | {"OPENBLAS_NUM_THREADS": "1"} | {**self.environment}
 
     def _end(self, code: int) -> str:
-        """Return why the process ended before its last frame was read."""
+        """Describe why the process ended before its last frame was read."""
         if code == -signal.SIGALRM:
             return f"{self.library} exceeded its time limit"
         status = signal.Signals(-code).name if code < 0 else f"status {code}"
@@ -106,9 +107,9 @@ class Child(NamedTuple):
 
 
 def _next_frame(stream: IO[bytes], take: Callable[[dict[str, Any], int], None]) -> Frame | None:
-    """Read a frame, or None at the end.
+    """Read a frame, or return None at the end.
 
-    A process that has ended within a frame gives None too.
+    None is also returned if the process has ended within a frame.
     """
     line = stream.readline()
     if not line.endswith(b"\n"):

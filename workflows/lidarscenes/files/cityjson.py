@@ -1,6 +1,7 @@
-"""CityJSON and CityJSONSeq, after the specifications 1.0 to 2.0 (Ledoux et al. 2019, cityjson.org).
+"""Read CityJSON and CityJSONSeq, versions 1.0 to 2.0 (Ledoux et al. 2019, cityjson.org).
 
-This is not cjio, which triangulates in a loop of Python and keeps no names in its exports.
+cjio is not used, because it triangulates in a Python loop and does not preserve names in its
+exports.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 
-# {class of ASPRS LAS 1.4: name, and patterns of city objects, whose names begin with their types};
-# class 1 is for types that have no class in LAS.
+# ASPRS LAS 1.4 classes with patterns for the names of city objects, which begin with their types.
+# Class 1 is for types without a class in LAS.
 CLASSES = {
     1: ObjectClass(
         "unclassified",
@@ -75,26 +76,26 @@ _DEPTHS = {
     "MultiSolid": 3,
     "CompositeSolid": 3,
 }
-_OPEN_SURFACES = ("ClosureSurface", "WaterClosureSurface")  # through which light passes
-# EPSG codes of geographic reference systems: of published CityJSON files, and of countries.
+_OPEN_SURFACES = ("ClosureSurface", "WaterClosureSurface")  # light passes through them
+# EPSG codes of geographic coordinate systems in published CityJSON files and of countries.
 _GEOGRAPHIC_SYSTEMS = {
     4167, 4171, 4258, 4267, 4269, 4283, 4326, 4490, 4612, 4617, 4674, 4937, 4939, 4979,
     6667, 6668, 6697, 7789, 7843, 7844, 7912, 9518, 9755, 9989,
 }  # fmt: skip
 _CODES = re.compile(r"(?i)\b(EPSG|ESRI)[:/]+(?:[\d.]*[:/]+)?(\d{4,6})\b")
-_MAX_SLOPE = 100  # largest ratio of a city's height to its width, unless in degrees
+_MAX_SLOPE = 100  # if the ratio of height to width is larger, coordinates are in degrees
 _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or export it in parts"
 
 _Json = dict[str, Any]
 
 
 class _Polygons(NamedTuple):
-    """Polygons of the objects of a document.
+    """The polygons of the objects in a document.
 
-    An owner is (number of the object, material).
+    An owner is (index of the object, material).
     """
 
-    corners: list[Ints]  # vertices of the polygons without holes, an array for each object
+    corners: list[Ints]  # vertices of the polygons without holes, one array per object
     sizes: list[int]  # number of corners of each polygon without holes
     owners: list[tuple[int, int]]  # owners of polygons without holes
     holed_faces: list[Ints]  # triangles of the polygons with holes
@@ -102,7 +103,10 @@ class _Polygons(NamedTuple):
 
 
 def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the highest level of detail of each city object, from a .jsonl line by line."""
+    """Read each city object at its highest level of detail.
+
+    A .jsonl file is read line by line.
+    """
     allowance = Allowance(len(data), _PARTS)
 
     def lines() -> Iterator[bytes]:
@@ -130,17 +134,21 @@ def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _unpacked_bytes(text: bytes) -> int:
-    """Return the largest memory that reading JSON takes, in bytes."""
+    """Estimate the peak memory for parsing JSON in bytes."""
     return 5 * len(text) + 100 * text.count(b"[") + 300 * text.count(b"{") + 48 * text.count(b",")
 
 
 class _CityFile:
-    """The objects of a file, placed as nodes.
+    """The objects in a file, placed as nodes.
 
     Parameters
     ----------
     head
         The file, or the first line of a sequence.
+    allowance
+        Memory that the content may occupy.
+    options
+        Options for reading.
     """
 
     def __init__(self, head: _Json, allowance: Allowance, options: ReadOptions) -> None:
@@ -148,7 +156,7 @@ class _CityFile:
         self._allowance = allowance
         self._colors = options.colors
         self._names_materials = options.materials
-        self._unit = options.unit  # unit that the user gives
+        self._unit = options.unit  # unit that the user has specified
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -161,15 +169,16 @@ class _CityFile:
         self._unscaled = "transform" not in head and version >= "1.1"
         self._placed: list[PlacedNode] = []
         self._templates: list[list[SceneMesh]] | None = None
-        self._levels: Counter[float] = Counter()  # {level of detail: objects}
-        self._unread: Counter[str] = Counter()  # {kind of unread content: count}
+        self._levels: Counter[float] = Counter()  # number of objects by level of detail
+        self._unread: Counter[str] = Counter()  # number of unread items by kind
 
     def add(self, document: _Json) -> None:
-        """Add the objects of a file or line."""
+        """Add the objects in a file or a line."""
         points = _points(document["vertices"]) * self._scale + self._translate
         objects: dict[str, _Json] = document["CityObjects"]
         levels: dict[str, list[tuple[float, _Json]]] = {}
-        parts: dict[str, float] = defaultdict(lambda: -np.inf)  # {object: finest of its parts}
+        # Finest level of detail of each object's parts
+        parts: dict[str, float] = defaultdict(lambda: -np.inf)
         for key, entry in objects.items():
             levels[key] = list(self._with_levels(entry.get("geometry") or ()))
             if entry["type"].endswith("Part"):
@@ -178,7 +187,7 @@ class _CityFile:
                     parts[parent] = max(parts[parent], finest)
         surfaces_of_objects: list[tuple[str, list[_Json]]] = []
         for key, leveled in levels.items():
-            # A building stands for its parts unless they are finer.
+            # A building represents its parts unless these are more detailed.
             best = max((level for level, _ in leveled), default=-np.inf)
             if not leveled or best < parts.get(key, -np.inf):
                 continue
@@ -222,10 +231,10 @@ class _CityFile:
     def _meshes(
         self, points: Floats, objects: list[tuple[str, list[_Json]]], document: _Json
     ) -> list[list[SceneMesh]]:
-        """Return the mesh of each object, in a list, or an empty list without triangles.
+        """Return the mesh of each object in a list, which is empty without triangles.
 
-        `objects` are names and geometries. All polygons of a document are cut at once, which takes
-        a tenth of the time.
+        `objects` are names and geometries. All polygons in a document are triangulated at once,
+        which is ten times as fast.
         """
         faces, owners = self._triangles(points, self._polygons(points, objects))
         if not len(faces):
@@ -244,7 +253,7 @@ class _CityFile:
         ]
 
     def _polygons(self, points: Floats, objects: list[tuple[str, list[_Json]]]) -> _Polygons:
-        """Collect the polygons of objects, and cut polygons with holes into triangles."""
+        """Collect the polygons of objects, and triangulate polygons with holes."""
         polygons = _Polygons([np.zeros(0, np.int64)], [], [], [], [])
         for number, (name, geometries) in enumerate(objects):
             corners: list[int] = []
@@ -268,11 +277,11 @@ class _CityFile:
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
-        """Cut polygons into triangles (t, 3), and return these and their owners (t, 2)."""
+        """Triangulate polygons, and return the triangles (t, 3) and their owners (t, 2)."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
-        # No two polygons share corners, so that triangles belong to the polygon of a corner.
+        # Polygons do not share corners here, so each corner identifies the polygon of a triangle.
         simple = triangulated(points[corners], np.arange(len(corners)), sizes)
         polygon = np.searchsorted(np.cumsum(sizes), simple[:, 0], side="right")
         faces = np.concatenate([corners[simple], *polygons.holed_faces])
@@ -285,7 +294,7 @@ class _CityFile:
         return faces, owners
 
     def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
-        """Return triangles with color and name of a material, where -1 is not a material."""
+        """Return triangles with the color and name of a material; -1 means no material."""
         colors = None
         name = ""
         if material >= 0:
@@ -297,15 +306,15 @@ class _CityFile:
         return Piece(points, faces, None, colors, name)
 
     def _surfaces(self, geometries: Sequence[_Json]) -> Iterator[tuple[list[list[int]], int]]:
-        """Yield the rings of polygons and the numbers of their materials, -1 for none."""
+        """Yield the rings of polygons, and the indices of their materials or -1."""
         for geometry in geometries:
-            if geometry["type"] not in _DEPTHS:  # geometry of a template
+            if geometry["type"] not in _DEPTHS:  # only in templates
                 self._unread[str(geometry["type"])[:40]] += 1
                 continue
             semantics = geometry.get("semantics") or {}
             kinds = dict(enumerate(surface["type"] for surface in semantics.get("surfaces") or ()))
             paint: _Json = {}
-            if self._colors or self._names_materials:  # the first theme counts
+            if self._colors or self._names_materials:  # the first theme is used
                 paint = next(iter((geometry.get("material") or {}).values()), {})
             values = semantics.get("values"), paint.get("values", paint.get("value"))
             if self._colors and geometry.get("texture"):
@@ -325,7 +334,7 @@ class _CityFile:
             *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
         ]
         corners = np.concatenate(bounds)[bool(self._placed) :]
-        system = _System.of_head(self._head, corners)
+        system = _System.from_head(self._head, corners)
         system.check(corners)
         if system.height_units != 1 and self._unit is None:
             matrix = np.diag([1.0, 1.0, system.height_units, 1.0])
@@ -355,7 +364,10 @@ class _CityFile:
 
 @dataclass(frozen=True)
 class _System:
-    """The reference system of a file, by rasterio if it is installed."""
+    """The coordinate system of a file.
+
+    Its properties are known if rasterio is installed.
+    """
 
     name: str  # code, or empty
     epsg: int | None
@@ -365,8 +377,8 @@ class _System:
     height_units: float = 1.0  # units of x and y in the unit of heights
 
     @classmethod
-    def of_head(cls, head: _Json, corners: Floats) -> _System:
-        """Return the system of a file, or of the first line of a sequence, with its corners."""
+    def from_head(cls, head: _Json, corners: Floats) -> _System:
+        """Return the coordinate system stated in a file or the first line of a sequence."""
         text = str((head.get("metadata") or {}).get("referenceSystem") or "")
         looks_like_angles = _looks_like_angles(corners)
         codes = _CODES.findall(text)  # the first code of a compound system is horizontal
@@ -388,7 +400,7 @@ class _System:
         return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
 
     def check(self, corners: Floats) -> None:
-        """Raise MeshFileError if coordinates (n, 3) are angles, or lengths that are not true."""
+        """Raise MeshFileError if coordinates (n, 3) are angles or not true to scale."""
         reproject = "Reproject it, for example with `cjio FILE crs_reproject {} save NEW`"
         if self.is_of_angles:
             raise MeshFileError(
@@ -402,7 +414,7 @@ class _System:
             raise MeshFileError(f"uses {self.name}, {problem}. {reproject.format(code or 'EPSG')}")
 
     def notes(self, *, unit_given: bool) -> list[str]:
-        """Return notes on the system."""
+        """Return notes on the coordinate system."""
         if self.unit_m != 1 and not unit_given:
             return [
                 f"uses {self.name}, whose unit is {self.unit_m:.9g} m. Its coordinates were "
@@ -418,7 +430,7 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners (n, 3) of a city are degrees with heights in meters."""
+    """Return True if the corners (n, 3) of a city are apparently in degrees."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))
@@ -427,7 +439,7 @@ def _looks_like_angles(corners: Floats) -> bool:
 def _points(coordinates: Any) -> Floats:
     """Return coordinates (v, 3).
 
-    Raises ValueError for another shape.
+    Raises ValueError if they have another shape.
     """
     try:
         points = np.array(coordinates or np.zeros((0, 3)), np.float64)
@@ -439,7 +451,10 @@ def _points(coordinates: Any) -> Floats:
 
 
 def _integers(numbers: Sequence[int]) -> Ints:
-    """Return whole numbers (n,), or raise ValueError."""
+    """Return integers (n,).
+
+    Raises ValueError if the values are not integers.
+    """
     array = np.array(numbers or np.zeros(0, np.int64))
     if array.ndim != 1 or array.dtype != np.int64:
         raise ValueError(
@@ -450,9 +465,9 @@ def _integers(numbers: Sequence[int]) -> Ints:
 
 
 def _item(items: Any, number: Any) -> Any:
-    """Return an item by its number.
+    """Return an item by its index.
 
-    Raises ValueError if no item has the number.
+    Raises ValueError if the index is invalid.
     """
     if type(number) is not int or not 0 <= number < len(items):
         raise ValueError(
@@ -462,7 +477,7 @@ def _item(items: Any, number: Any) -> Any:
 
 
 def _level(geometry: _Json) -> float:
-    """Return the level of detail of a geometry, -1 if the level is unknown."""
+    """Return the level of detail of a geometry, or -1 if it is unknown."""
     try:
         return float(geometry["lod"])
     except (KeyError, TypeError, ValueError):
@@ -470,7 +485,7 @@ def _level(geometry: _Json) -> float:
 
 
 def _surfaces_at(tree: Any, depth: int, *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the lists at a depth of nested lists, with their nested or shared values."""
+    """Yield the items at a depth of nested lists, with their nested or shared values."""
     if not depth:
         yield (tree, *values)
         return

@@ -1,11 +1,13 @@
-"""COLLADA files, .dae, after its specification 1.4.1 by the Khronos Group (2008).
+"""Read COLLADA files (.dae), following specification 1.4.1 by the Khronos Group (2008).
 
-This is not pycollada, which drops geometry with a material, a skin or a morph that it does not
-resolve, holes in polygons and offsets of accessors, refuses comments, pictures without paths and
-odd colors, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
-files, skips missing geometries, keeps single precision, and ends the process if nodes contain each
-other. Only triangles are read, and the diffuse colors and images of materials; not lights, cameras
-and animations.
+Triangles are read with the diffuse colors and images of their materials. Lights, cameras, and
+animations are not read.
+
+pycollada is not used. It drops geometry with an unresolved material, skin, or morph, holes in
+polygons, and offsets of accessors. It refuses comments, images without paths, and unusual colors,
+and it reduces coordinates to single precision. assimp 5.4 is not used either. It refused twice as
+many of 661 public files, skips missing geometries, reduces coordinates to single precision, and
+crashes if nodes contain each other.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.companions import image_file
@@ -46,15 +48,15 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
 class _Inputs(NamedTuple):
-    """Points of a primitive, and the layout of the numbers in <p>."""
+    """The points of a primitive, and the layout of the numbers in <p>."""
 
     points: Floats  # (v, 3)
-    offset: int  # offset of the indices of points in the numbers of a corner
-    stride: int  # count of numbers of a corner
+    offset: int  # position of the point index among the numbers of a corner
+    stride: int  # number of values per corner
 
 
 def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visual scene of a file, with colors and names of its materials."""
+    """Read the visual scene of a file, with the colors and names of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -79,10 +81,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Document:
-    """Elements of a file by their ids.
-
-    Each geometry is read once.
-    """
+    """The elements of a file by ID; each geometry is read once."""
 
     def __init__(
         self, root: Element, allowance: Allowance, paint: _Effects | None, options: ReadOptions
@@ -92,7 +91,7 @@ class _Document:
         self._paint = paint
         self._names_materials = options.materials
         self._skins_at_rest = options.skins_at_rest
-        # By kind, too: some programs give a scene and a node in it the same id.
+        # The tag is part of the key, because some programs give a scene and its node the same ID.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
             self._ids.setdefault((element.tag, element.get("id", "")), element)
@@ -101,14 +100,14 @@ class _Document:
         self._floats = cache(_numbers)
 
     def roots(self) -> list[Element]:
-        """Return the visual scene of the file, in a list, by default the first."""
+        """Return the visual scene that the file selects, or its first one, in a list."""
         shown = self._root.find("scene/instance_visual_scene")
         if shown is not None:
             return [self._target(shown, "visual_scene")]
         return self._root.findall("library_visual_scenes/visual_scene")[:1]
 
     def node(self, element: Element) -> Node:
-        """Return the node of a <node>, or of the <visual_scene>."""
+        """Return the node for a <node> or a <visual_scene>."""
         meshes: list[SceneMesh] = []
         children = []
         matrix = np.eye(4)
@@ -140,7 +139,7 @@ class _Document:
         return Node(name, matrix, meshes, children, skinned=is_skinned)
 
     def _skin(self, controller: Element, instance: Element) -> list[SceneMesh]:
-        """Return the meshes of a skin where its joints are at rest, in the file's coordinates."""
+        """Return the meshes of a skin in its rest pose, in the coordinates of the file."""
         skin = controller.find("skin")
         if skin is None:
             raise MeshFileError(
@@ -161,7 +160,10 @@ class _Document:
         ]
 
     def _target(self, element: Element, kind: str) -> Element:
-        """Return the element of a kind that an element names, or raise MeshFileError."""
+        """Return the element of a kind that an element refers to.
+
+        Raises MeshFileError if it is not in the file.
+        """
         url = element.get("source", element.get("url", ""))
         target = self._ids.get((kind, url[1:]), self._ids.get((kind, unquote(url[1:]))))
         if target is None or not url.startswith("#"):
@@ -174,9 +176,9 @@ class _Document:
     def _read_geometry(
         self, geometry: Element, bound: tuple[tuple[str, Element], ...]
     ) -> list[SceneMesh]:
-        """Return the mesh of all primitives, which differ by material only, or an empty list.
+        """Return the mesh of all primitives, which differ only in their materials, or nothing.
 
-        `bound` are symbols of materials, and the elements they stand for.
+        `bound` are the material symbols and the elements that they refer to.
         """
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
@@ -203,7 +205,7 @@ class _Document:
         return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
 
     def _bound_materials(self, instance: Element) -> tuple[tuple[str, Element], ...]:
-        """Return the materials that an instance of a geometry gives to its symbols."""
+        """Return the materials that a geometry instance assigns to symbols."""
         entries = instance.findall("bind_material/technique_common/instance_material")
         materials = [
             (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
@@ -212,7 +214,7 @@ class _Document:
         return tuple((symbol, material) for symbol, material in materials if material is not None)
 
     def _piece(self, primitive: Element, material: Element | None) -> Piece:
-        """Return the triangles of a primitive, in the colors of a material."""
+        """Return the triangles of a primitive in the colors of a material."""
         points, offset, stride = self._inputs(primitive)
         lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
         numbers = map(_integers, lists)
@@ -238,10 +240,10 @@ class _Document:
         corners: Ints,
         triangle_corners: Ints,
     ) -> Colors | None:
-        """Return the colors of triangles by a material, or None if its effect has no color.
+        """Return the colors of triangles, or None if the effect of the material has no color.
 
-        `corners` (c, stride) are the numbers in <p>. Rows of `corners` are the corners of
-        triangles, `triangle_corners` (t, 3).
+        `corners` (c, stride) are the numbers in <p>, and `triangle_corners` (t, 3) are the rows of
+        `corners` that form the triangles.
         """
         url = material.find("instance_effect[@url]")
         assert url is not None
@@ -263,7 +265,7 @@ class _Document:
     def _inputs(self, primitive: Element) -> _Inputs:
         """Return the points of a primitive.
 
-        Raises ValueError without points.
+        Raises ValueError if there are none.
         """
         stride = 0
         points = None
@@ -279,14 +281,14 @@ class _Document:
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
-        """Return the positions (v, 3) of <vertices>."""
+        """Return the positions (v, 3) in <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
             raise ValueError(f"{_tag(vertices)} has no <input> with the semantic POSITION")
         source = self._target(entry, "source")
         rows = self._rows(source)
         accessor = source.findall("technique_common/accessor/param")
-        # Skip a parameter without a name.
+        # Parameters without a name are skipped.
         names = [parameter.get("name") for parameter in accessor]
         columns = [names.index(axis) for axis in "XYZ" if axis in names]
         if len(columns) != 3:
@@ -295,7 +297,7 @@ class _Document:
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:
-        """Return the numbers (count, stride) of a <source>."""
+        """Return the numbers (count, stride) in a <source>."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError(f"{_tag(source)} has no <accessor>")
@@ -312,10 +314,7 @@ class _Document:
 
 
 class _Effects:
-    """Diffuse colors of effects.
-
-    Each image is read once.
-    """
+    """The diffuse colors of effects; each image is read once."""
 
     def __init__(self, path: Path, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -325,10 +324,7 @@ class _Effects:
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or color (1, 1, 3) of an effect.
-
-        Returns None for an effect without color.
-        """
+        """Return the image or the color (1, 1, 3) of an effect, or None if it has none."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
@@ -338,7 +334,8 @@ class _Effects:
             if color is None:
                 return None
             return as_bytes(np.array(color.split()[:3], np.float64)).reshape(1, 1, 3)
-        # A sampler's surface names an image; some programs leave out the sampler or both.
+        # A texture refers to a sampler, which refers to a surface, which refers to an image. Some
+        # programs omit the sampler or both.
         parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
         name = texture.get("texture", "")
         wrap_s = ""
@@ -359,9 +356,9 @@ class _Effects:
         return self._texture((file.strip(), wrap_s, wrap_t))
 
     def _read_texture(self, key: tuple[str, str, str]) -> Texture:
-        """Read the texture of an image.
+        """Read an image as a texture.
 
-        `key` is its name and the wraps along s and t.
+        `key` consists of its name and the wrap modes along s and t.
         """
         name, *wraps = key
         file = image_file(self._path, name, self._options, self._allowance)
@@ -375,7 +372,7 @@ def _triangles(
 ) -> Iterator[Ints]:
     """Yield the triangles (t, 3) of a primitive.
 
-    `corners` returns the corners of a <p> or <h>.
+    `corners` returns the corners in a <p> or <h>.
     """
     lists = [corners(p) for p in primitive.findall("p")]
     if primitive.tag == "triangles":
@@ -415,7 +412,7 @@ def _numbers(element: Element) -> Floats:
 def _words(element: Element, kind: type, expected: str) -> AnyArray:
     """Return the numbers of a type in the text of an element.
 
-    Raises ValueError for other words.
+    Raises ValueError if the text contains anything else.
     """
     words = (element.text or "").split()
     try:
@@ -437,9 +434,9 @@ def _is_number(word: str, kind: type) -> bool:
 
 
 def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
-    """Return an attribute.
+    """Return an attribute as an integer.
 
-    Raises ValueError if the attribute is not a whole number.
+    Raises ValueError if it is not an integer.
     """
     text = element.get(attribute, str(default))
     try:
@@ -451,15 +448,15 @@ def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
 
 
 def _tag(element: Element) -> str:
-    """Return the start of an element, for messages: «<source id="positions">»."""
+    """Return the start of an element for messages, for example ``<source id='positions'>``."""
     name = element.get("id") or element.get("sid")
     return f"<{element.tag} id={name[:40]!r}>" if name else f"<{element.tag}>"
 
 
 def _step(element: Element) -> Floats:
-    """Return the matrix (4, 4) of a step of a placement.
+    """Return the matrix (4, 4) of a transform element.
 
-    Raises ValueError for other numbers.
+    Raises ValueError if it has the wrong number of values.
     """
     numbers = _numbers(element)
     count, matrix_of = _STEPS[element.tag]
@@ -469,16 +466,16 @@ def _step(element: Element) -> Floats:
 
 
 def _rotate(numbers: Floats) -> Floats:
-    """Return the rotation about an axis, in degrees, or the identity without an axis."""
+    """Return a rotation about an axis in degrees, or the identity without an axis."""
     *axis, degrees = numbers
     return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
 
 
 def _look_at(numbers: Floats) -> Floats:
-    """Return the matrix of a camera position, its target and up, (9,)."""
+    """Return the matrix for a camera position, a target, and an up vector, given as (9,)."""
     eye, target, up = numbers.reshape(3, 3)
-    z = (eye - target) / length(eye - target)
-    x = np.cross(up, z) / length(np.cross(up, z))
+    z = (eye - target) / norm(eye - target)
+    x = np.cross(up, z) / norm(np.cross(up, z))
     return affine(np.stack([x, np.cross(z, x), z], axis=1), eye)
 
 

@@ -1,13 +1,13 @@
-"""Mesh formats that lidarscenes adds: `mesh_formats` finds this table by its name."""
+"""List the mesh formats that lidarscenes adds; `mesh_formats` in lidarsim finds this table."""
 
 from __future__ import annotations
 
 from lidarsim.scene.files.mesh_formats import MeshFormat
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
-ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
-WORLDS = (".sdf", ".world")  # worlds of Gazebo
-MODELS = (".xml",)  # models of MuJoCo
+ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro files with advice
+WORLDS = (".sdf", ".world")  # Gazebo worlds
+MODELS = (".xml",)  # MuJoCo models
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"

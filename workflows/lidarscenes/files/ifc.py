@@ -1,4 +1,4 @@
-"""Buildings of IFC, .ifc and .ifczip, through ifcopenshell (license LGPL-3.0-or-later).
+"""Read IFC buildings (.ifc and .ifczip) with ifcopenshell (LGPL-3.0-or-later).
 
 `ifc_child.py` reads the files in a separate process. The shapes of elements come from the geometry
 iterator of ifcopenshell, with openings cut out.
@@ -25,7 +25,6 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.elementary import arctan2
 from lidarsim.base.extras import install_command
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -43,10 +42,10 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .child_process import Child
+from .child_process import ReaderProcess
 
-# {number: name, and classes of IFC with their subclasses}. Numbers are of ASPRS LAS 1.4, from 64
-# on free to use; 64 to 72 are of roads.
+# {number: (name, IFC classes, including their subclasses)}. Numbers are ASPRS LAS 1.4 classes. From
+# 64 on, they are user-defined; 64 to 72 are used for roads.
 _CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
     2: (
         "ground",
@@ -66,11 +65,11 @@ _CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
 }
 _OTHER_CLASS = (1, "unclassified")
 
-MIN_MEMORY_BYTES = 1024 * 2**20  # bytes that ifcopenshell and its process may take for any file
-MEMORY_TIMES = 30  # memory as a multiple of the file's bytes
+MIN_MEMORY_BYTES = 1024 * 2**20  # memory that the ifcopenshell process may use for any file
+MEMORY_TIMES = 30  # additional memory as a multiple of the file size
 _END = b"END-ISO-10303-21"
-_END_BYTES = 200  # bytes of a file that contain its end
-_MAX_SCALE_ERROR = 0.1  # limit: meters of a map are meters of a building, nearly
+_END_BYTES = 200  # number of bytes in which the end mark must be found
+_MAX_SCALE_ERROR = 0.1  # a larger deviation from 1 means that units do not match
 _MAP_NUMBERS = (
     "Eastings",
     "Northings",
@@ -87,9 +86,8 @@ _EMPTY = "contains no elements with geometry, such as walls or slabs, in the sel
 
 
 @dataclass(frozen=True)
-@checked_fields
 class IfcOptions:
-    """Options of buildings."""
+    """Options for reading buildings."""
 
     storeys: Annotated[
         Annotated[Several[Text], Field(min_length=1)] | None,
@@ -98,7 +96,7 @@ class IfcOptions:
 
 
 def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the elements of a building, all or of the storeys in `options.own`."""
+    """Read the elements of a building, optionally restricted to storeys."""
     own: IfcOptions = options.own
     storeys = own.storeys
     is_packed = path.suffix.lower() == ".ifczip"
@@ -109,15 +107,15 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
         raise MeshFileError(
             f"is an IFC file, which requires ifcopenshell. Install it with `{command}`"
         )
-    if sys.platform == "win32":  # where a process has no limits of memory
+    if sys.platform == "win32":  # memory limits of processes are not supported
         raise MeshFileError("is an IFC file, which is not supported on Windows. Export it as .glb")
     if not is_packed:
         _check_end(path)
     size = path.stat().st_size
     allowance = Allowance(size, _ADVICE)
-    # Packed files are about a tenth.
+    # Packed files have about a tenth of the size.
     memory = MIN_MEMORY_BYTES + MEMORY_TIMES * (10 * size if is_packed else size)
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("ifc_child.py"),
         "ifcopenshell",
         min(memory, MIN_MEMORY_BYTES + memory_share()),
@@ -150,7 +148,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _check_end(path: Path) -> None:
-    """Check that a file has its last line: ifcopenshell reads files cut short in silence."""
+    """Check that a file has its last line, because ifcopenshell reads truncated files silently."""
     with path.open("rb") as stream:
         stream.seek(max(path.stat().st_size - _END_BYTES, 0))
         if _END not in stream.read():
@@ -158,9 +156,9 @@ def _check_end(path: Path) -> None:
 
 
 def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
-    """Check that a building has all storeys asked for.
+    """Check that a building has all requested storeys.
 
-    Raises MeshFileError with their names if not.
+    Raises MeshFileError, with the names of its storeys, if not.
     """
     missing = [name for name in wanted or () if name not in storeys]
     if missing:
@@ -171,7 +169,7 @@ def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
 
 
 class _Shapes:
-    """Meshes of the shapes of a file, which elements share."""
+    """The meshes of the shapes in a file, which elements share."""
 
     def __init__(self, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -185,9 +183,9 @@ class _Shapes:
         self._frames.append((frame, arrays))
 
     def meshes(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
-        """Return the mesh of a shape, in a list, or an empty list without triangles.
+        """Return the mesh of a shape in a list, which is empty without triangles.
 
-        `plain_material` is the name of the material of faces without a style.
+        `plain_material` is the material name for faces without a style.
         """
         key = (number, plain_material if self._options.materials else "")
         if key not in self._meshes:
@@ -195,7 +193,7 @@ class _Shapes:
         return self._meshes[key]
 
     def _mesh(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
-        """Return the mesh of a shape, with colors and materials if asked for."""
+        """Return the mesh of a shape, with colors and materials if requested."""
         frame, (vertices, faces, styles) = self._frames[number]
         pieces = []
         for style in np.unique(styles).tolist():
@@ -249,7 +247,7 @@ def _content(
 
 
 def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, ObjectClass]:
-    """Return the semantic classes of the classes of IFC in a file."""
+    """Return the semantic classes for the IFC classes in a file."""
     patterns: dict[tuple[int, str], list[str]] = defaultdict(list)
     for name in sorted(names):
         matches = (
@@ -267,7 +265,7 @@ def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, Obje
 def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
     """Return notes on the coordinate system that a file states.
 
-    `middle` (2,) are x and y in the middle of the building.
+    `middle` (2,) is the center of the building in plan.
     """
     stated = building["map"]
     if stated is None:
@@ -297,9 +295,9 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
 
 
 def _conversion_note(conversion: _MapConversion, system: str, *, is_known: bool) -> str:
-    """Return the note on a map conversion that moves, rotates or scales a building.
+    """Return a note on a map conversion that moves, rotates, or scales a building.
 
-    `is_known` says whether `system` is an EPSG code.
+    `is_known` states whether `system` is an EPSG code.
     """
     where = system if conversion.system else "its coordinate system"
     x, y, z = (number * conversion.unit_m for number in conversion.offset)
@@ -335,7 +333,7 @@ def _scale_list(conversion: _MapConversion) -> str:
 
 @dataclass(frozen=True)
 class _MapConversion:
-    """The map conversion of a building, with its numbers validated."""
+    """The validated map conversion of a building."""
 
     system: str  # name of the coordinate system, or empty
     unit_m: float  # meters in the unit of the map
@@ -346,11 +344,12 @@ class _MapConversion:
 
     @classmethod
     def from_file(cls, stated: dict[str, Any]) -> _MapConversion:
-        """Return the conversion that a file states.
+        """Validate the conversion that a file states.
 
-        Raises ValueError if it cannot be understood. The unit of the map is that of the coordinate
-        system, else the unit by which the stated scale is near 1, of the project or meters, else
-        that of the project. A scale that is not stated converts units and nothing else.
+        The map unit is that of the coordinate system. If it is not stated, it is the unit, meters
+        or the project unit, for which the scale is close to 1. Without a scale, it is the project
+        unit. A missing scale means that only units are converted. Raises ValueError if the
+        conversion is inconsistent.
         """
         if stated["count"] > 1:
             raise ValueError(
@@ -383,19 +382,19 @@ class _MapConversion:
 
     @property
     def is_true(self) -> bool:
-        """Whether lengths of the building are lengths on the map."""
+        """Whether lengths in the building are equal to lengths on the map."""
         return all(abs(scale - 1) <= 1e-9 for scale in self.scales)
 
     @property
     def is_identity(self) -> bool:
-        """Whether coordinates of the building are coordinates on the map, but for the unit."""
+        """Whether coordinates in the building are equal to map coordinates, except for the unit."""
         return self.is_true and not any(self.offset) and not self.heading_deg
 
 
 def _number(stated: dict[str, Any], name: str) -> float | None:
-    """Return a number of a map conversion, or None if it is not stated.
+    """Return a number in a map conversion, or None if it is not stated.
 
-    Property sets may have it as text.
+    Property sets may contain it as text.
     """
     value = stated.get(name)
     if value is None or value == "":
@@ -410,7 +409,7 @@ def _number(stated: dict[str, Any], name: str) -> float | None:
 
 
 def _map_unit_m(unit: float | str | None, project_m: float, scale: float | None) -> float:
-    """Return the meters in the unit of a map, by its length in meters, its name, or the scale."""
+    """Return the length of a map unit in meters, given its length, its name, or the scale."""
     if isinstance(unit, str):
         unit_m = unit_by_name(unit)
         if unit_m is None:

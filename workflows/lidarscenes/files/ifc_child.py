@@ -1,8 +1,8 @@
-"""Reads an IFC building with ifcopenshell, in a process that `ifc.py` starts: a script.
+"""Read an IFC building with ifcopenshell in the process that `ifc.py` starts; this is a script.
 
-ifcopenshell ends its process on some broken files; here this process only. The script imports
-nothing of lidarpool. Standard output gets frames (`child_process.py`): first of the building,
-then of each shape that elements share, last of the elements.
+Invalid files can crash ifcopenshell, and here this affects only this process. The script imports
+nothing from lidarpool. It writes frames to standard output (see `child_process.py`): first the
+building, then each shape that elements share, and finally the elements.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ import numpy as np
 from ifcopenshell.util.unit import calculate_unit_scale, get_unit_scale
 from numpy.typing import NDArray
 
-MAX_WAIT_S = 300  # limit between two shapes; broken files may take for ever
-_MAX_PARENTS = 100  # limit for an element in the tree of a building; broken files have cycles
+MAX_WAIT_S = 300  # time limit between two shapes; invalid files may never finish
+_MAX_PARENTS = 100  # maximum depth of an element in a building; invalid files have cycles
 
-_HEAD_BYTES = 2**16  # bytes of a file that contain its header
+_HEAD_BYTES = 2**16  # number of bytes in which the header must be found
 _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
-# Schemas whose entities have the attributes of a schema that the library reads, but for attributes
-# without a shape and for the order of Normals and Closed of triangulated face sets, which are not
-# used. The drafts of IFC4X3, _RC1 to _RC4, differ in more.
+# Schemas that are equivalent to a schema that the library supports. They differ only in attributes
+# that do not affect shapes, and in the order of Normals and Closed in triangulated face sets, which
+# are not used. The drafts of IFC4X3, _RC1 to _RC4, have more differences.
 _SAME_SCHEMAS = {
     "IFC2X3_FINAL": "IFC2X3",
     "IFC2X3_TC1": "IFC2X3",
@@ -42,7 +42,7 @@ _SAME_SCHEMAS = {
     "IFC4X3_TC1": "IFC4X3_ADD2",
 }
 
-# Classes, with their subclasses, that have shapes and reflect no light.
+# Classes, including their subclasses, whose shapes do not reflect light.
 _UNREAD = {
     "IfcSpatialElement",
     "IfcSpatialStructureElement",  # type of IFC2X3
@@ -57,7 +57,7 @@ _UNREAD = {
     "IfcStructuralItem",
 }
 _TERRAIN = "IfcSite"
-# Relations of an element: attribute of the element, attribute of the relation with its parent.
+# Relations of an element: its attribute, and the attribute of the relation that has the parent.
 _PARENTS = (
     ("ContainedInStructure", "RelatingStructure"),
     ("Decomposes", "RelatingObject"),
@@ -66,7 +66,7 @@ _PARENTS = (
     ("VoidsElements", "RelatingBuildingElement"),
     ("AdheresToElement", "RelatingElement"),
 )
-# Property sets that stand in for IfcMapConversion and IfcProjectedCRS, in lower case.
+# Property sets that replace IfcMapConversion and IfcProjectedCRS in IFC2X3, in lower case.
 _CONVERSION_SET = "epset_mapconversion"
 _SYSTEM_SET = "epset_projectedcrs"
 _MAP_NUMBERS = (
@@ -80,7 +80,7 @@ _MAP_NUMBERS = (
 
 
 class Building:
-    """The elements of a file."""
+    """The elements in a file."""
 
     def __init__(self, path: str, request: dict[str, Any], write: Any) -> None:
         self._file = _open(path, request["max_unpacked"])
@@ -112,7 +112,7 @@ class Building:
             self._write_elements([], [], [])
 
     def _elements(self) -> Iterable[Any]:
-        """Yield the elements with a shape that reflects light, of the storeys asked for."""
+        """Yield the elements of the requested storeys whose shapes reflect light."""
         for product in self._file.by_type("IfcProduct"):
             ancestors = self._ancestors_of(product.is_a())
             if product.Representation is None:
@@ -123,7 +123,7 @@ class Building:
                 yield product
 
     def _ancestors_of(self, name: str) -> list[str]:
-        """Return the name of a class and of its superclasses."""
+        """Return the names of a class and its superclasses."""
         if name not in self._ancestors:
             names = []
             declaration = self._schema.declaration_by_name(name).as_entity()
@@ -144,7 +144,7 @@ class Building:
         raise ValueError("the containment of its elements is circular")
 
     def _write_shapes(self, elements: dict[int, Any]) -> None:
-        """Write shapes and elements."""
+        """Write the shapes and the elements."""
         settings = ifcopenshell.geom.settings()
         settings.set("no-normals", True)
         settings.set("apply-default-materials", False)
@@ -159,7 +159,7 @@ class Building:
             placed = iterator.get()
             geometry = placed.geometry
             element = elements.get(placed.id)
-            # A wall that its opening takes away has a shape without triangles.
+            # A wall that an opening removes completely has a shape without triangles.
             if element is not None and len(geometry.faces_buffer):
                 if geometry.id not in shapes:
                     shapes[geometry.id] = len(shapes)
@@ -177,7 +177,7 @@ class Building:
     def _write_elements(
         self, rows: list[Any], matrices: list[NDArray[Any]], missing: list[str]
     ) -> None:
-        """Write the frame of all elements, and names of elements without triangles."""
+        """Write the frame of all elements, with the names of elements without triangles."""
         self._write(
             {
                 "what": "elements",
@@ -190,9 +190,9 @@ class Building:
         )
 
     def _write_shape(self, geometry: Any) -> None:
-        """Write the triangles and materials of a shape."""
+        """Write the triangles and the materials of a shape."""
         faces = np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3)
-        # Styles of the triangles, then of the edges of curves in the shape.
+        # The styles of triangles are followed by those of curves.
         styles = np.frombuffer(geometry.material_ids_buffer, np.int32)[: len(faces)]
         self._write(
             {
@@ -205,9 +205,9 @@ class Building:
         )
 
     def _material(self, style: Any) -> dict[str, Any]:
-        """Return the name, color and transparency of a style.
+        """Return the name, color, and transparency of a style.
 
-        A color is None if not stated.
+        The color is None if it is not stated.
         """
         color = style.get_color()
         shares = [color.r(), color.g(), color.b()]
@@ -221,15 +221,15 @@ class Building:
         }
 
     def _states_unit(self) -> bool:
-        """Return True if the project states a unit of length."""
+        """Return True if the project states a length unit."""
         units = [unit for entry in self._file.by_type("IfcUnitAssignment") for unit in entry.Units]
         return any(getattr(unit, "UnitType", None) == "LENGTHUNIT" for unit in units)
 
     def _map_conversion(self) -> dict[str, Any] | None:
         """Return the map conversion as the file states it, or None.
 
-        Entities take precedence over the property sets that stand in for them in IFC2X3. Values
-        are those of the file; `ifc.py` validates and converts them.
+        Entities take precedence over the property sets that replace them in IFC2X3. `ifc.py`
+        validates and converts the values.
         """
         if not self._file.by_type("IfcProject"):
             return None
@@ -239,7 +239,7 @@ class Building:
         return {"unit_m": calculate_unit_scale(self._file), "count": 1} | stated
 
     def _stated_operation(self) -> dict[str, Any] | None:
-        """Return the first coordinate operation, an entity since IFC4, or None."""
+        """Return the first coordinate operation, which exists since IFC4, or None."""
         try:
             operations = self._file.by_type("IfcCoordinateOperation")
         except RuntimeError:  # IFC2X3 has no such class
@@ -265,10 +265,11 @@ class Building:
         return stated | {name: getattr(operation, name, None) for name in names}
 
     def _stated_sets(self) -> dict[str, Any] | None:
-        """Return the map conversion in property sets, by whatever object has the sets, or None.
+        """Return the map conversion in property sets of any object, or None.
 
-        "User Guide for Geo-referencing in IFC" of buildingSMART, version 2, has them on the
-        project; programs have them on the site, too, and differ in the case of the name.
+        According to the "User Guide for Geo-referencing in IFC", version 2, by buildingSMART, the
+        project has the property sets. Some programs assign them to the site, and the case of the
+        name varies.
         """
         sets: dict[str, list[dict[str, Any]]] = {_CONVERSION_SET: [], _SYSTEM_SET: []}
         for entity in self._file.by_type("IfcPropertySet"):
@@ -288,7 +289,7 @@ class Building:
         }
 
     def _position_of_site(self) -> list[float] | None:
-        """Return the latitude and longitude of the site, degrees, or None."""
+        """Return the latitude and longitude of the site in degrees, or None."""
         for site in self._file.by_type("IfcSite"):
             angles = [site.RefLatitude, site.RefLongitude]
             if all(angles) and any(map(any, angles)):
@@ -301,9 +302,9 @@ class Building:
 
 
 def _open(path: str, max_unpacked: int) -> Any:
-    """Open a file, and unpack an .ifczip in memory.
+    """Open a file, unpacking an .ifczip in memory.
 
-    UnreadSchemaError if the library does not read the schema of the file.
+    Raises UnreadSchemaError if the library does not support the schema of the file.
     """
     if path.lower().endswith(".ifczip"):
         data = _unpacked(path, max_unpacked)
@@ -318,7 +319,7 @@ def _open(path: str, max_unpacked: int) -> Any:
 
 
 def _unpacked(path: str, max_bytes: int) -> bytes:
-    """Return the bytes of the building in an .ifczip."""
+    """Return the content of the building in an .ifczip."""
     with zipfile.ZipFile(path) as archive:
         entries = [e for e in archive.infolist() if e.filename.lower().endswith(".ifc")]
         if len(entries) != 1:
@@ -333,12 +334,12 @@ def _unpacked(path: str, max_bytes: int) -> bytes:
 
 
 def _with_read_schema(head: bytes) -> bytes:
-    """Return the first bytes of a file with a schema that the library reads.
+    """Replace the schema in the header of a file by an equivalent one that the library supports.
 
-    UnreadSchemaError if the library reads neither the schema nor a schema of the same layout.
+    Raises UnreadSchemaError if there is none.
     """
     stated = _SCHEMA.search(head)
-    if stated is None:  # which the library refuses
+    if stated is None:  # the library will refuse the file
         return head
     name = stated[1].decode("latin-1")
     names = [text for text in ifcopenshell.ifcopenshell_wrapper.schema_names() if "IFC" in text]
@@ -351,7 +352,10 @@ def _with_read_schema(head: bytes) -> bytes:
 
 
 class UnreadSchemaError(Exception):
-    """A schema that the library does not read, and the schemas that are read."""
+    """The library does not support the schema of a file.
+
+    The arguments are the schema and the supported schemas.
+    """
 
 
 def _parent(element: Any) -> Any:
@@ -364,7 +368,7 @@ def _parent(element: Any) -> Any:
 
 
 def _properties(entity: Any) -> dict[str, Any]:
-    """Return the single values of a property set."""
+    """Return the single values in a property set."""
     values = {}
     for item in entity.HasProperties or ():
         if item.is_a("IfcPropertySingleValue") and item.NominalValue is not None:
@@ -374,12 +378,12 @@ def _properties(entity: Any) -> dict[str, Any]:
 
 
 def _name(element: Any) -> str:
-    """Return the class and name of an element."""
+    """Return the class and the name of an element."""
     return f"{element.is_a()} {element.Name or element.GlobalId}"
 
 
 def _material_of(element: Any) -> str:
-    """Return the name of the single material of an element, or empty for layers and the like."""
+    """Return the name of an element's material, or an empty string for layers and other sets."""
     for relation in getattr(element, "HasAssociations", None) or ():
         if relation.is_a("IfcRelAssociatesMaterial"):
             material = relation.RelatingMaterial
@@ -395,7 +399,7 @@ def main(path: str, request: dict[str, Any]) -> None:
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
         """Write a frame: a line of JSON, and the bytes of arrays."""
-        signal.alarm(0)  # who reads this may take long
+        signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")
         for array in arrays:
@@ -407,10 +411,10 @@ def main(path: str, request: dict[str, Any]) -> None:
     except UnreadSchemaError as error:
         schema, names = error.args
         write({"what": "schema", "schema": schema, "read": names})
-    except MemoryError:  # treated as if the library had ended the process
+    except MemoryError:  # treated like a crash of the library
         raise
-    except Exception as error:  # readers of broken files raise errors of any type
-        if "shared_library::load" in str(error):  # memory is short, not the file wrong
+    except Exception as error:  # ifcopenshell raises errors of any type
+        if "shared_library::load" in str(error):  # caused by a lack of memory
             raise
         reason = " ".join(str(error).replace(path, os.path.basename(path)).split())  # noqa: PTH119
         write({"what": "error", "reason": (reason or type(error).__name__)[:300]})
@@ -425,4 +429,4 @@ if __name__ == "__main__":
     max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
     resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
     main(sys.argv[1], message)
-    os._exit(0)  # at once: taking a large building down takes long
+    os._exit(0)  # exit at once, because deleting a large building takes long

@@ -1,7 +1,8 @@
-"""XML of SDFormat and MJCF, as leniently as Gazebo and MuJoCo read it.
+"""Parse SDFormat and MJCF files as leniently as Gazebo and MuJoCo do.
 
-Public files have comments with «--» and prefixes without a namespace, which end expat, and with
-expat ElementTree. Entities are refused, except the entities of XML itself and of characters.
+Public files have comments that contain "--" and prefixes without a namespace, which expat, and
+therefore ElementTree, rejects. Entities are refused, except predefined entities and character
+references.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.base.errors import CutShortError
 
-MAX_ELEMENTS = 1_000_000  # limit for a file; public worlds of Gazebo have up to 60,000
+MAX_ELEMENTS = 1_000_000  # public Gazebo worlds have up to 60,000
 _MAX_DEPTH = 200
 
 _TAG = re.compile(
@@ -25,10 +26,10 @@ _SKIPPED = {"<!--": "-->", "<?": "?>"}  # {start of a part without elements: end
 _CDATA = ("<![CDATA[", "]]>")
 
 
-def lenient_root(data: bytes) -> Element:
+def parse_lenient_xml(data: bytes) -> Element:
     """Return the root element of a file.
 
-    Prefixes stay in tags, and comments are left out.
+    Prefixes remain in tags, and comments are skipped.
 
     Raises
     ------
@@ -43,12 +44,12 @@ def lenient_root(data: bytes) -> Element:
 
 
 class _Parser:
-    """Parser of a text, whose elements are built from start to end."""
+    """A parser that builds the elements in a text."""
 
     def __init__(self, text: str) -> None:
         self._text = text
-        self._open: list[Element] = []  # elements that have not ended
-        self._texts: list[list[str]] = []  # pieces of text of each of these
+        self._open: list[Element] = []  # elements that are not complete
+        self._texts: list[list[str]] = []  # parts of the text of each open element
         self._root: Element | None = None
         self._count = 0
 
@@ -66,7 +67,7 @@ class _Parser:
         return self._root
 
     def _after_markup(self, start: int) -> int:
-        """Read the markup at a position, and return the position after the markup."""
+        """Parse the markup at a position, and return the position after it."""
         text = self._text
         for first, last in _SKIPPED.items():
             if text.startswith(first, start):
@@ -90,7 +91,7 @@ class _Parser:
         return tag.end()
 
     def _end_of(self, start: int, mark: str) -> int:
-        """Return the position after the next mark."""
+        """Return the position after the next end mark."""
         stop = self._text.find(mark, start)
         if stop < 0:
             raise ValueError(
@@ -101,7 +102,7 @@ class _Parser:
     def _after_declaration(self, start: int) -> int:
         """Return the position after a <!DOCTYPE …>.
 
-        Raises ValueError for declarations.
+        Raises ValueError if it declares entities.
         """
         stop = self._end_of(start, ">")
         declaration = self._text[start:stop]
@@ -110,7 +111,7 @@ class _Parser:
         return stop
 
     def _start_element(self, tag: re.Match[str], start: int) -> None:
-        """Open an element, which is closed if empty."""
+        """Start an element, which is complete if its tag is empty."""
         self._count += 1
         if self._count > MAX_ELEMENTS:
             raise ValueError(f"it contains more than {MAX_ELEMENTS:,} elements")
@@ -130,7 +131,7 @@ class _Parser:
                 raise ValueError(f"its elements are nested more than {_MAX_DEPTH} levels deep")
 
     def _end_element(self, name: str, start: int) -> None:
-        """Close the innermost element."""
+        """Complete the innermost element."""
         if not self._open or self._open[-1].tag != name:
             raise ValueError(
                 f"line {self._line(start)} contains </{name[:40]}> without a matching start tag"
@@ -144,18 +145,18 @@ class _Parser:
             self._texts[-1].append(text if is_literal else self._resolved(text))
 
     def _resolved(self, text: str) -> str:
-        """Return text with its references to characters resolved."""
+        """Return text with its character references resolved."""
         return _REFERENCE.sub(_character, text) if "&" in text else text
 
     def _line(self, position: int) -> int:
-        """Return the number of the line of a position, from 1."""
+        """Return the line number of a position, starting from 1."""
         return self._text.count("\n", 0, position) + 1
 
 
 def _character(reference: re.Match[str]) -> str:
     """Return the character of a reference.
 
-    Raises ValueError for an entity.
+    Raises ValueError if it is an entity that is not predefined.
     """
     name = reference[1]
     if name in _CHARACTERS:

@@ -1,7 +1,8 @@
-"""Rasters of heights, such as GeoTIFF, through rasterio and its GDAL.
+"""Read elevation rasters, such as GeoTIFF, with rasterio and its GDAL.
 
-Files are opened with the driver of their ending, which sees no files beside them; formats that
-could name other files are read from memory. So no file that a raster names is opened, nor fetched.
+Each file is opened with the driver for its extension, without access to other files. Formats that
+can refer to other files are read from memory. A raster can therefore not cause other files to be
+opened or downloaded.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ import numpy as np
 
 from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
 from lidarsim.base.arrays import AnyArray, Bools, Floats
+from lidarsim.base.checks import check_fields
 from lidarsim.base.declared import Rectangle, about
 from lidarsim.base.elementary import decade
-from lidarsim.base.errors import CutShortError
+from lidarsim.base.errors import ArgumentError, CutShortError
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import input_size, read_input
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.scene.files.coordinate_systems import (
@@ -59,35 +60,34 @@ from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.survey.survey import EpsgCode
 
-DRIVERS = {  # {ending: GDAL's name of the driver}
+DRIVERS = {  # {extension: GDAL driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",
     ".dem": "USGSDEM", ".dt0": "DTED", ".dt1": "DTED", ".dt2": "DTED",
 }  # fmt: skip
 
-_MAX_BESIDE_BYTES = 65536  # limit for a file beside a raster
+_MAX_BESIDE_BYTES = 65536  # maximum size of a file beside a raster
 
-# Without this, a file that begins with integers is read as integers.
+# By default, a file that begins with integers is read as integers.
 _OPEN_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}
 
-_BLOCK_VERTICES = 100_000  # number of vertices that are reprojected at a time, through lists
-_PIXEL_BYTES = 100  # bytes of a pixel in a mesh: vertices, two triangles, and temporary arrays
-MAX_UNASKED_PIXELS = 5_000_000  # pixels that are read without a window and a step; more take long
-_MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
-_WIDEST_DEG = 12.0  # degrees of longitude; a UTM zone is 6 wide
+_BLOCK_VERTICES = 100_000  # vertices that are reprojected at a time, because this creates lists
+_PIXEL_BYTES = 100  # memory per pixel for vertices, two triangles, and temporary arrays
+MAX_UNASKED_PIXELS = 5_000_000  # limit without a window or step, because more pixels take long
+_MAX_READ = 1_000_000_000  # maximum number of pixels to average, which takes two minutes
+_WIDEST_DEG = 12.0  # maximum width in degrees of longitude; a UTM zone is 6 degrees wide
 
-Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
+Window = tuple[float, float, float, float]  # minimum x and y, maximum x and y
 PixelRange = tuple[int, int]  # half-open
 
-# Heights of the Earth's surface.
+# Range of the Earth's surface.
 _LOWEST_M = -12_000.0
 _HIGHEST_M = 9_000.0
-_NO_DATA = -9999.0  # which many programs write without saying so in the file
+_NO_DATA = -9999.0  # many programs use this value without declaring it
 
 
 @dataclass(frozen=True)
-@checked_fields
 class RasterOptions:
-    """Options of rasters of heights."""
+    """Options for reading elevation rasters."""
 
     step_m: Annotated[
         float | None,
@@ -97,16 +97,27 @@ class RasterOptions:
         Rectangle | None,
         about("part of a raster to read, as [x0, y0, x1, y1] with the minimum and maximum x and y"),
     ] = None
-    # Code of the mesh's coordinate system, `world.epsg` of scenarios; None chooses by the file.
+    # Coordinate system of the mesh, `world.epsg` in scenarios; None chooses one for the file.
     epsg: EpsgCode | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.window is not None:
+            x0, y0, x1, y1 = self.window
+            if not (x0 < x1 and y0 < y1):
+                raise ArgumentError(
+                    "window must be [x0, y0, x1, y1] with the lower corner first, but is "
+                    f"{list(self.window)}."
+                )
 
 
 def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
+    """Read the first band as a mesh with a vertex at each pixel center and two triangles per cell.
 
-    Cells with a pixel without height are holes. Coordinates are of the system `epsg` in
-    `options.own`; else the raster's own if they are in meters that are true to scale in its
-    middle, or of the UTM zone of its middle. The window has the pixels whose middles are within.
+    A cell with a pixel that has no height is a hole. The coordinate system is `epsg` in
+    `options.own`. By default, it is that of the raster if its coordinates are in meters that are
+    true to scale at its center, otherwise the UTM zone of its center. A window includes the pixels
+    whose centers are inside.
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(
@@ -130,10 +141,7 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
 def _raster_mesh(
     source: _Source, target_crs: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[SceneMesh, str]:
-    """Return the mesh of a raster in a coordinate system, and its summary.
-
-    Appends notes.
-    """
+    """Return the mesh of a raster in a coordinate system, and a summary; append notes."""
     request: RasterOptions = options.own
     window = request.window
     chosen = request.step_m is not None or window is not None
@@ -157,7 +165,7 @@ def _raster_mesh(
 def _read_values(
     grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange
 ) -> tuple[Floats, Bools]:
-    """Return the values of the first band (rows, columns), and whether they are valid."""
+    """Return the values in the first band (rows, columns), and whether they are valid."""
     band = grid.file.read(1, window=(row_range, column_range), masked=True)
     values = np.ma.getdata(band).astype(np.float64)
     return values, ~np.ma.getmaskarray(band) & np.isfinite(values)
@@ -166,18 +174,23 @@ def _read_values(
 def _height_notes(
     pixels: _RasterGrid, grid: _RasterGrid, path: Path, mesh: SceneMesh, no_data_m: float
 ) -> list[str]:
-    """Return a note on heights that are not of the Earth's surface, or no note.
-
-    MeshFileError for heights beyond `MAX_COORDINATE_M`, which no scene may have.
+    """Return a note if heights are implausible for the Earth's surface.
 
     Parameters
     ----------
     pixels, grid
-        The raster, and the grid of the mesh: the same, or a coarser one.
+        The raster, and the grid of the mesh, which may be coarser.
+    path
+        Path of the file.
     mesh
-        The mesh of the grid.
+        Mesh of the grid.
     no_data_m
-        Height of the value that many programs write for no data.
+        Height of the value with which many programs mark missing data.
+
+    Raises
+    ------
+    MeshFileError
+        If heights exceed `MAX_COORDINATE_M`, which is not allowed in scenes.
     """
     lowest_m, highest_m = mesh.bounds[:, 2]
     if _LOWEST_M <= lowest_m <= highest_m <= _HIGHEST_M and lowest_m != no_data_m:
@@ -203,7 +216,7 @@ def _height_notes(
 
 
 def _value_near(pixels: _RasterGrid, grid: _RasterGrid, vertex: Floats) -> float:
-    """Return the value of the first band farthest from zero, of the pixels that made a vertex."""
+    """Return the value with the largest magnitude among the pixels that determine a vertex."""
     reach = 0.75 * grid.pixel_m + 2 * pixels.pixel_m
     x, y, _ = vertex.tolist()
     columns, rows = pixels.pixels_in((x - reach, y - reach, x + reach, y + reach))
@@ -218,18 +231,18 @@ class _Source:
 
     file: Any
     affine: Any  # transform from columns and rows to x and y, in meters in a local system
-    crs: Any  # horizontal coordinate system of x and y; None for none on Earth
-    up_m: float | None  # unit of heights of the vertical system, meters
-    local: _LocalSystem | None = None  # system without a place on Earth, if the file states one
+    crs: Any  # horizontal coordinate system of x and y; None without a position on Earth
+    up_m: float | None  # unit of the vertical coordinate system in meters
+    local: _LocalSystem | None = None  # stated system without a position on Earth
 
     def heights_m(self, values: Floats, unit_m: float) -> Floats:
-        """Return the heights in meters of values of the first band, which has a unit."""
+        """Convert values in the first band, which have a unit, to heights in meters."""
         return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
 @dataclass(frozen=True)
 class _LocalSystem:
-    """A system without a place on Earth, such as the grid of a site."""
+    """A coordinate system without a position on Earth, such as a site grid."""
 
     name: str
     unit: str
@@ -237,7 +250,7 @@ class _LocalSystem:
 
     @property
     def note(self) -> str:
-        """A note on the conversion to meters, empty for meters."""
+        """A note on the conversion to meters, or an empty string for meters."""
         if self.unit_m == 1:
             return ""
         return (
@@ -247,7 +260,7 @@ class _LocalSystem:
 
 
 def _source(file: Any, path: Path) -> _Source:
-    """Return an open raster with the coordinates of its pixels."""
+    """Determine the coordinates of the pixels of an open raster."""
     from rasterio.transform import Affine
 
     affine = _affine(file, path)
@@ -270,9 +283,10 @@ def _source(file: Any, path: Path) -> _Source:
 
 
 def _stated_crs(file: Any, path: Path) -> Any:
-    """Return the coordinate system that a raster or the `.prj` of an ASCII grid states, or None.
+    """Return the coordinate system of a raster, or None.
 
-    GDAL reads `.prj` files in WKT 1 only, and ignores others.
+    An ASCII grid may have it in a `.prj` file. GDAL itself reads `.prj` files in WKT 1 only, and
+    ignores others.
     """
     if file.crs is not None or file.driver != "AAIGrid":
         return file.crs
@@ -288,7 +302,7 @@ def _stated_crs(file: Any, path: Path) -> Any:
 
 @contextmanager
 def _open_raster(path: Path) -> Iterator[Any]:
-    """Open a file with the driver of its ending, and yield the dataset of rasterio."""
+    """Open a file with the driver for its extension, and yield the rasterio dataset."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
@@ -301,13 +315,13 @@ def _open_raster(path: Path) -> Iterator[Any]:
         settings = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **settings))
         try:
-            if driver == "GTiff":  # which may be larger than the memory, and reads a window
+            if driver == "GTiff":  # may exceed the memory, because only a window is read
                 input_size(path)
                 source = rasterio.open(path.absolute(), driver=driver)
             else:
                 name = uuid4().hex
                 folder = f"/vsimem/{name}/"
-                # SRTMHGT has the position in the name of the file.
+                # SRTMHGT encodes the position in the file name.
                 stem = path.stem if driver == "SRTMHGT" else "raster"
                 for ending, content in (
                     (".prj", _read_beside(path, ".prj")),
@@ -324,7 +338,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
 
 def _failure(reason: str, driver: str) -> ValueError:
-    """Return the error of a file that a driver of GDAL refused for a reason."""
+    """Return the error for a file that a GDAL driver has refused."""
     if "File short" in reason:
         return CutShortError("it contains fewer heights than its header declares")
     if "not recognized as being in a supported file format" in reason:
@@ -335,7 +349,7 @@ def _failure(reason: str, driver: str) -> ValueError:
 
 
 def _read_beside(path: Path, suffix: str) -> bytes:
-    """Return the content of a small file beside a raster, or no text without such a file."""
+    """Return the content of a small file beside a raster, or nothing if it does not exist."""
     for ending in (suffix, suffix.upper()):
         if (file := path.with_suffix(ending)).is_file():
             return read_input(file, _MAX_BESIDE_BYTES)
@@ -343,7 +357,7 @@ def _read_beside(path: Path, suffix: str) -> bytes:
 
 
 def _check_kind(source: Any) -> None:
-    """Raise MeshFileError for bands without heights, and blocks that exceed the memory."""
+    """Raise MeshFileError if the band has no heights, or its blocks exceed the memory."""
     if not source.dtypes[0].startswith(("int", "uint", "float")):
         raise MeshFileError(
             f"has pixels of type {source.dtypes[0]}, which cannot be read as heights"
@@ -369,10 +383,10 @@ def _check_kind(source: Any) -> None:
 
 
 def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
-    """Return the coordinate system of the mesh, in true meters, or raise MeshFileError.
+    """Choose the coordinate system of the mesh, which must be in meters that are true to scale.
 
-    Appends a note if the meters of the raster are not true to scale, and if the meters of the mesh
-    are not true at its edges.
+    A note is appended if the raster is reprojected, or if lengths have errors at the edges of the
+    mesh. Raises MeshFileError if there is no suitable coordinate system.
     """
     crs = source.crs
     middle = _corners(source.file, source.affine).mean(axis=0)
@@ -406,14 +420,14 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
 
 
 def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
-    """Return the system of a chosen code.
+    """Return the coordinate system with a given code.
 
-    Raises MeshFileError if the system is not in true meters.
+    Raises MeshFileError if it is not in meters that are true to scale.
     """
     target = crs_of_code(epsg)
     place = middle
     if target is not None and crs is not None:
-        with suppress(Exception):  # errors of GDAL have classes that rasterio keeps private
+        with suppress(Exception):  # the classes of GDAL errors are private in rasterio
             place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
     if problem := target_problem(epsg, *place.tolist()):
         raise MeshFileError(f"cannot be reprojected to world.epsg {problem}")
@@ -421,7 +435,7 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
 
 
 def _zone_crs(source: _Source, middle: Floats) -> Any:
-    """Return the UTM zone of a place in a raster's system.
+    """Return the UTM zone of a position in a raster's coordinate system.
 
     Raises MeshFileError if the raster is too wide.
     """
@@ -443,7 +457,7 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
 
 
 def _width_deg(source: _Source) -> float:
-    """Return the width of a raster on Earth in degrees of longitude, or infinite if it has none."""
+    """Return the width of a raster in degrees of longitude, or infinity if it has none."""
     corners = _corners(source.file, source.affine)
     if source.crs.is_geographic:
         return float(np.ptp(corners[:, 0]))
@@ -451,17 +465,17 @@ def _width_deg(source: _Source) -> float:
     longitudes = sorted(place[0] for place in places if place is not None)
     if len(longitudes) < len(places):
         return math.inf
-    gaps = np.diff([*longitudes, longitudes[0] + 360])  # a raster may cross the date line
+    gaps = np.diff([*longitudes, longitudes[0] + 360])  # a raster may cross the antimeridian
     return 360 - float(gaps.max())
 
 
 def _scale_error_at_edges(source: _Source, target: Any) -> float:
-    """Return the largest error of lengths at the corners of a raster, or 0 below the limit."""
+    """Return the largest scale error at the corners of a raster, or 0 if it is negligible."""
     corners = _corners(source.file, source.affine)
     if source.crs is not None and source.crs != target:
         try:
             corners = transformed(source.crs, horizontal_part(target)[0], corners)
-        except Exception:  # errors of GDAL have classes that rasterio keeps private
+        except Exception:  # the classes of GDAL errors are private in rasterio
             return 0.0
     horizontal, _ = horizontal_part(target)
     scales = [ground_scale(horizontal, x, y) for x, y in corners.tolist()]
@@ -470,13 +484,13 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
 
 
 def _affine(file: Any, path: Path) -> Any:
-    """Return the affine from columns and rows to x and y, by default for pixels of 1 m."""
+    """Return the transform from columns and rows to x and y, by default with pixels of 1 m."""
     from rasterio.transform import Affine
 
     affine = file.transform
     if affine.is_identity:
         affine = Affine(1, 0, 0, 0, -1, file.height)
-        if numbers := _read_beside(path, ".tfw").split():  # middle of the first pixel
+        if numbers := _read_beside(path, ".tfw").split():  # refers to the first pixel's center
             a, d, b, e, c, f = map(float, numbers)
             affine = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
     if not np.isfinite(affine).all() or affine.determinant == 0:
@@ -485,19 +499,22 @@ def _affine(file: Any, path: Path) -> Any:
 
 
 def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return x and y by an affine, whose operators differ from version to version."""
+    """Apply an affine transform to x and y.
+
+    Its operators are not used, because they differ between versions.
+    """
     a, b, c, d, e, f = [*affine][:6]
     return a * x + b * y + c, d * x + e * y + f
 
 
 def _corners(file: Any, affine: Any) -> Floats:
-    """Return the corners (4, 2) of a file, in its coordinate system."""
+    """Return the corners (4, 2) of a file in its coordinate system."""
     return np.array([_apply(affine, x, y) for x in (0, file.width) for y in (0, file.height)])
 
 
 @dataclass(frozen=True)
 class _RasterGrid:
-    """Pixels of a raster, and their coordinates in the file and in the mesh."""
+    """The pixels of a raster, with their coordinates in the file and in the mesh."""
 
     file: Any
     affine: Any  # transform from columns and rows to x and y
@@ -506,11 +523,11 @@ class _RasterGrid:
 
     @property
     def keeps_crs(self) -> bool:
-        """Whether the mesh has the coordinates of the file."""
+        """Whether the mesh has the same coordinates as the file."""
         return self.crs is None or bool(self.crs == self.target_crs)
 
     def coordinates(self, column: AnyArray, row: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Return x and y in the mesh's coordinates."""
+        """Return x and y in the coordinates of the mesh."""
         from rasterio.warp import transform
 
         x, y = _apply(self.affine, column, row)
@@ -521,7 +538,7 @@ class _RasterGrid:
 
     @cached_property
     def extent(self) -> Floats:
-        """Lowest and highest x and y in the mesh's coordinates, (2, 2)."""
+        """Minimum and maximum x and y (2, 2) in the coordinates of the mesh."""
         from rasterio.warp import transform_bounds
 
         corners = _corners(self.file, self.affine)
@@ -534,14 +551,17 @@ class _RasterGrid:
 
     @cached_property
     def pixel_m(self) -> float:
-        """Side of a square as large as the pixel in the middle, meters."""
+        """Side length in meters of a square with the area of the central pixel."""
         column = np.array([0.0, 1.0, 0.0])
         row = np.array([0.0, 0.0, 1.0])
         x, y = self.coordinates(column + self.file.width // 2, row + self.file.height // 2)
         return math.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
 
     def pixels_in(self, window: Window | None) -> tuple[PixelRange, PixelRange]:
-        """Return the columns and rows whose middles are in a window or its box, half-open."""
+        """Return the half-open ranges of columns and rows whose pixel centers are in a window.
+
+        If the raster is rotated or reprojected, the ranges enclose the window.
+        """
         from rasterio.warp import transform_bounds
 
         size = np.array([self.file.width, self.file.height])
@@ -561,7 +581,7 @@ class _RasterGrid:
         return (first_column, stop_column), (first_row, stop_row)
 
     def check_overlap(self, window: Window) -> None:
-        """Raise MeshFileError for a window beside all pixels."""
+        """Raise MeshFileError if a window does not overlap the raster."""
         lower, upper = self.extent
         if (np.maximum(lower, window[:2]) >= np.minimum(upper, window[2:])).any():
             (x_min, x_max), (y_min, y_max) = self.extent.T.tolist()
@@ -573,7 +593,7 @@ class _RasterGrid:
 
 @contextmanager
 def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterator[_RasterGrid]:
-    """Yield a grid of mean heights, along the axes of the mesh's coordinates."""
+    """Yield a grid with mean heights, aligned with the axes of the mesh."""
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
     from rasterio.transform import Affine
@@ -596,10 +616,10 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
     columns, rows = np.ceil((upper - lower) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
         raise MeshFileError("covers fewer than 2 x 2 grid cells. Choose a smaller value for step_m")
-    # Whole cells have their middle at their mean.
+    # Use complete cells only, so that their mean heights are valid at their centers.
     width_m, height_m = (upper - lower) / (columns, rows)
     affine = Affine(width_m, 0, lower[0], 0, -height_m, upper[1])
-    # GDAL wants a system, the same on both sides; which is arbitrary.
+    # GDAL requires coordinate systems. Any will do if both sides are equal.
     plane = grid.target_crs or CRS.from_epsg(32631)
     options: dict[str, Any] = {"src_crs": grid.crs or plane, "crs": plane}
     if grid.file.nodata is None and grid.file.dtypes[0].startswith("float"):
@@ -622,9 +642,10 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
 def _check_size(
     grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange, name: str, *, chosen: bool
 ) -> None:
-    """Raise MeshFileError for too many pixels, with a window and a step that fit the memory.
+    """Raise MeshFileError if there are too many pixels, suggesting a window and a step that fit.
 
-    Without a `chosen` window or step the limit is lower, for a mesh that is quick to read and show.
+    Unless a window or step is `chosen`, the limit is lower, so that the mesh is quick to read and
+    display.
     """
     sides = np.array([column_range[1] - column_range[0], row_range[1] - row_range[0]])
     count = int(np.prod(sides.astype(object)))
@@ -635,7 +656,7 @@ def _check_size(
         return
     lower, upper = grid.extent
     x, y = grid.coordinates(np.array([sum(column_range) / 2]), np.array([sum(row_range) / 2]))
-    # Less by a tenth, for pixels that are askew.
+    # Reduce the window by a tenth, because pixels may be rotated.
     half = np.minimum(0.9 * math.sqrt(max_pixels), sides) * grid.pixel_m / 2
     window = [round(float(side), 1) for side in (x[0] - half[0], y[0] - half[1])]
     window += [round(float(side), 1) for side in (x[0] + half[0], y[0] + half[1])]
@@ -668,10 +689,10 @@ def _grid_mesh(
     heights: Floats,
     valid: Bools,
 ) -> SceneMesh:
-    """Return the mesh of pixels' middles, with two triangles, seen from above, for a full cell.
+    """Return a mesh with a vertex at each pixel center and two triangles for each complete cell.
 
-    Middles of pixels are transformed and keep their heights: GDAL's bilinear warp widens its kernel
-    where pixels grow along an axis, and rasterio does not pass XSCALE on.
+    Pixel centers are transformed and keep their heights. GDAL's bilinear warp is not used, because
+    it widens its kernel where pixels grow along an axis, and rasterio does not support XSCALE.
     """
     cells = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
     if not cells.any():
@@ -687,7 +708,7 @@ def _grid_mesh(
     vertices[:, 2] = heights[used]
     number = np.cumsum(used).reshape(used.shape) - 1
     faces = np.empty((np.count_nonzero(cells), 2, 3), np.int64)
-    down, right = (1, 2) if grid.affine.determinant < 0 else (2, 1)  # rows go down, or up
+    down, right = (1, 2) if grid.affine.determinant < 0 else (2, 1)  # rows run down or up
     faces[:, :, 0] = number[:-1, :-1][cells][:, None]
     faces[:, 0, down] = number[1:, :-1][cells]
     faces[:, 1, right] = number[:-1, 1:][cells]
@@ -696,7 +717,10 @@ def _grid_mesh(
 
 
 def _height_unit_m(source: _Source, notes: list[str]) -> float:
-    """Return the meters in the unit of heights: of the band, else of the vertical system."""
+    """Return the length of the height unit in meters.
+
+    The unit is that of the band, of the vertical coordinate system, or of the coordinates.
+    """
     stated = source.file.units[0]
     if stated:
         if (unit_m := unit_by_name(stated)) is not None:
@@ -723,7 +747,7 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
 
 
 def _notes(source: _Source, path: Path) -> list[str]:
-    """Return notes on missing coordinates, further bands and files that are not read."""
+    """Return notes on missing coordinate systems, additional bands, and files that are not read."""
     file = source.file
     notes = []
     unit_m = 1.0 if source.local is None else source.local.unit_m
@@ -759,7 +783,7 @@ def _crs_label(crs: Any) -> str:
 
 
 def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bools) -> str:
-    """Return the size and the coordinate systems of a mesh in words."""
+    """Describe the size and the coordinate systems of a mesh."""
     rows, columns = valid.shape
     words = f"{columns:,} x {rows:,} {'means' if step_m else 'pixels'} of {grid.pixel_m:.6g} m"
     if (rows, columns) != source.file.shape:

@@ -1,10 +1,10 @@
-"""3MF files, after its core specification and its production and materials extensions.
+"""Read 3MF files, following the core, production, and materials specifications.
 
-By the 3MF Consortium (2018).
+The specifications are by the 3MF Consortium (2018).
 
-This is not trimesh, which follows nested components only to some depth and confuses parts of inner
-files; nor assimp 5.4, which reads no parts of inner files, ignores required extensions, and ends
-the process on a property index that is out of range.
+trimesh is not used, because it follows nested components only to a limited depth and confuses the
+parts of inner files. assimp 5.4 is not used either: it does not read the parts of inner files,
+ignores required extensions, and crashes if a property index is out of range.
 """
 
 from __future__ import annotations
@@ -51,31 +51,31 @@ _UNITS_M = {
 # Required extensions that do not change shapes, or that are supported here.
 _SUPPORTED = re.compile(r"/(material|production|securecontent)/")
 
-# What a few letters make.
-_OBJECT_BYTES = 1000  # bytes of an object, its placement, or a group of colors
-_COLOR_BYTES = 100  # bytes of a color or material in a group
+# Memory that short elements need, in bytes.
+_OBJECT_BYTES = 1000  # an object, a placement, or a color group
+_COLOR_BYTES = 100  # a color or material in a group
 
-_COLOR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
+_COLOR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is ignored
 
-_Key = tuple[str, str]  # inner file and number of an object
+_Key = tuple[str, str]  # inner file and ID of an object
 
 
 @dataclass
 class _MeshObject:
-    """An object of a model: a mesh, or components."""
+    """An object in a model, which is a mesh or consists of components."""
 
     name: str
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
-    # Number of a group of colors, and index in it, of triangles without.
+    # Group ID and index of the property for triangles that state none
     default_property: tuple[str, str] = ("", "0")
     shades: array[int] = field(default_factory=lambda: array("B"))  # shades of corners, if read
     materials: list[str] = field(default_factory=list)  # names of triangles, if read
 
     @cached_property
     def meshes(self) -> list[SceneMesh]:
-        """The mesh of the object, in a list, or an empty list without triangles."""
+        """The mesh of the object in a list, which is empty without triangles."""
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
@@ -96,7 +96,7 @@ class _MeshObject:
 
 @dataclass(frozen=True, eq=False)
 class _Placement:
-    """A component or build item: an object with a matrix (4, 4)."""
+    """A component or build item: an object placed by a matrix (4, 4)."""
 
     key: _Key
     name: str
@@ -104,7 +104,7 @@ class _Placement:
 
 
 def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the build items of a file, and colors of base materials and color groups."""
+    """Read the build items in a file, with the colors of base materials and color groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive, Allowance(len(data), SMALLER), options)
         root = package.model(package.start())
@@ -131,7 +131,7 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Package:
-    """The inner files of an archive, each read when an object of the file is placed."""
+    """The inner files in an archive, each read when one of its objects is placed."""
 
     def __init__(
         self, archive: zipfile.ZipFile, allowance: Allowance, options: ReadOptions
@@ -142,7 +142,7 @@ class _Package:
         self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
-        """Return the inner file of the model to build."""
+        """Return the name of the inner file with the model to build."""
         names = self._archive.namelist()
         relations = ""
         if "_rels/.rels" in names:
@@ -157,7 +157,7 @@ class _Package:
         raise ValueError("the archive does not contain 3D/3dmodel.model")
 
     def model(self, name: str) -> _Model:
-        """Return an inner file, which is read on its first use."""
+        """Return an inner file, which is read on first use."""
         name = name.lstrip("/")
         if name not in self.models:
             pieces = self._pieces(name)
@@ -165,10 +165,7 @@ class _Package:
         return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
-        """Yield the content of an inner file.
-
-        The content is never longer than announced.
-        """
+        """Yield the content of an inner file, which is never longer than its stated size."""
         if name not in self._archive.namelist():
             raise ValueError(f"the archive does not contain {name[:80]!r}")
         entry = self._archive.getinfo(name)
@@ -185,7 +182,7 @@ class _Package:
     def object(self, key: _Key) -> _MeshObject:
         """Return an object.
 
-        Raises ValueError if the object is missing.
+        Raises ValueError if it is not defined.
         """
         objects = self.model(key[0]).objects
         if key[1] not in objects:
@@ -194,9 +191,9 @@ class _Package:
 
 
 class _Model:
-    """Objects of an inner file, and its build items.
+    """The objects and build items in an inner file.
 
-    The parser makes no tree, which would take ten times the file's size.
+    The file is parsed without building a tree, which would need ten times the size of the file.
     """
 
     def __init__(
@@ -215,7 +212,7 @@ class _Model:
         self._name = name
         self._allowance = allowance
         self._object = _MeshObject("")
-        # Without namespaces, because slicers omit the declaration of some.
+        # Namespaces are ignored, because slicers do not declare all of them.
         self._readers: dict[str, Callable[[dict[str, str]], None]] = {
             "basematerials": self._begin_group,
             "colorgroup": self._begin_group,
@@ -258,7 +255,7 @@ class _Model:
             raise MeshFileError(f"contains <{tag}>, which is not supported. Export it as triangles")
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
-        """Begin a group of colors or materials."""
+        """Start a group of colors or materials."""
         self._allowance.take(_OBJECT_BYTES)
         self._group = self._groups.setdefault(attributes["id"], [])
         self._names_of_group = self._names.setdefault(attributes["id"], [])
@@ -272,7 +269,7 @@ class _Model:
         self._names_of_group.append(attributes.get("name", ""))
 
     def _begin_object(self, attributes: dict[str, str]) -> None:
-        """Begin an object."""
+        """Start an object."""
         self._allowance.take(_OBJECT_BYTES)
         self._object = _MeshObject(attributes.get("name", ""))
         self._object.default_property = attributes.get("pid", ""), attributes.get("pindex", "0")
@@ -281,7 +278,7 @@ class _Model:
     def _begin_model(self, attributes: dict[str, str]) -> None:
         """Read the unit of the model.
 
-        Raises MeshFileError if an extension is not supported.
+        Raises MeshFileError if the model requires an unsupported extension.
         """
         self.unit = attributes.get("unit", self.unit)
         for prefix in attributes.get("requiredextensions", "").split():
@@ -293,14 +290,14 @@ class _Model:
                 )
 
     def _material(self, attributes: dict[str, str]) -> str:
-        """Return the name of the material of a triangle's first corner, or an empty string."""
+        """Return the material name at a triangle's first corner, or an empty string."""
         group, number = self._object.default_property
         index = int(attributes.get("p1", number))
         names = self._names.get(attributes.get("pid", group), [])
         return names[index] if 0 <= index < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
-        """Add the colors of a triangle's corners, or gray for a triangle without colors."""
+        """Add the colors at a triangle's corners, or gray if it has none."""
         group, number = self._object.default_property
         group = attributes.get("pid", group)
         first = attributes.get("p1", number)
@@ -312,7 +309,7 @@ class _Model:
             self._object.shades.frombytes(colors[index] if has_colors else GRAY.tobytes())
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
-        """Read a component or build item."""
+        """Read a component or a build item."""
         self._allowance.take(_OBJECT_BYTES)
         path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")
         matrix = np.eye(4)

@@ -1,4 +1,4 @@
-"""Shapes of size 1, or of radius 1, around zero, which robots and worlds are made of."""
+"""Define unit shapes, with size 1 or radius 1 and centered at the origin, for robots and worlds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import capsule, cylinder
 
-SIDES = 64  # sides of a circle, 0.12 % of the radius inside it at most
+SIDES = 64  # sides of a circle, which deviate from it by at most 0.12 % of the radius
 
 UNIT_BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
 UNIT_BALL = capsule(1, 0, SIDES, "sphere")

@@ -1,8 +1,8 @@
-"""OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, license TOST-1.0).
+"""Read OpenUSD scenes (.usd, .usda, .usdc, .usdz) with usd-core (Pixar, license TOST-1.0).
 
-`usd_child.py` reads the scenes in a separate process, and states the reasons. References
-to other files are resolved by usd-core; content from outside the scene's folder is refused.
-`usd_materials.py` reads masks and colors.
+`usd_child.py` reads the scenes in a separate process, and explains why. usd-core resolves
+references to other files; content from outside the scene's folder is refused. `usd_materials.py`
+reads masks and colors.
 """
 
 from __future__ import annotations
@@ -51,31 +51,32 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
 
-from .child_process import Child, Frame
-from .usd_materials import MeshLook, UsdMaterials, material_pieces
+from .child_process import Frame, ReaderProcess
+from .usd_materials import MeshAppearance, UsdMaterials, material_pieces
 
 _LIMITS = {
     "prims and instances": MAX_NODES,
     "poses of moving objects": 1_000_000,
     "moving objects": 10_000,
 }
-USD_CORE_BYTES = 512 * 2**20  # bytes that usd-core takes for any file
+USD_CORE_BYTES = 512 * 2**20  # memory that usd-core needs for any file
 _LATEST_S = 9e8
-_SEGMENTS = 64  # around spheres, cylinders, cones and capsules
+_SEGMENTS = 64  # sides of spheres, cylinders, cones, and capsules
 
 
 def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read all visible prims of a scene at its first time, and their motions or an animation."""
+    """Read all visible prims in a scene at its first time, with their motions or an animation."""
     if find_spec("pxr") is None:
         command = install_command("lidarpool[usd]")
         raise MeshFileError(
             f"is an OpenUSD file, which requires usd-core. Install it with `{command}`"
         )
-    if sys.platform == "win32":  # where a process has no limits of memory
+    if sys.platform == "win32":  # memory limits of processes are not supported
         raise MeshFileError(
             "is an OpenUSD file, which is not supported on Windows. Export it as .glb"
         )
-    allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)  # all files share
+    # All files share an allowance.
+    allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)
     with closing(_frames(path, options, allowance)) as frames:
         stage, _ = next(frames)
         contents = _contents(frames, stage, path.stem, options, allowance)
@@ -92,7 +93,7 @@ def _contents(
     options: ReadOptions,
     allowance: Allowance,
 ) -> Iterator[Content]:
-    """Yield the content of each pose of an animation, or of the first time."""
+    """Yield the content at each pose of an animation, or at the first time."""
     materials = UsdMaterials(allowance, options)
     meshes: dict[int, list[SceneMesh]] = {}
     for frame, arrays in frames:
@@ -107,29 +108,29 @@ def _contents(
                 content = _content(stage | frame, arrays, meshes, stem, allowance)
                 content.notes += materials.notes.lines()
                 yield _with_notes(content, stage, frame["counts"])
-                materials.colored = False  # all poses have the colors of the first
+                materials.colored = False  # all poses use the colors of the first one
 
 
 def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[Frame]:
-    """Read a file in a separate process, and yield the frames of its standard output."""
+    """Read a file in a separate process, and yield the frames of its output."""
 
     def take(frame: dict[str, Any], size: int) -> None:
-        """Take the bytes of an array of a frame.
+        """Count the size of an array toward the memory limit.
 
-        Images let the content take more.
+        Images also raise the limit for the content.
         """
         if frame["what"] == "image":
             allowance.grow(size)
         allowance.take(size)
 
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("usd_child.py"),
         "usd-core",
         memory_share() + USD_CORE_BYTES,
         path.parent,
         hidden=("PXR_",),  # the user's plug-ins and search paths would change the scene
-        # A thread that is refused for the memory limit would be waited for until the alarm. One
-        # thread takes a sixth longer for 100 layers.
+        # If the memory limit prevents a thread from starting, usd-core waits for it until the time
+        # limit. Using a single thread takes a sixth longer for 100 layers.
         environment={"PXR_WORK_THREAD_LIMIT": "1"},
     )
     request = options._asdict() | {"most": _LIMITS, "rate_hz": RATE_HZ}
@@ -148,7 +149,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
 def _polygon_mesh(
     frame: dict[str, Any], arrays: list[AnyArray], allowance: Allowance, materials: UsdMaterials
 ) -> list[SceneMesh]:
-    """Return the mesh of polygons, in a list, or an empty list without triangles."""
+    """Return the mesh of polygons in a list, which is empty without triangles."""
     name = frame["name"]
     allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
     sizes, corners, points, holes = arrays[:4]
@@ -176,21 +177,21 @@ def _polygon_mesh(
 def _shape_mesh(
     frame: dict[str, Any], arrays: list[AnyArray], materials: UsdMaterials
 ) -> list[SceneMesh]:
-    """Return the mesh of a cube, sphere, cylinder, cone, capsule or plane, or an empty list."""
+    """Return the mesh of a primitive shape in a list, which is empty if its size is zero."""
     mesh = _plain_shape(frame)
     if mesh is None or "materials" not in frame:
         return [mesh] if mesh else []
     rows = np.arange(len(mesh.faces))
-    look = MeshLook(frame, arrays, {"constant": np.zeros((len(rows), 3), np.int64)})
+    look = MeshAppearance(frame, arrays, {"constant": np.zeros((len(rows), 3), np.int64)})
     number = next((number for number, _ in frame["materials"]), None)
-    # Without texture coordinates they have no masks either, and a note says so.
+    # Shapes lack texture coordinates and therefore have no masks. This call only adds a note.
     materials.cutout(number, look, rows)
     named = FaceMaterials.named(materials.name(number))
     return [replace(mesh, colors=materials.colors(number, look, rows), materials=named)]
 
 
 def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
-    """Return the triangles of a shape, without materials, or None if a size is 0."""
+    """Return the triangles of a primitive shape without materials, or None if a size is zero."""
     name = frame["name"]
     kind = frame["kind"]
     size = frame["sizes"]
@@ -211,7 +212,7 @@ def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
     else:
         shape = cylinder if kind == "Cylinder" else capsule
         mesh = shape(size["radius"], size.get("height", 0), _SEGMENTS, name)
-    # Shapes are made along z; turn their axis.
+    # Shapes are created along z. Permute the axes to match the stated axis.
     return SceneMesh(name, np.roll(mesh.vertices, axis + 1, axis=1), mesh.faces)
 
 
@@ -222,7 +223,7 @@ def _content(
     stem: str,
     allowance: Allowance,
 ) -> Content:
-    """Place meshes by the nodes of a scene."""
+    """Place meshes according to the nodes of a scene."""
     moving = frame["moving"]
     matrices = arrays[0].copy()
     motions = arrays[1 : 1 + len(moving)]
@@ -239,7 +240,7 @@ def _content(
         name, mesh, children, instanced = nodes[key]
         for copied, array in instanced:
             inner = nodes[copied]
-            alone = inner[1] is not None and not (inner[2] or inner[3])  # a mesh, and no more
+            alone = inner[1] is not None and not (inner[2] or inner[3])  # only a mesh
             rows = [None] if alone else range(len(copies[array]))
             children += [(copied, array, row) for row in rows]
         return Node(name, matrices[key], meshes.get(mesh, ()), children)
@@ -247,7 +248,7 @@ def _content(
     placed = _with_distinct_names(placed_nodes(frame["roots"], node, stem))
     content = placed_content(placed, copy_all=len(frame["times_s"]) > 1)
     for number, motion in zip(moving, motions, strict=True):
-        # Its mesh has the scale, since actors have none.
+        # The scale is applied to the mesh, because actors cannot be scaled.
         matrices[number] = np.eye(4)
         scale = matrices[number, :3, :3]
         poses = motion[:, 1:].reshape(-1, 3, 4)
@@ -256,7 +257,7 @@ def _content(
         content.skipped += part.skipped
         if part.meshes:
             shared = [item.mesh for item in part.meshes if isinstance(item, SceneInstance)]
-            # An actor has no instances.
+            # Actors cannot have instances, so their triangles are copied.
             allowance.take(sum(80 * len(mesh.faces) for mesh in shared))
             rotations = matmul(poses[:, :, :3], inverse(scale))
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
@@ -269,14 +270,14 @@ def _content(
 
 
 def _with_distinct_names(nodes: list[PlacedNode]) -> list[PlacedNode]:
-    """Return nodes with distinct names where prims share a name.
+    """Give nodes distinct names if their prims share a name.
 
-    The candidates are the prims around a prim that hold no other prim of its name; the name is the
-    rarest of theirs, of equally rare names the nearest: a chess set has many «Render» in many
-    «Geom», each in a «King» or «Queen». If there are further meshes in that prim, the names are
-    joined, «King/Render».
+    The new name is that of an enclosing prim that contains no other prim with the shared name. The
+    least frequent such name is chosen, or the innermost of several. For example, a chess set has
+    many prims called "Render" in prims called "Geom", each in a "King" or "Queen". If the enclosing
+    prim contains other meshes, the names are joined, as in "King/Render".
     """
-    # Copies share a path.
+    # Copies of a node share a path.
     paths = {node.path for node in nodes if node.path}
     uses = Counter(path[-1] for path in paths)
     mesh_counts: Counter[Any] = Counter()  # {prim, or prim and name: meshes in the prim}
@@ -302,7 +303,7 @@ def _with_distinct_names(nodes: list[PlacedNode]) -> list[PlacedNode]:
 
 
 def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Content:
-    """Set units and axes of a content, and add notes on content that is not read."""
+    """Set the unit and the up axis of a content, and add notes on content that is not read."""
     content.unit_m = stage["unit_m"]
     content.up_axis = stage["up_axis"]
     if not 0 < stage["unit_m"] < np.inf:
@@ -322,7 +323,7 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
 
 
 def _notes(stage: dict[str, Any], counts: dict[str, int]) -> Iterator[str]:
-    """Yield notes on content that is not read, from a stage and counts of its prims."""
+    """Yield notes on content that is not read, given the stage and counts of its prims."""
     moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
     if stage["materialx"]:
         yield (

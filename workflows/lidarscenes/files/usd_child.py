@@ -1,10 +1,10 @@
-"""Reads an OpenUSD scene with usd-core, in a process that `usd.py` starts: a script, not a module.
+"""Read an OpenUSD scene with usd-core in the process that `usd.py` starts; this is a script.
 
-usd-core ends its process on some broken files, and needs unlimited memory for other files; here
-both end this process only. The script imports nothing of lidarpool, to start fast. Standard output
-gets frames, each a line of JSON and the bytes of arrays: first of the stage, then of each mesh,
-after the images and materials that the mesh is the first to use, last of the nodes. Content that
-several prims share is written once. Of an animation, meshes and nodes come again for each pose.
+Some invalid files crash usd-core, and others need unlimited memory. Here, this affects only this
+process. The script imports nothing from lidarpool, so that it starts quickly. It writes frames to
+standard output: first the stage, then each mesh, preceded by the images and materials that it is
+the first to use, and finally the nodes. Content that several prims share is written once. For an
+animation, meshes and nodes are written again for each pose.
 """
 
 from __future__ import annotations
@@ -26,47 +26,51 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 
-MAX_WAIT_S = 300  # limit between two meshes; broken files may take for ever
+MAX_WAIT_S = 300  # time limit between two meshes; invalid files may never finish
 
-_RIGID = 1e-4  # largest change of the square of a scale
-# Largest deviation of the path of a moving prim between poses.
+_RIGID = 1e-4  # maximum change of a squared scale
+# Maximum deviation of an interpolated motion between poses.
 _MAX_OFFSET_M = 1e-5
 _MAX_ANGLE_RAD = 1e-4
-_PROBES = (0.1459, 0.382, 0.618, 0.8541)  # shares of the time between two; of no repeating turns
-_MAX_HALVINGS = 12  # limit for halving the time between two samples
-_MAX_LINKS = 8  # limit for shaders that compute texture coordinates
+# Fractions of the time between two poses at which the deviation is measured. They are irregular, so
+# that periodic motions are detected.
+_PROBES = (0.1459, 0.382, 0.618, 0.8541)
+_MAX_HALVINGS = 12  # maximum number of bisections between two samples
+_MAX_LINKS = 8  # maximum number of chained shaders that compute texture coordinates
 
-_EXCLUDED_PURPOSES = (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)  # purposes
+_EXCLUDED_PURPOSES = (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)
 _SHOWN = (
     Usd.PrimIsActive
     & Usd.PrimIsLoaded
-    & Usd.PrimHasDefiningSpecifier  # PrimIsDefined would require the prims above, too
+    & Usd.PrimHasDefiningSpecifier  # PrimIsDefined would also require it for all ancestors
     & ~Usd.PrimIsAbstract
 )
 
 
-class TooManyError(Exception):
-    """The stage has more prims, copies or poses than are read."""
+class StageLimitError(Exception):
+    """The stage has too many prims, copies, or poses."""
 
 
 class _Inherited(NamedTuple):
-    """Properties of a node that the prims above set.
+    """Properties of a node that are set by enclosing prims.
 
-    With its path, they are the key of the node.
+    Together with the path of the node, they identify the node.
     """
 
-    excluded: bool  # its purpose is left out
-    still: bool  # its animation is ignored, as for prims that an instancer copies
-    instance: Any  # look or path of the instance around the prim, which prototypes lack
+    excluded: bool  # whether prims with its purpose are skipped
+    still: bool  # whether its animation is ignored, as for prims that an instancer copies
+    instance: Any  # appearance or path of the enclosing instance, which prototypes lack
 
 
 class StageNodes:
-    """Nodes of a stage, numbered in the order of discovery.
+    """The nodes of a stage, numbered in the order of discovery.
 
-    A node that several instances share is a node of their prototype.
+    A node that several instances share is the node in their prototype.
     """
 
-    def __init__(self, stage: Any, limits: dict[str, int], looks: Looks, write: Any) -> None:
+    def __init__(
+        self, stage: Any, limits: dict[str, int], looks: MaterialReader, write: Any
+    ) -> None:
         self._stage = stage
         self._remaining = limits
         self._looks = looks
@@ -74,14 +78,15 @@ class StageNodes:
         self._time = looks.time
         self._numbers: dict[tuple[Any, _Inherited], int] = {}  # {(path, inherited): number}
         self._pending: list[tuple[Any, _Inherited]] = []
-        self._passes: dict[Any, bool] = {}  # {prototype and test: whether a prim passes}
+        self._passes: dict[Any, bool] = {}  # {(prototype, test): whether a prim passes}
         self._meshes: dict[bytes, int] = {}  # {hash of the content: number}
         self.roots: list[int] = []
         self.nodes: list[Any] = []
         self.matrices: list[NDArray[np.float64]] = []
         self.copies: list[NDArray[np.float64]] = []
         self.moving: list[int] = []  # moving nodes that are not children
-        self.motions: list[NDArray[np.float64]] = []  # (k, 13) of each: time code, then 3 rows of 4
+        # Time codes and the first three rows of the poses, (k, 13) each
+        self.motions: list[NDArray[np.float64]] = []
         self.counts: Counter[str] = Counter()  # counts for notes
 
     @property
@@ -93,15 +98,15 @@ class StageNodes:
 
     def read(self) -> None:
         """Collect all nodes, and write their meshes."""
-        # If the rate is 0, usd-core would look for samples for ever.
+        # With a rate of 0, usd-core would search for samples forever.
         still = not self._stage.GetTimeCodesPerSecond() > 0
         root = self._number(self._stage.GetPseudoRoot(), _Inherited(False, still, None))
         self.roots.append(root)
-        for prim, inherited in self._pending:  # grows meanwhile
+        for prim, inherited in self._pending:  # grows during the loop
             self.nodes.append(self._node(prim, inherited))
 
     def _number(self, prim: Any, inherited: _Inherited) -> int:
-        """Return the number of a node, a new number for a new node."""
+        """Return the number of a node, assigning a new one to a new node."""
         key = _shared(prim).GetPath(), inherited
         if key not in self._numbers:
             self._numbers[key] = len(self._numbers)
@@ -110,19 +115,22 @@ class StageNodes:
         return self._numbers[key]
 
     def _count(self, count: int, kind: str = "prims and instances") -> None:
-        """Count towards the limit of a kind.
+        """Count toward the limit for a kind of content.
 
-        Raises TooManyError beyond the limit.
+        Raises StageLimitError beyond the limit.
         """
         self._remaining[kind] -= count
         if self._remaining[kind] < 0:
-            raise TooManyError(kind)
+            raise StageLimitError(kind)
 
     def _node(self, prim: Any, inherited: _Inherited) -> list[Any]:
-        """Return name, number of the mesh, numbers of children, and copies as (child, array)."""
+        """Return a node: its name, mesh number, child numbers, and copies.
+
+        A copy is (node number, index into `copies`).
+        """
         node: list[Any] = [prim.GetName(), None, [], []]
         xformable = UsdGeom.Xformable(prim)
-        # Of row vectors, in OpenUSD.
+        # Transpose, because OpenUSD uses row vectors.
         matrix = xformable.GetLocalTransformation(self._time) if xformable else np.eye(4)
         self.matrices.append(np.array(matrix).T)
         if imageable := UsdGeom.Imageable(prim):
@@ -149,7 +157,7 @@ class StageNodes:
         return node
 
     def _add_child(self, node: list[Any], child: Any, inherited: _Inherited) -> None:
-        """Add a child to its node, to the roots, or to the nodes that move."""
+        """Add a child to its node, to the roots, or to the moving nodes."""
         xformable = UsdGeom.Xformable(child)
         number = self._number(child, inherited)
         motion = None
@@ -168,9 +176,9 @@ class StageNodes:
             node[2].append(number)
 
     def _any_below(self, prim: Any, test: Callable[[Any], bool]) -> bool:
-        """Return whether a prim, or a prim below, passes a test.
+        """Return whether a prim or one of its descendants passes a test.
 
-        Prototypes are tested once.
+        Each prototype is tested once.
         """
         for inner in Usd.PrimRange(_shared(prim)):
             if test(inner):
@@ -185,14 +193,14 @@ class StageNodes:
         return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
-        """Return time codes and poses in the world, (k, 13), or None for a standing prim.
+        """Return the time codes and world poses (k, 13) of a prim, or None if it does not move.
 
-        Between the poses, a straight path that turns evenly about one axis deviates from OpenUSD's
-        by `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD` at most.
+        Interpolating positions linearly, and rotations about a single axis, deviates from OpenUSD
+        by at most `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD`.
         """
         xformable = UsdGeom.Xformable(prim)
         samples = xformable.GetTimeSamples()
-        # Also between samples, which a turntable may have at whole revolutions only.
+        # Also check between samples, because a turntable may have samples only at full revolutions.
         between = [a + _PROBES[0] * (b - a) for a, b in pairwise(samples)]
         matrices = [
             np.array(xformable.GetLocalTransformation(code)) for code in [*samples, *between]
@@ -213,7 +221,7 @@ class StageNodes:
         return None
 
     def _copies(self, instancer: Any, excluded: bool) -> list[tuple[int, int]]:
-        """Return the nodes that an instancer copies, each with the number of its `copies`."""
+        """Return the nodes that an instancer copies, each with an index into `copies`."""
         prototype_numbers = np.array(
             instancer.GetProtoIndicesAttr().Get(self._time) or (), np.int64
         )
@@ -246,7 +254,7 @@ class StageNodes:
         return nodes
 
     def _mesh(self, prim: Any) -> int | None:
-        """Write the triangles of a prim, if they are new, and return the number of the mesh."""
+        """Write the triangles of a prim if they are new, and return the number of the mesh."""
         kind = str(prim.GetTypeName())
         arrays: list[Any] = []
         if prim.IsA(UsdGeom.Mesh):
@@ -287,17 +295,17 @@ class StageNodes:
 
 
 class _TimedPose:
-    """Pose of a prim in the world at a time code."""
+    """The world pose of a prim at a time code."""
 
     def __init__(self, prim: Any, code: float) -> None:
         matrix = UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code)
         self.code = code
-        self.matrix = np.array(matrix).T  # (4, 4); OpenUSD's are of row vectors
+        self.matrix = np.array(matrix).T  # (4, 4), transposed because OpenUSD uses row vectors
         self.rotation = matrix.RemoveScaleShear().ExtractRotationQuat()
 
 
 def _sample_codes(prim: Any) -> list[float]:
-    """Return the time codes of the samples of a prim and of the prims above, ascending."""
+    """Return the time codes of the samples of a prim and its ancestors, in ascending order."""
     codes: set[float] = set()
     above = prim
     while above:
@@ -308,7 +316,7 @@ def _sample_codes(prim: Any) -> list[float]:
 
 
 def _is_rigid(poses: list[_TimedPose]) -> bool:
-    """Return whether poses differ by rotations and offsets only."""
+    """Return whether poses differ only by rotations and translations."""
     linear = np.array([pose.matrix[:3, :3] for pose in poses])
     if np.linalg.matrix_rank(linear[0]) < 3:
         return False
@@ -320,10 +328,10 @@ def _is_rigid(poses: list[_TimedPose]) -> bool:
 def _poses_up_to(
     prim: Any, start: _TimedPose, stop: _TimedPose, max_offset: float, depth: int
 ) -> list[_TimedPose]:
-    """Return the poses after `start`, up to `stop`, that a path interpolates closely enough.
+    """Return the poses after `start`, up to `stop`, that are needed for accurate interpolation.
 
-    `max_offset` is in units of the stage (`StageNodes._motion`); `depth` is the number of
-    halvings that are left.
+    `max_offset` is the tolerance in units of the stage, and `depth` the number of remaining
+    bisections.
     """
     step = stop.code - start.code
     if not depth:
@@ -341,8 +349,11 @@ def _poses_up_to(
     return [stop]
 
 
-class Looks:
-    """Images and materials, written when they are first used, and colors of meshes."""
+class MaterialReader:
+    """Reads the images and materials in a stage, and the colors of its meshes.
+
+    An image or a material is written when it is first used.
+    """
 
     def __init__(self, request: dict[str, Any], write: Any) -> None:
         self.time = Usd.TimeCode.Default()
@@ -357,10 +368,7 @@ class Looks:
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:
-        """Return the material and color that prims in an instance inherit.
-
-        Returns None without both.
-        """
+        """Return the material and color that prims in an instance inherit, or None."""
         if not (self._masks or self._colors or self._names_materials):
             return None
         color = self._values(instance, "displayColor") if self._colors else None
@@ -368,11 +376,10 @@ class Looks:
         return None if look == (None, None) else look
 
     def mesh_fields(self, prim: Any, arrays: list[Any]) -> dict[str, Any]:
-        """Return fields of a frame: materials of polygons, and values.
+        """Return the frame fields for the materials and values of a mesh.
 
-        The values are appended to the arrays of the frame.
-
-        Values are at corners, vertices, polygons or constant, by OpenUSD's interpolation.
+        The values are appended to the arrays of the frame. According to the OpenUSD interpolation,
+        they belong to corners, vertices, or polygons, or are constant.
         """
         if not (self._masks or self._colors or self._names_materials):
             return {}
@@ -396,10 +403,7 @@ class Looks:
         return {"materials": materials, "values": values} if materials or values else {}
 
     def _values(self, prim: Any, name: str) -> tuple[str, NDArray[np.float32]] | None:
-        """Return interpolation and values (k, w) of a primvar.
-
-        Returns None if the primvar is not set.
-        """
+        """Return the interpolation and the values (k, w) of a primvar, or None if it is not set."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         values = np.array(primvar.ComputeFlattened(self.time) if primvar else None)
         if values.dtype.kind != "f" or values.ndim != 2:
@@ -418,9 +422,9 @@ class Looks:
         return self._materials[path]
 
     def _material(self, material: Any) -> tuple[int | None, list[str]]:
-        """Write a new material, and return its number and the names of the values read.
+        """Write a new material, and return its number and the names of the primvars that it uses.
 
-        The number is None for a material without properties that are asked for.
+        The number is None if the material has none of the requested properties.
         """
         shader, kind = _surface_shader(material)
         properties = self._properties(shader, kind) if shader else {}
@@ -435,7 +439,7 @@ class Looks:
         return number, [source["values"] for source in sources if "values" in source]
 
     def _properties(self, shader: Any, kind: str) -> dict[str, Any]:
-        """Return color, opacity and threshold of a surface, as far as they are asked for."""
+        """Return the requested properties of a surface: color, opacity, and opacity threshold."""
         properties: dict[str, Any] = {}
         if kind not in _SURFACES:
             if self._colors:
@@ -454,7 +458,7 @@ class Looks:
         return properties
 
     def _omniverse_color(self, shader: Any) -> dict[str, Any]:
-        """Return the base color of NVIDIA's OmniPBR."""
+        """Return the base color of NVIDIA's OmniPBR shader."""
         inputs = ("diffuse_tint", "diffuse_color_constant", "diffuse_texture")
         tint, plain, image = (_constant(shader.GetInput(name)) for name in inputs)
         tint = tint or (1, 1, 1)
@@ -469,7 +473,7 @@ class Looks:
         return {"value": [a * b for a, b in zip(plain or (0.2, 0.2, 0.2), tint, strict=True)]}
 
     def _source(self, surface_input: Any) -> dict[str, Any] | None:
-        """Return the source of the value of a surface's input, or None if the input is not set."""
+        """Return the source of a surface input, or None if the input is not set."""
         attributes = (
             UsdShade.Utils.GetValueProducingAttributes(surface_input) if surface_input else ()
         )
@@ -520,7 +524,7 @@ class Looks:
             c = math.cos(math.radians(angle_deg or 0))
             s = math.sin(math.radians(angle_deg or 0))
             scale_u, scale_v = scale or (1, 1)
-            # Scaled, rotated anticlockwise, moved; of row vectors.
+            # Scale, rotate counterclockwise, and translate row vectors.
             step = np.array(
                 [[scale_u * c, scale_u * s, 0], [-scale_v * s, scale_v * c, 0], [0, 0, 1]]
             )
@@ -530,7 +534,7 @@ class Looks:
         return {"unread": "its texture coordinates are computed in an unsupported way"}
 
     def _image(self, asset: Any) -> int:
-        """Write a new image, and return its number."""
+        """Write an image if it is new, and return its number."""
         path = getattr(asset, "resolvedPath", "") or getattr(asset, "path", "")
         number = self._images.setdefault(path, len(self._images))
         if number < len(self._images) - 1:
@@ -540,7 +544,7 @@ class Looks:
         data = b""
         if "<UDIM>" in path:
             frame["unread"] = "is a set of UDIM tiles, which is not supported"
-        elif not os.path.isfile(outer):  # noqa: PTH113 - or a pipe, which would wait for ever
+        elif not os.path.isfile(outer):  # noqa: PTH113 - opening a pipe would wait forever
             frame["unread"] = "does not exist"
         elif not outer.startswith(self._folders):
             frame["unread"] = (
@@ -553,10 +557,7 @@ class Looks:
 
 
 def _surface_shader(material: Any) -> tuple[Any, str]:
-    """Return the shader of a material's surface and its kind.
-
-    A kind that is read is preferred.
-    """
+    """Return the surface shader of a material and its kind, preferring supported kinds."""
     shader = None
     kind = ""
     for context in ("", "mdl", "mtlx"):
@@ -569,17 +570,17 @@ def _surface_shader(material: Any) -> tuple[Any, str]:
 
 
 def _constant(shader_input: Any) -> Any:
-    """Return the value of an input that no shader computes, or None for an unset input."""
+    """Return the value of an input, or None if it is not set or computed by a shader."""
     attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input) if shader_input else ()
     return attributes[0].Get() if attributes else None
 
 
 def _numbers(value: Any) -> Any:
-    """Return a number, or the numbers of a vector."""
+    """Convert a number or a vector to Python floats."""
     return [float(number) for number in value] if hasattr(value, "__len__") else float(value)
 
 
-# {shader of a surface: (input of its base color, color if that is not set)}
+# {surface shader: (input of its base color, default color)}
 _SURFACES = {
     "UsdPreviewSurface": ("diffuseColor", [0.18] * 3),
     "ND_UsdPreviewSurface_surfaceshader": ("diffuseColor", [0.18] * 3),
@@ -599,7 +600,7 @@ _SIZES = {
 
 
 def _shared(prim: Any) -> Any:
-    """Return the prim of a prototype if instances share the prim, else the prim itself."""
+    """Return the corresponding prim in the prototype if instances share the prim, else the prim."""
     return prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
 
 
@@ -610,16 +611,16 @@ def _transform_varies(prim: Any) -> bool:
 
 
 def _has_surface(prim: Any) -> bool:
-    """Return whether a prim is a shape, or copies shapes."""
+    """Return whether a prim is a shape or an instancer."""
     return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer))
 
 
 class _Animation(NamedTuple):
-    """Motion of a stage, and the times of its poses."""
+    """The motion of a stage, and the times of its poses."""
 
-    animations: list[dict[str, str]]  # names of the animations of skeletons
+    animations: list[dict[str, str]]  # names of the skeleton animations
     attributes: list[Any]  # moving attributes
-    codes: list[float]  # time codes of the poses: one if no animation is asked for
+    codes: list[float]  # time codes of the poses, only one if no animation is requested
 
 
 def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
@@ -628,9 +629,9 @@ def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
     rate_hz = stage.GetTimeCodesPerSecond()
     while name is not None and (proxies := [p for p in stage.Traverse() if p.IsInstance()]):
         for prim in proxies:
-            prim.SetInstanceable(False)  # prims in instances are not skinned
+            prim.SetInstanceable(False)  # usd-core does not skin prims in instances
     prims = [p for p in stage.Traverse() if name is not None or p.IsA(UsdSkel.Animation)]
-    # If the rate is 0, usd-core would look for samples for ever.
+    # With a rate of 0, usd-core would search for samples forever.
     attributes = [a for prim in prims if rate_hz > 0 for a in prim.GetAuthoredAttributes()]
     moving = [attribute for attribute in attributes if attribute.ValueMightBeTimeVarying()]
     clips = {p.GetName(): p.GetPath() for p in prims if moving and p.IsA(UsdSkel.Animation)}
@@ -649,16 +650,16 @@ def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
 
 
 def _stage_files(stage: Any) -> list[str]:
-    """Return the files that a stage was read from.
+    """Return the files from which a stage was read.
 
-    Files in a .usdz count as the .usdz.
+    Files inside a .usdz are represented by the .usdz.
     """
     layers = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
     return sorted({str(Ar.SplitPackageRelativePathOuter(path)[0]) for path in layers} - {""})
 
 
 def _missing_files(stage: Any) -> list[str]:
-    """Return the names of files and prims that a stage refers to and usd-core cannot read."""
+    """Return the names of referenced files and prims that usd-core cannot read."""
     folder = os.path.dirname(stage.GetRootLayer().realPath) + "/"  # noqa: PTH120
     missing_names = set()
     for error in map(str, stage.GetCompositionErrors()):
@@ -668,7 +669,7 @@ def _missing_files(stage: Any) -> list[str]:
 
 
 def _reason(error: Exception, path: str) -> str:
-    """Return the reason of an error, without names of C++ and folders."""
+    """Return the reason for an error without C++ names and folders."""
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
@@ -678,15 +679,15 @@ def _reason(error: Exception, path: str) -> str:
 
 
 def _checked_layers(path: str) -> list[Any]:
-    """Open a layer and its sublayers, and check the kind of every file that they name.
+    """Open a layer and its sublayers, checking that all files that they refer to are regular.
 
-    Opening a pipe waits for a writer. Layers that references of other layers name are not checked:
-    the composition decides which files are opened.
+    Opening a named pipe would wait for a writer. Files that references in other layers name are not
+    checked, because only composition determines which of them are opened.
 
     Raises
     ------
     ValueError
-        If a file is a pipe, a socket or a device.
+        If a file is a pipe, a socket, or a device.
     """
     layers = [Sdf.Layer.FindOrOpen(path)]
     names = {path}
@@ -710,7 +711,7 @@ def main(path: str, request: dict[str, Any]) -> None:
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
         """Write a frame: a line of JSON, and the bytes of arrays."""
-        signal.alarm(0)  # who reads this may take long
+        signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")
         for array in arrays:
@@ -738,13 +739,13 @@ def main(path: str, request: dict[str, Any]) -> None:
                 "times_s": (np.array(animation.codes) / stage.GetTimeCodesPerSecond()).tolist(),
             }
         )
-        looks = Looks(request, write)
+        looks = MaterialReader(request, write)
         for code in animation.codes:
             stage.GetSessionLayer().Clear()  # forget the previous pose
             stage.SetEditTarget(stage.GetSessionLayer())
             for attribute in animation.attributes:
                 attribute.Set(Sdf.ValueBlock() if (value := attribute.Get(code)) is None else value)
-            # Skinning bends at samples only, and prims that stand.
+            # Skinning is only applied at samples, and to prims that do not move.
             UsdSkel.BakeSkinning(stage.Traverse(), Gf.Interval(code, code))
             looks.time = Usd.TimeCode(code)
             nodes = StageNodes(stage, request["most"].copy(), looks, write)
@@ -764,9 +765,9 @@ def main(path: str, request: dict[str, Any]) -> None:
                 *nodes.motions,
                 *nodes.copies,
             )
-    except TooManyError as error:
+    except StageLimitError as error:
         write({"what": "too many", "of": str(error)})
-    except Exception as error:  # readers of broken files raise errors of any type
+    except Exception as error:  # usd-core raises errors of any type
         write({"what": "error", "reason": _reason(error, path)})
     output.flush()
     del silent
@@ -781,4 +782,4 @@ if __name__ == "__main__":
     max_bytes = message["memory"] if hard_limit < 0 else min(message["memory"], hard_limit)
     resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, hard_limit))
     main(file, message)
-    os._exit(0)  # at once: taking a large stage down takes long
+    os._exit(0)  # exit at once, because deleting a large stage takes long

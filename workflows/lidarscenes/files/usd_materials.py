@@ -1,4 +1,4 @@
-"""Materials and colors of OpenUSD's meshes, from the frames of `usd_child.py`."""
+"""Read the materials and colors of OpenUSD meshes from the frames of `usd_child.py`."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from lidarsim.scene.masks import (
 )
 from lidarsim.scene.scene_mesh import Cutout
 
-_DEFAULT_THRESHOLD = 0.5  # lowest opacity that stops light, unless a material states another
+_DEFAULT_THRESHOLD = 0.5  # minimum opacity that stops light, unless the material states another
 _BYTES = np.arange(256) / 255
 
-# Source of a color or an opacity of a material: a `value`, an `image`, or `values` of the mesh;
-# `Looks` in usd_child.py writes them.
+# The source of a material's color or opacity: a `value`, an `image`, or `values` of the mesh, as
+# `MaterialReader` in usd_child.py writes it.
 ColorSource = dict[str, Any]
 _DISPLAY: ColorSource = {"values": "displayColor"}
 
 
 class _Use(NamedTuple):
-    """A use of an image, which meshes share."""
+    """The use of an image by a material; several meshes may share it."""
 
     image: int
     channels: str  # "rgb", or a letter of "rgba"
-    scale: tuple[float, ...]  # (4,); light is multiplied by the scale,
-    bias: tuple[float, ...]  # (4,); then the bias is added
-    raw: bool  # its numbers are light, not sRGB
+    scale: tuple[float, ...]  # (4,) factors for light
+    bias: tuple[float, ...]  # (4,) offsets that are added after scaling
+    raw: bool  # whether values are linear light instead of sRGB
     wraps: tuple[Wrap, Wrap]
 
     @classmethod
     def from_source(cls, source: ColorSource) -> _Use:
-        """Return the use of an image by a source."""
+        """Return the use of an image that a source describes."""
         scale = tuple(source.get("scale", (1,) * 4))
         bias = tuple(source.get("bias", (0,) * 4))
         raw = source.get("raw", False)
@@ -54,20 +54,20 @@ class _Use(NamedTuple):
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
     def light(self, channel: str) -> Floats:
-        """Return the light (256,) of the bytes of a channel."""
+        """Return the linear light (256,) for each byte value of a channel."""
         k = "rgba".index(channel)
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
 
 
-class MeshLook:
-    """Arrays of a mesh that its materials read: texture coordinates and colors.
+class MeshAppearance:
+    """The arrays of a mesh that its materials use: texture coordinates and colors.
 
     Parameters
     ----------
     frame, arrays
         Frame of the mesh.
     value_indices
-        {interpolation: index of the value at each corner of the triangles, (t, 3)}.
+        For each interpolation, the index (t, 3) of the value at each corner of the triangles.
     """
 
     def __init__(
@@ -78,14 +78,17 @@ class MeshLook:
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
     def coordinates(self, source: ColorSource, face_indices: Ints) -> tuple[Floats, Ints]:
-        """Return texture coordinates (c, 2) as in glTF, and their indices at corners, (k, 3)."""
+        """Return texture coordinates (c, 2) in glTF's convention, and their indices (k, 3).
+
+        There is an index for each corner of the triangles.
+        """
         values, corners = self._corner_values(source["values"], face_indices, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
         u, v = (matmul(values, matrix[:2]) + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
-    def painted(self, name: str, face_indices: Ints) -> Colors | None:
-        """Return colors of triangles by values, linear light, or None without values."""
+    def value_colors(self, name: str, face_indices: Ints) -> Colors | None:
+        """Return colors of triangles from values in linear light, or None without values."""
         if name not in self._values:
             return None
         values, corners = self._corner_values(name, face_indices, 3)
@@ -95,8 +98,11 @@ class MeshLook:
         return Colors.of_corners(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
-        """Return values (c, width), and their indices at corners (k, 3), or raise MaskError."""
-        if not name:  # a texture without coordinates has its value at zero everywhere
+        """Return values (c, width), and their indices (k, 3) at corners.
+
+        Raises MaskError if the mesh has no suitable values.
+        """
+        if not name:  # a texture without coordinates is sampled at the origin
             return np.zeros((1, width)), np.zeros((len(face_indices), 3), np.int64)
         if name not in self._values:
             raise MaskError(f"its mesh has no primvar {name!r}")
@@ -114,7 +120,7 @@ class MeshLook:
 
 
 class UsdMaterials:
-    """Images and materials of a scene by their numbers, with colors and masks of triangles."""
+    """The numbered images and materials in a scene, which provide colors and masks."""
 
     def __init__(self, allowance: Allowance, options: ReadOptions) -> None:
         self._allowance = allowance
@@ -128,7 +134,7 @@ class UsdMaterials:
         self.notes = MaskNotes()
 
     def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
-        """Store a frame of an image or a material."""
+        """Store the frame of an image or a material."""
         if frame["what"] == "material":
             self._materials[frame["number"]] = frame
             return
@@ -136,15 +142,15 @@ class UsdMaterials:
         self._images[frame["number"]] = reason, arrays[0].tobytes()
 
     def name(self, number: int | None) -> str:
-        """Return the name of a material, or an empty string if names are not asked for."""
+        """Return the name of a material, or an empty string if names are not requested."""
         return (
             ""
             if number is None or not self._names_materials
             else str(self._materials[number]["name"])
         )
 
-    def colors(self, number: int | None, look: MeshLook, face_indices: Ints) -> Colors | None:
-        """Return the colors that a material gives triangles, or None."""
+    def colors(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Colors | None:
+        """Return the colors that a material gives to triangles, or None."""
         if not self.colored:
             return None
         material = self._materials[number]
@@ -161,11 +167,11 @@ class UsdMaterials:
                 if "image" in color_source:
                     coordinates = look.coordinates(color_source, face_indices)
                     return self._shades(_Use.from_source(color_source)).colors(*coordinates)
-                return look.painted(color_source["values"], face_indices)
+                return look.value_colors(color_source["values"], face_indices)
         return None
 
-    def cutout(self, number: int | None, look: MeshLook, face_indices: Ints) -> Cutout | None:
-        """Return the mask that a material gives triangles, or None for solid triangles."""
+    def cutout(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Cutout | None:
+        """Return the mask that a material gives to triangles, or None if they are opaque."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
         with self.notes.without_mask(material["name"]):
@@ -185,7 +191,7 @@ class UsdMaterials:
     def _image(self, number: int) -> bytes:
         """Return the content of an image.
 
-        Raises MaskError if the image cannot be read.
+        Raises MaskError if it cannot be read.
         """
         reason, content = self._images[number]
         if reason:
@@ -193,7 +199,7 @@ class UsdMaterials:
         return content
 
     def _read_shades(self, use: _Use) -> Texture:
-        """Read the colors of an image as a texture."""
+        """Read the colors in an image as a texture."""
         image = read_colors(self._image(use.image), self._allowance, self.notes)
         names = use.channels if use.channels == "rgb" else use.channels * 3
         tables = [as_srgb(np.nan_to_num(use.light(name))) for name in names]
@@ -201,9 +207,9 @@ class UsdMaterials:
         return Texture(np.stack(shades, axis=-1), use.wraps, self._allowance)
 
     def _read_mask(self, key: tuple[_Use, float]) -> Texture | Literal["glass"] | None:
-        """Read the mask of an image.
+        """Read the mask in an image.
 
-        Returns «glass» if the image is nowhere opaque, and None if it is opaque everywhere.
+        Returns "glass" if the image is opaque nowhere, and None if it is opaque everywhere.
         """
         use, threshold = key
         channel = use.channels[0]
@@ -229,18 +235,19 @@ def material_pieces(
     polygons: tuple[Ints, Ints, Bools],
     materials: UsdMaterials,
 ) -> Iterator[Piece]:
-    """Cut polygons into triangles, divided by their materials.
+    """Triangulate polygons, and divide the triangles by their materials.
 
-    `polygons` are sizes, the vertices at the corners, and whether each polygon is not a hole.
+    `polygons` are the sizes of the polygons, the vertices at their corners, and a mask of the
+    polygons that are not holes.
 
     Raises
     ------
     ValueError
-        As `triangulated`.
+        If `triangulated` raises it.
     """
     sizes, corners, solid = polygons
     check_corners(corners, len(vertices))
-    # By the number of the corner, since a vertex may have another color in each polygon.
+    # Use corners instead of vertices, because colors of a vertex may differ between polygons.
     solid_corners = np.flatnonzero(np.repeat(solid, sizes))
     faces = solid_corners[
         triangulated(vertices[corners[solid_corners]], np.arange(len(solid_corners)), sizes[solid])
@@ -248,7 +255,7 @@ def material_pieces(
     polygon = np.repeat(np.arange(len(sizes)), sizes)[faces]
     value_indices = {"constant": np.zeros_like(faces), "uniform": polygon, "faceVarying": faces}
     value_indices["vertex"] = value_indices["varying"] = corners[faces]
-    look = MeshLook(frame, arrays, value_indices)
+    look = MeshAppearance(frame, arrays, value_indices)
     group = np.zeros(len(sizes), np.int64)
     numbers: list[int | None] = [None]
     for number, array in frame.get("materials", ()):

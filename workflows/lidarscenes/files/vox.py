@@ -1,4 +1,4 @@
-"""Voxel files of AMAPVox (.vox), which HELIOS++ reads too: leaf area by a grid of voxels."""
+"""Read AMAPVox voxel files (.vox) as grids of leaf area, as HELIOS++ does."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, Voxels
 
 DENSITY = "PadBVTotal"
-_MAX_COUNT_ERROR = 2  # voxels between corners and counts; HELIOS++'s own writer makes 1.5
-# The box is larger on all sides by this share of a voxel's edge: its sides do not coincide with the
-# ground or a neighboring grid, which light would miss.
+# Tolerated difference, in voxels, between corners and counts. The writer in HELIOS++ causes 1.5.
+_MAX_COUNT_ERROR = 2
+# The box is enlarged on all sides by this share of a voxel's edge length, so that its sides do not
+# coincide with the ground or a neighboring grid, where rays could miss them.
 _MARGIN = 0.02
 
 
 def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read a voxel file as an object: a box around the voxels with leaves.
 
-    The first voxel starts at `min_corner`, and each has the edge `res`, as in HELIOS++. Voxels that
-    are not listed, or whose density is NaN, have no leaves.
+    As in HELIOS++, the first voxel starts at `min_corner`, and each voxel has the edge length
+    `res`. Voxels that are not listed or whose density is NaN have no leaves.
     """
     if data.startswith(b"VOX "):
         raise MeshFileError(
@@ -66,27 +67,27 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Grid(NamedTuple):
-    """Grid of a voxel file."""
+    """The grid in a voxel file."""
 
-    counts: Floats  # (3,), voxels along x, y and z
-    min_corner: Floats  # (3,), meters: start of the first voxel
-    edges_m: Floats  # (3,), edges of a voxel
+    counts: Floats  # (3,) number of voxels along x, y, and z
+    min_corner: Floats  # (3,) start of the first voxel in meters
+    edges_m: Floats  # (3,) edge lengths of a voxel in meters
 
 
 class _Table(NamedTuple):
-    """Header and rows of a voxel file."""
+    """The header and the rows in a voxel file."""
 
     header: dict[str, str]
     grid: _Grid
     density_name: str
-    indices: Floats  # (n, 3), of the voxels in the grid
-    densities: Floats  # (n,), m²/m³
+    indices: Floats  # (n, 3) indices of the voxels in the grid
+    densities: Floats  # (n,) in m²/m³
 
 
 def _read_table(data: bytes) -> _Table:
-    """Read header and rows of a voxel file.
+    """Read the header and the rows in a voxel file.
 
-    Raises MeshFileError if they are not valid.
+    Raises MeshFileError if they are invalid.
     """
     heading = re.search(rb"^[ \t]*i[ \t]+j[ \t]+k[ \t].*$", data, re.MULTILINE)
     if heading is None:
@@ -107,19 +108,19 @@ def _read_table(data: bytes) -> _Table:
 
 
 def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
-    """Return the numbers (n, k) of the used columns.
+    """Return the numbers (n, k) in the used columns.
 
-    Raises ValueError that names a wrong line.
+    Raises ValueError, with the line number, if a line is invalid.
     """
     try:
         return np.asarray(np.loadtxt(io.BytesIO(text), usecols=used, ndmin=2), np.float64)
-    except ValueError:  # read cell by cell, which names the line
+    except ValueError:  # read again cell by cell to find the invalid line
         lines = io.TextIOWrapper(io.BytesIO(text), "utf-8", "replace")
         return RowReader(columns, used, used=used).read(lines, first_line)
 
 
 def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
-    """Return a box around voxels (x, y, z) that start at a corner (3,), meters."""
+    """Return a box around voxels (x, y, z) that start at a corner (3,), in meters."""
     sides_m = np.array(densities.shape) * edges_m
     margin_m = _MARGIN * edges_m.min()
     shell = box(name, tuple(sides_m + 2 * margin_m))
@@ -129,13 +130,13 @@ def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Flo
 
 
 def _grid(header: dict[str, str]) -> _Grid:
-    """Read the grid of a header.
+    """Read the grid in a header.
 
-    Raises MeshFileError if numbers are missing or wrong.
+    Raises MeshFileError if values are missing or invalid.
     """
 
     def three(name: str, times: int = 1) -> Floats:
-        """Return three numbers of the header, or raise MeshFileError."""
+        """Return three numbers in the header, or raise MeshFileError."""
         try:
             values = np.array([float(word) for word in header[name].split()] * times)[:3]
         except (KeyError, ValueError):
@@ -164,7 +165,7 @@ def _grid(header: dict[str, str]) -> _Grid:
 
 
 def _density_column(columns: list[str]) -> int:
-    """Return the column of plant area density, of AMAPVox 1 or 2."""
+    """Return the index of the plant area density column in AMAPVox 1 or 2."""
     if DENSITY in columns:
         return columns.index(DENSITY)
     named = [row for row, name in enumerate(columns) if name.lower().startswith("pad")]
@@ -177,7 +178,7 @@ def _density_column(columns: list[str]) -> int:
 
 
 def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
-    """Raise MeshFileError for rows outside the grid, repeated voxels, and impossible densities."""
+    """Raise MeshFileError for voxels outside the grid, repeated voxels, and invalid densities."""
     is_bad = ~((indices == np.floor(indices)) & (indices >= 0) & (indices < shape)).all(axis=1)
     if is_bad.any():
         raise MeshFileError(
@@ -198,5 +199,5 @@ def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
 
 
 def _spaced(numbers: Floats) -> str:
-    """Return numbers with spaces between."""
+    """Return numbers separated by spaces."""
     return " ".join(f"{number:g}" for number in numbers)

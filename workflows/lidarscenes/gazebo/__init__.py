@@ -1,1 +1,1 @@
-"""Worlds and models of Gazebo, in SDFormat."""
+"""Read Gazebo worlds and models in SDFormat."""

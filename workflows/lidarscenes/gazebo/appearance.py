@@ -1,4 +1,4 @@
-"""Colors and names of materials in SDFormat."""
+"""Read the colors and material names of SDFormat visuals."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.words import printable
 from lidarsim.scene.colors import as_bytes, as_srgb
 
-from .frames import numbers_of
+from .frames import child_numbers
 
 FULL_RETRO = 255.0  # value of <laser_retro> that is as bright as white
 
-# Diffuse colors of the plain materials that Gazebo brings, sRGB.
+# Diffuse sRGB colors of the plain materials that are part of Gazebo.
 _NAMED: dict[str, tuple[float, float, float]] = {
     "black": (0.0, 0.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
@@ -45,11 +45,11 @@ class Appearance(NamedTuple):
     color
         uint8 (1, 1, 3), sRGB; None without a color.
     material
-        Name of the material; empty without a name.
+        Name of the material, or an empty string.
     is_retro
-        Whether <laser_retro> gives the color, and takes precedence over images.
+        Whether the color comes from <laser_retro>, which takes precedence over images.
     is_hidden
-        Whether the visual is transparent altogether.
+        Whether the visual is fully transparent.
     """
 
     color: Bytes | None
@@ -58,13 +58,13 @@ class Appearance(NamedTuple):
     is_hidden: bool
 
 
-def appearance_of(shape: Element, retro: float) -> Appearance:
+def read_appearance(shape: Element, retro: float) -> Appearance:
     """Return the appearance of a visual or collision.
 
-    `retro` is its <laser_retro>, 0 for none.
+    `retro` is its <laser_retro>, or 0 if there is none.
     """
     material = shape.find("material")
-    hidden = numbers_of(shape, "transparency", 1, "0").item() >= 1
+    hidden = child_numbers(shape, "transparency", 1, "0").item() >= 1
     name = "" if material is None else printable(material.findtext("script/name") or "")
     if retro > 0:
         gray = as_srgb(np.full((1, 1, 3), min(retro / FULL_RETRO, 1.0)))
@@ -76,7 +76,7 @@ def appearance_of(shape: Element, retro: float) -> Appearance:
         if text and len(values) not in (3, 4):
             raise LidarError(f"<diffuse> is {text[:60]!r}; it must be 3 or 4 finite numbers.")
         if text:
-            color = as_bytes(numbers_of(material, "diffuse", len(values), "")[:3])
+            color = as_bytes(child_numbers(material, "diffuse", len(values), "")[:3])
         elif name.startswith(_PREFIX):
             named = _NAMED.get(name.removeprefix(_PREFIX).lower())
             color = None if named is None else as_bytes(named)

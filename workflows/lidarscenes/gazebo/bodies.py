@@ -1,4 +1,4 @@
-"""Models of SDFormat as trees of bodies, with the frames that place links and nested models."""
+"""Read SDFormat models as trees of bodies, with frames that place links and nested models."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lidarsim.base.vectors import matmul
 from lidarsim.base.words import printable
 from lidarsim.scene.files.scene_graph import MAX_NODES
 
-from ..files.lenient_xml import lenient_root
-from .frames import Frames, RelativePose, placed_by, pose_of
+from ..files.lenient_xml import parse_lenient_xml
+from .frames import FrameGraph, RelativePose, placement_matrix, read_pose
 from .notes import Notes
-from .resources import MissingFileError, Resources, Source, short_name
+from .resources import ResourceNotFoundError, Resources, Source, short_name
 
-_MAX_NESTED = 30  # models within each other
+_MAX_NESTED = 30  # maximum depth of nested models
 _MODEL_FRAME = "__model__"
 WORLD_FRAME = "world"
 _SEPARATOR = "::"
@@ -44,68 +44,65 @@ class Link(NamedTuple):
 
     name: str
     element: Element
-    source: Source  # file that the link is in
+    source: Source  # file that contains the link
 
 
-class Instance(NamedTuple):
-    """Placement of a model in a world or in another model."""
+class PlacedModel(NamedTuple):
+    """A model placed in a world or in another model."""
 
     name: str
-    body: Body
-    matrix: Floats  # (4, 4), to the frame of the world or model
+    body: GazeboBody
+    matrix: Floats  # (4, 4) matrix to the frame of the world or model
 
 
 @dataclass(eq=False)
-class Body:
-    """A model, or a world, without its pose.
+class GazeboBody:
+    """The content of a model or a world, without its own pose.
 
-    Equal includes share a body.
+    Identical includes share a body.
 
     Attributes
     ----------
     frames
-        Frames of the model and of its nested models.
+        Frames of the model and its nested models.
     links
         Links of the model itself.
     children
-        Models in it.
+        Nested models.
     """
 
-    frames: Frames
+    frames: FrameGraph
     links: list[Link] = field(default_factory=list)
-    children: list[Instance] = field(default_factory=list)
+    children: list[PlacedModel] = field(default_factory=list)
 
     @cached_property
     def size(self) -> int:
-        """Number of links and models in the model, at all depths."""
+        """Total number of links and nested models."""
         return len(self.links) + sum(1 + child.body.size for child in self.children)
 
 
 class _Included(NamedTuple):
-    """The content of a file of a model."""
+    """The model in a file that an <include> refers to."""
 
     element: Element  # its <model>
     source: Source
 
 
 class BodyReader:
-    """Reader of the bodies of a world.
-
-    Each file and each model is read once.
-    """
+    """Reads the bodies in a world, each file and each model once."""
 
     def __init__(self, resources: Resources, notes: Notes, allowance: Allowance) -> None:
         self.resources = resources
         self.notes = notes
         self.allowance = allowance
         self._files: dict[Path, _Included | None] = {}
-        self._bodies: dict[int, Body] = {}  # {id of a <model>: body}
+        self._bodies: dict[int, GazeboBody] = {}  # {id of a <model>: body}
         self._open_elements: list[int] = []  # ids of the <model>s that are being read
         self._ground: Element | None = None
 
-    def world(self, element: Element, source: Source) -> Body:
-        """Return the body of a <world>, or of a root with models."""
-        body = Body(Frames(WORLD_FRAME))
+    def world(self, element: Element, source: Source) -> GazeboBody:
+        """Return the body of a <world>, or of a root element with models."""
+        body = GazeboBody(FrameGraph(WORLD_FRAME))
         self._fill(body, element, source)
         if body.size > MAX_NODES:
             raise LidarError(
@@ -114,32 +111,32 @@ class BodyReader:
             )
         return body
 
-    def _fill(self, body: Body, element: Element, source: Source) -> None:
-        """Read links, frames and models of an element into a body."""
+    def _fill(self, body: GazeboBody, element: Element, source: Source) -> None:
+        """Read the links, frames, and models in an element into a body."""
         self.notes.check_children(element)
         frames = body.frames
         for link in element.findall("link"):
             with prefixed(f"link {_name(link)!r}"):
-                name = frames.define(_name(link), pose_of(link), frames.root)
+                name = frames.define(_name(link), read_pose(link), frames.root)
             body.links.append(Link(name, link, source))
         for frame in element.findall("frame"):
             attached = printable(frame.get("attached_to", "")) or frames.root
             with prefixed(f"frame {_name(frame)!r}"):
-                frames.define(_name(frame), pose_of(frame), attached)
+                frames.define(_name(frame), read_pose(frame), attached)
         for joint in element.findall("joint"):
             child = joint.find("child")
             link_name = "" if child is None else (child.get("link") or child.text or "")
             if child is not None:
-                frames.define(_name(joint), pose_of(joint), printable(link_name) or frames.root)
+                frames.define(_name(joint), read_pose(joint), printable(link_name) or frames.root)
         nested = [*self._nested(body, element, source)]
         for name, child_body, _ in nested:
             with prefixed(f"model {name!r}"):
-                body.children.append(Instance(name, child_body, frames.matrix(name)))
+                body.children.append(PlacedModel(name, child_body, frames.matrix(name)))
 
     def _nested(
-        self, body: Body, element: Element, source: Source
-    ) -> Iterator[tuple[str, Body, RelativePose]]:
-        """Yield names, bodies and poses of the models in an element, with their frames defined."""
+        self, body: GazeboBody, element: Element, source: Source
+    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
+        """Yield the names, bodies, and poses of nested models, after defining their frames."""
         for child in element:
             if child.tag == "model":
                 name = _name(child)
@@ -150,9 +147,9 @@ class BodyReader:
                 yield from self._include(body, child, source)
 
     def _include(
-        self, body: Body, include: Element, source: Source
-    ) -> Iterator[tuple[str, Body, RelativePose]]:
-        """Yield the model that an <include> names, or merge the model into the body."""
+        self, body: GazeboBody, include: Element, source: Source
+    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
+        """Yield the model that an <include> refers to, or merge the model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
         included = self._included(uri, source)
@@ -169,33 +166,35 @@ class BodyReader:
             yield self._define(body, name, nested, posed, include)
 
     def _define(
-        self, body: Body, name: str, nested: Body, posed: Element, placing: Element
-    ) -> tuple[str, Body, RelativePose]:
-        """Define the frame of a nested model, and return name, body and pose of the model."""
+        self, body: GazeboBody, name: str, nested: GazeboBody, posed: Element, placing: Element
+    ) -> tuple[str, GazeboBody, RelativePose]:
+        """Define the frame of a nested model, and return the model's name, body, and pose."""
         placement = _placement_frame(placing, posed)
-        pose = pose_of(posed)
-        pose = pose._replace(matrix=placed_by(pose.matrix, nested.frames, placement))
+        pose = read_pose(posed)
+        pose = pose._replace(matrix=placement_matrix(pose.matrix, nested.frames, placement))
         frames = body.frames
         name = frames.define(name, pose, frames.root)
         frames.nested[name] = nested.frames
         return name, nested, pose
 
-    def _merge(self, body: Body, nested: Body, posed: Element, placing: Element) -> None:
-        """Add links and models of an included model to the body."""
-        pose = pose_of(posed)
+    def _merge(
+        self, body: GazeboBody, nested: GazeboBody, posed: Element, placing: Element
+    ) -> None:
+        """Merge the links and nested models of an included model into the body."""
+        pose = read_pose(posed)
         frames = body.frames
-        matrix = placed_by(pose.matrix, nested.frames, _placement_frame(placing, posed))
+        matrix = placement_matrix(pose.matrix, nested.frames, _placement_frame(placing, posed))
         matrix = matmul(frames.matrix(pose.frame or frames.root), matrix)
-        frames.adopt(nested.frames, matrix)
+        frames.merge(nested.frames, matrix)
         body.links += nested.links
         body.children += [
             child._replace(matrix=matmul(matrix, child.matrix)) for child in nested.children
         ]
 
-    def model(self, element: Element, source: Source) -> Body:
+    def model(self, element: Element, source: Source) -> GazeboBody:
         """Return the body of a <model>.
 
-        Raises LidarError if includes go in a circle.
+        Raises LidarError if includes are circular.
         """
         key = id(element)
         if key in self._open_elements:
@@ -206,7 +205,7 @@ class BodyReader:
             raise LidarError(f"models are nested more than {_MAX_NESTED} levels deep.")
         if key not in self._bodies:
             self._open_elements.append(key)
-            body = Body(Frames(_MODEL_FRAME))
+            body = GazeboBody(FrameGraph(_MODEL_FRAME))
             self._fill(body, element, source)
             if body.size > MAX_NODES:
                 raise LidarError(
@@ -218,14 +217,14 @@ class BodyReader:
         return self._bodies[key]
 
     def _included(self, uri: str, source: Source) -> _Included | None:
-        """Return the model of a URI, or None for a light, or for a model that is missing."""
+        """Return the model at a URI, or None if it is a light or missing."""
         if not uri:
             self.notes.missing_models["an <include> without <uri>"] += 1
             return None
         name = short_name(uri).rpartition("/")[2].lower()
         try:
-            file = self.resources.model(uri, source)
-        except MissingFileError as error:
+            file = self.resources.find_model(uri, source)
+        except ResourceNotFoundError as error:
             if name in _GROUND_PLANES:
                 return _Included(self._ground_plane(), source)
             if name not in _LIGHTS:
@@ -234,19 +233,19 @@ class BodyReader:
         return self._read(file)
 
     def _ground_plane(self) -> Element:
-        """Return the model of the ground plane that Gazebo brings."""
+        """Return the ground plane model that is part of Gazebo."""
         if self._ground is None:
-            self._ground = lenient_root(GROUND_PLANE.encode())
+            self._ground = parse_lenient_xml(GROUND_PLANE.encode())
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
-        """Return the model of a file, or None without a model, or for an unreadable file."""
+        """Return the model in a file, or None if the file is unreadable or has no model."""
         path = source.path.resolve()
         if path not in self._files:
             self._files[path] = None
             try:
                 data = read_input(path)
-                root = lenient_root(data)
+                root = parse_lenient_xml(data)
             except (OSError, ValueError, LidarError) as error:
                 reason = getattr(error, "strerror", None) or error
                 self.notes.unread_files[f"{path.parent.name}/{path.name}"] = f"{reason}"
@@ -261,16 +260,22 @@ class BodyReader:
 
 
 def _placement_frame(placing: Element, posed: Element) -> str:
-    """Return the frame of a model that its pose is for, or no text for the model's own frame."""
+    """Return the frame of a model that its pose refers to; empty for the model's own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element, without characters that cannot be printed."""
+    """Return the name of an element without unprintable characters."""
     return printable(element.get("name", ""))
 
 
-def scoped(path: tuple[str, ...]) -> str:
-    """Return the name of a model or link within models, as Gazebo writes names."""
+def scoped_name(path: tuple[str, ...]) -> str:
+    """Join the names of nested models and a link in Gazebo's notation.
+
+    Examples
+    --------
+    >>> scoped_name(("car", "wheel"))
+    'car::wheel'
+    """
     return _SEPARATOR.join(path)

@@ -1,4 +1,4 @@
-"""Poses of SDFormat, and frames that poses are relative to."""
+"""Resolve SDFormat poses and the frames that they are relative to."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.base.words import did_you_mean, printable
 from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
 
-MAX_NUMBER = 1e8  # limit for numbers in a file, but for poses
-_MAX_POSE = 1e12  # number of a pose, beyond which it is as if it were infinite
-_MIN_NORM = 1e-6  # limit for the norm of a quaternion
+MAX_NUMBER = 1e8  # largest number in a file, except in poses
+_MAX_POSE = 1e12  # larger numbers in a pose are treated as infinite
+_MIN_NORM = 1e-6  # smallest norm of a quaternion
 
 
 class RelativePose(NamedTuple):
     """A pose in a named frame."""
 
-    matrix: Floats  # (4, 4), from the posed frame to the named frame
-    frame: str  # empty for the default of the element
+    matrix: Floats  # (4, 4) matrix from the posed frame to the named frame
+    frame: str  # empty for the default frame of the element
 
 
-def numbers_of(
+def child_numbers(
     element: Element, name: str, count: int, default: str, *, at_least: float | None = None
 ) -> Floats:
-    """Return `count` numbers of the text of a child element, or of `default` without a text.
+    """Return the `count` numbers in a child element, or in `default` if it is missing or empty.
 
     Raises
     ------
     LidarError
-        If the text is other than `count` finite numbers, or a number is below `at_least`.
+        If the text does not consist of `count` finite numbers, or a number is below `at_least`.
     """
     text = (element.findtext(name) or "").strip() or default
-    return numbers_in(text, f"<{name}>", count, at_least=at_least)
+    return parse_numbers(text, f"<{name}>", count, at_least=at_least)
 
 
-def numbers_in(
+def parse_numbers(
     text: str,
     subject: str,
     count: int,
@@ -49,11 +49,10 @@ def numbers_in(
     at_least: float | None = None,
     of_any_size: bool = False,
 ) -> Floats:
-    """Return the numbers of a text.
+    """Parse `count` numbers in a text, which error messages call `subject`.
 
-    Raises LidarError, which names `subject`, as `numbers_of` does.
-
-    With `of_any_size`, numbers may also be infinite, NaN or very large.
+    With `of_any_size`, numbers may also be infinite, NaN, or very large. Raises LidarError as
+    `child_numbers` does.
     """
     try:
         values = np.array(text.split(), np.float64)
@@ -68,61 +67,60 @@ def numbers_in(
     return values
 
 
-def pose_of(element: Element) -> RelativePose:
-    """Return the pose of an element, or identity without <pose>."""
+def read_pose(element: Element) -> RelativePose:
+    """Return the pose of an element, or the identity if it has no <pose>."""
     pose = element.find("pose")
     if pose is None:
         return RelativePose(np.eye(4), "")
     frame = pose.get("relative_to") or pose.get("frame") or ""
-    return RelativePose(matrix_of(pose), printable(frame))
+    return RelativePose(read_matrix(pose), printable(frame))
 
 
-def matrix_of(pose: Element) -> Floats:
-    """Return the matrix (4, 4) of a <pose>: x, y, z, and roll, pitch, yaw or a quaternion.
+def read_matrix(pose: Element) -> Floats:
+    """Return the matrix (4, 4) of a <pose>.
 
-    Physics may have thrown a model to a pose that is not finite, or has very large numbers: its
-    matrix is of NaN, apart from the last row.
+    The pose consists of x, y, z, and either roll, pitch, and yaw or a quaternion. In a recorded
+    state, physics may have moved a model to a pose with infinite or very large numbers. The matrix
+    of such a pose is NaN, except for its last row.
 
     Raises
     ------
     LidarError
-        If there are not as many numbers as expected, or the quaternion has no length.
+        If the number of values is wrong, or the quaternion has zero length.
     """
     text = (pose.text or "").strip()
     is_quaternion = pose.get("rotation_format") == "quat_xyzw"
     if not text:
         return np.eye(4)
-    values = numbers_in(text, "<pose>", 7 if is_quaternion else 6, of_any_size=True)
+    values = parse_numbers(text, "<pose>", 7 if is_quaternion else 6, of_any_size=True)
     if not (np.abs(values) <= _MAX_POSE).all():
         return affine(np.full((3, 3), np.nan), np.full(3, np.nan))
     if is_quaternion:
-        norm = length(values[3:])
-        if not norm > _MIN_NORM:
+        size = norm(values[3:])
+        if not size > _MIN_NORM:
             raise LidarError(f"<pose> is {shown(text)}, whose quaternion has zero length.")
-        x, y, z, w = values[3:] / norm
+        x, y, z, w = values[3:] / size
         return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
     angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])
     return affine(rotations_of(angles[::-1]) if angles.any() else np.eye(3), values[:3])
 
 
-class Frames:
-    """Frames of a world or model, by name.
+class FrameGraph:
+    """The frames of a world or model, by name.
 
     `root` is the name of the frame of the world or model itself.
     """
 
     def __init__(self, root: str) -> None:
         self.root = root
-        self.nested: dict[str, Frames] = {}  # {name of a nested model: its frames}
-        self._matrices: dict[str, Floats] = {root: np.eye(4)}  # (4, 4), to the root
+        self.nested: dict[str, FrameGraph] = {}  # {name of a nested model: its frames}
+        self._matrices: dict[str, Floats] = {root: np.eye(4)}  # matrices (4, 4) to the root
         self._poses: dict[str, RelativePose] = {}
 
     def define(self, name: str, pose: RelativePose, default: str) -> str:
-        """Define a frame by its pose.
+        """Define a frame, and return its name, with a number if the name is already used.
 
-        `default` is the frame of poses that name none.
-
-        Returns the name, with a number if the name is in use.
+        `default` is the reference frame if the pose does not name one.
         """
         unique = name
         number = 0
@@ -136,8 +134,8 @@ class Frames:
         """Return the names of all defined frames."""
         return [self.root, *self._poses]
 
-    def adopt(self, nested: Frames, placement: Floats) -> None:
-        """Define the frames of a merged model, whose root is at `placement` (4, 4), as own."""
+    def merge(self, nested: FrameGraph, placement: Floats) -> None:
+        """Add the frames of a merged model whose root is placed by a matrix (4, 4)."""
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
             self.define(name, RelativePose(matrix, self.root), self.root)
@@ -149,7 +147,7 @@ class Frames:
         Raises
         ------
         LidarError
-            If the frame, or one that it is relative to, is not defined, or they go in a circle.
+            If a frame is not defined, or if frames refer to each other in a circle.
         """
         chain: list[str] = []
         while name not in self._matrices:
@@ -163,7 +161,7 @@ class Frames:
         return self._matrices[chain[0] if chain else name]
 
     def _pose(self, name: str) -> RelativePose:
-        """Return the pose of a frame, or of a frame MODEL::FRAME of a nested model."""
+        """Return the pose of a frame, which may be MODEL::FRAME of a nested model."""
         model, mark, inner = name.partition("::")
         if name not in self._poses and mark and model in self.nested:
             self._poses[name] = RelativePose(self.nested[model].matrix(inner), model)
@@ -173,13 +171,13 @@ class Frames:
             )
         return self._poses[name]
 
-    def between(self, frame: str, target: str) -> Floats:
+    def transform_between(self, frame: str, target: str) -> Floats:
         """Return the matrix (4, 4) from a frame to another frame."""
         return matmul(inverted(self.matrix(target)), self.matrix(frame))
 
 
-def placed_by(pose: Floats, frames: Frames, placement_frame: str) -> Floats:
-    """Return the matrix (4, 4) of a model whose `placement_frame` is at a pose (4, 4)."""
+def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
+    """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose (4, 4)."""
     if not placement_frame:
         return pose
     return matmul(pose, inverted(frames.matrix(placement_frame)))

@@ -1,4 +1,4 @@
-"""Worlds of Gazebo as scenarios: a sensor for each lidar, on one carrier that stands."""
+"""Convert Gazebo worlds to scenarios, with a sensor for each lidar on a stationary platform."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 
 from ..writers.lidar_scenario import write_scenario
-from .frames import numbers_of
-from .lidars import lidars_of, unknown_sensors
-from .visibility_flags import ALL_BITS, flags_of
-from .world import GazeboOptions, World, content_of, load_world
+from .frames import child_numbers
+from .lidars import find_lidars, unknown_sensors
+from .visibility_flags import ALL_BITS, read_flags
+from .world import GazeboOptions, World, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a world as a scenario into a folder: `scenario.yaml`, and a data file of each lidar.
+    """Write a world as a scenario: `scenario.yaml`, and a data file for each lidar.
 
     Parameters
     ----------
     world
         A .sdf or .world file with lidars.
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
         Folders that are searched first for models.
 
     Returns
     -------
-    What is not as in Gazebo, a line each.
+    Differences from Gazebo, one line each.
 
     Raises
     ------
     LidarError
-        If the world cannot be read, or has no lidar.
+        If the world cannot be read or has no lidar.
     """
     if len(assets) > 1:
         raise LidarError("it is a Gazebo world, for which only one `--assets` folder is allowed.")
     loaded = _loaded(world, assets)
-    lidars = [*lidars_of(loaded)]
-    left_out = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
+    lidars = [*find_lidars(loaded)]
+    unsupported = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
     if not lidars:
         reason = "".join(f" It contains {line}." for line in loaded.notes.remote_lines())
         reason += "".join(f" {line}" for line in unknown_sensors(loaded))
@@ -61,25 +61,25 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     entry = {"file": world, **({"assets": assets[0]} if assets else {})}
     unseen = _unseen_objects(loaded, [lidar.mask for lidar in lidars], _folders(world, assets))
     seeing = [lidar.lidar._replace(unseen=tuple(unseen.get(lidar.mask, ()))) for lidar in lidars]
-    return write_scenario(folder, "Gazebo", entry, seeing, _materials(loaded), left_out)
+    return write_scenario(folder, "Gazebo", entry, seeing, _materials(loaded), unsupported)
 
 
 def _unseen_objects(
     world: World, masks: Sequence[int], folders: tuple[Path, ...]
 ) -> dict[int, list[str]]:
-    """Return the patterns of the objects that lidars do not see: {<visibility_mask>: patterns}.
+    """Return the name patterns of objects that lidars do not see, by <visibility_mask>.
 
-    The names come from the scene of the world. Its meshes are read only if a lidar does not see a
-    visual.
+    The names are those in the scene. The meshes of the world are read only if a lidar does not see
+    one of the visuals.
     """
     visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]
-    flags = {flags_of(visual) for visual in visuals} - {0}
+    flags = {read_flags(visual) for visual in visuals} - {0}
     if all(mask and all(mask & value for value in flags) for mask in masks):
         return {}
     options = ReadOptions(masks=False, colors=False, folders=folders, own=GazeboOptions())
     with np.errstate(all="ignore"):
-        content, placed = content_of(world, options)
-    # Objects without an area are not in the content, which is else in the same order.
+        content, placed = build_content(world, options)
+    # The content has the same order, but lacks objects without an area.
     rest = iter(placed)
     objects = [item.name for item in content.meshes]
     flags_of_objects = [
@@ -95,9 +95,9 @@ def _unseen_objects(
 
 
 def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
-    """Return patterns that fit the names that are unseen, and no other name.
+    """Return patterns that match exactly the names of unseen objects.
 
-    All objects of a model, if there are several, are one pattern: MODEL/*.
+    If a model has several objects that are all unseen, the pattern is MODEL/*.
     """
     if all(is_unseen):
         return ["*"]
@@ -112,12 +112,12 @@ def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
 
 
 def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the folders of a world, resolved: its own first."""
+    """Return the resolved folders of a world, its own folder first."""
     return world.parent.resolve(), *(folder.resolve() for folder in assets)
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
-    """Return a world.
+    """Load a world.
 
     Raises LidarError if the file cannot be read.
     """
@@ -132,13 +132,13 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
 
 
 def _materials(world: World) -> dict[str, Any]:
-    """Return the section of materials, for shapes with a <laser_retro>."""
+    """Return the `materials` section if a shape has a <laser_retro>."""
     if not any(_has_retro(link.link.element) for link in world.links):
         return {}
     return {"materials": [{"objects": "*", "reflectance": "texture"}]}
 
 
 def _has_retro(link: Element) -> bool:
-    """Return True if a shape of a link has a <laser_retro> above 0."""
+    """Return True if a shape of a link has a positive <laser_retro>."""
     shapes = [*link.findall("visual"), *link.findall("collision")]
-    return any(numbers_of(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)
+    return any(child_numbers(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)

@@ -1,4 +1,4 @@
-"""Lidars of Gazebo, <sensor type="gpu_lidar"> and the like, as data files of sensors."""
+"""Convert Gazebo lidars, such as <sensor type="gpu_lidar">, to sensor data files."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import did_you_mean, listed, printable
 
-from ..writers.lidar_scenario import Lidar, clean
-from .bodies import scoped
-from .frames import numbers_in, numbers_of, pose_of
+from ..writers.lidar_scenario import Lidar, rounded
+from .bodies import scoped_name
+from .frames import child_numbers, parse_numbers, read_pose
 from .notes import unknown_children
-from .visibility_flags import LIDARS, figures_of, lidar_elements, mask_of
+from .visibility_flags import LIDARS, lidar_elements, lidar_settings, read_mask
 from .world import PlacedLink, World
 
-_COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
-# Types of sensors of SDFormat 1.0 to 1.12 that are not lidars.
+_COLLISION_LIDARS = ("ray", "lidar")  # their rays hit collision shapes
+# Sensor types in SDFormat 1.0 to 1.12 that are not lidars.
 _OTHER_SENSORS = (
     *("air_pressure", "air_speed", "altimeter", "contact", "custom", "force_torque", "gps", "imu"),
     *("magnetometer", "navsat", "rfid", "rfidtag", "sonar"),
@@ -31,53 +31,53 @@ _OTHER_SENSORS = (
     *("thermal_camera", "wide_angle_camera", "wideanglecamera"),
 )
 _SCANS = ("horizontal", "vertical")
-_NOISE_LEFT_OUT = {
+_NOISE_UNSUPPORTED = {
     "mean": "the mean of the noise",
     "bias_mean": "the mean of the noise bias",
     "bias_stddev": "the standard deviation of the noise bias",
     "dynamic_bias_stddev": "the dynamic bias of the noise",
     "precision": "the precision of the noise",
 }
-_MAX_NAMES = 12  # limit for the names that a line lists
-_RATE_HZ = 10.0  # default rate of sensors
+_MAX_NAMES = 12  # maximum number of names in a line
+_RATE_HZ = 10.0  # default update rate
 _FULL_TURN = 360.0
 _SLACK_DEG = 1e-3
 _MAX_SAMPLES = 1_000_000
 
 
 class GazeboLidar(NamedTuple):
-    """A lidar, and its <visibility_mask>."""
+    """A lidar and its <visibility_mask>."""
 
     lidar: Lidar
     mask: int
 
 
-def lidars_of(world: World) -> Iterator[GazeboLidar]:
-    """Yield the lidars of a world.
+def find_lidars(world: World) -> Iterator[GazeboLidar]:
+    """Yield the lidars in a world.
 
-    Raises LidarError if figures of a lidar are impossible.
+    Raises LidarError if a lidar has invalid values.
     """
     for link in world.links:
         for element in lidar_elements(link.link.element):
             name = printable(element.get("name", "")) or "lidar"
-            full_name = scoped((*link.path, name))
+            full_name = scoped_name((*link.path, name))
             with prefixed(f"sensor {full_name!r}"):
-                yield GazeboLidar(_lidar(element, link, name, full_name), mask_of(element))
+                yield GazeboLidar(_lidar(element, link, name, full_name), read_mask(element))
 
 
 def unknown_sensors(world: World) -> Iterator[str]:
-    """Yield clauses on the sensors of a world whose type SDFormat does not define."""
+    """Yield a clause for each sensor whose type is not defined by SDFormat."""
     for link in world.links:
         for element in link.link.element.findall("sensor"):
             kind = element.get("type") or ""
             if kind not in (*LIDARS, *_OTHER_SENSORS):
-                name = scoped((*link.path, printable(element.get("name", ""))))
+                name = scoped_name((*link.path, printable(element.get("name", ""))))
                 hint = did_you_mean(kind, LIDARS)
                 yield f"sensor {name!r} has the unknown type {printable(kind)[:40]!r}.{hint}"
 
 
 def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
-    """Yield a clause on elements of a lidar that SDFormat does not define, if any."""
+    """Yield a clause if a lidar has elements that are not defined by SDFormat."""
     scans = figures.findall("scan")
     parents = [element, figures, *scans]
     parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
@@ -87,33 +87,33 @@ def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
 
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
-    """Return the lidar of a <sensor>."""
-    figures = figures_of(element)
+    """Convert a <sensor> to a lidar."""
+    figures = lidar_settings(element)
     if figures is None:
         hint = did_you_mean("lidar", [printable(child.tag) for child in element])
         raise LidarError(f"it has neither <lidar> nor <ray>.{hint}")
-    pose = pose_of(element)
+    pose = read_pose(element)
     matrix = pose.matrix
     if pose.frame and pose.frame != link.link.name:
-        matrix = matmul(link.body.frames.between(pose.frame, link.link.name), matrix)
-    left_out = [*_unknown_elements(element, figures)]
-    rate_hz = numbers_of(element, "update_rate", 1, "0").item()
+        matrix = matmul(link.body.frames.transform_between(pose.frame, link.link.name), matrix)
+    unsupported = [*_unknown_elements(element, figures)]
+    rate_hz = child_numbers(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
-        left_out.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
+        unsupported.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
-        "rate_hz": clean(rate_hz),
+        "rate_hz": rounded(rate_hz),
         **_directions(figures),
     }
     ranges = figures.find("range")
-    resolution_m = 0.0 if ranges is None else numbers_of(ranges, "resolution", 1, "0").item()
+    resolution_m = 0.0 if ranges is None else child_numbers(ranges, "resolution", 1, "0").item()
     if resolution_m > 0:
-        data["optics"] = {"resolution_m": clean(resolution_m)}
-    data |= _noise(element, figures, left_out)
+        data["optics"] = {"resolution_m": rounded(resolution_m)}
+    data |= _noise(element, figures, unsupported)
     if element.get("type") in _COLLISION_LIDARS:
-        left_out.append(
+        unsupported.append(
             "rays that hit collision shapes (to include them, set geometry: collision in "
             "scene.files)"
         )
@@ -125,12 +125,12 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
         range_m=_range_m(ranges),
         matrix=matmul(link.matrix, matrix),
         model_matrix=link.model,
-        left_out=tuple(left_out),
+        unsupported=tuple(unsupported),
     )
 
 
 class _Scan(NamedTuple):
-    """Evenly spaced angles, both ends included."""
+    """Evenly spaced angles, including both ends."""
 
     first_deg: float
     last_deg: float
@@ -143,17 +143,17 @@ class _Scan(NamedTuple):
 
 
 def _scan(figures: Element, name: str, samples: str) -> _Scan:
-    """Return the samples of <horizontal> or <vertical>.
+    """Return the samples in <horizontal> or <vertical>.
 
     `samples` is the default number.
     """
     scan = figures.find(f"scan/{name}")
     scan = Element(name) if scan is None else scan
-    stated = numbers_of(scan, "samples", 1, samples, at_least=1).item()
-    count = round(stated * numbers_of(scan, "resolution", 1, "1", at_least=0).item())
+    stated = child_numbers(scan, "samples", 1, samples, at_least=1).item()
+    count = round(stated * child_numbers(scan, "resolution", 1, "1", at_least=0).item())
     if count > _MAX_SAMPLES:
         raise LidarError(f"<{name}> has {count:,} samples; at most {_MAX_SAMPLES:,} are allowed.")
-    angles = [numbers_of(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
+    angles = [child_numbers(scan, limit, 1, "0").item() for limit in ("min_angle", "max_angle")]
     first_deg, last_deg = np.degrees(angles).tolist()
     if last_deg < first_deg:
         raise LidarError(f"<{name}> has a <max_angle> below its <min_angle>.")
@@ -161,53 +161,50 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
 
 
 def _directions(figures: Element) -> dict[str, Any]:
-    """Return the fields of a data file for the directions of the rays."""
+    """Return the data file fields that describe the ray directions."""
     vertical = _scan(figures, "vertical", "1")
-    elevations: Any = [clean(vertical.first_deg)]
+    elevations: Any = [rounded(vertical.first_deg)]
     if vertical.samples > 1:
-        limits = {"first": clean(vertical.first_deg), "last": clean(vertical.last_deg)}
+        limits = {"first": rounded(vertical.first_deg), "last": rounded(vertical.last_deg)}
         elevations = {**limits, "count": vertical.samples}
     horizontal = _scan(figures, "horizontal", "640")
     step_deg = horizontal.step_deg
     count = horizontal.samples
     while count > 1 and count * step_deg > _FULL_TURN + _SLACK_DEG:
-        count -= 1  # the last sample is the first again
+        count -= 1  # the last sample repeats the first
     fields: dict[str, Any] = {"firings_per_turn": count}
     if count == 1 or count * step_deg > _FULL_TURN - _SLACK_DEG:
-        fields["zero_deg"] = clean(horizontal.first_deg)
-    else:  # firings of a line begin at its start, and end a step before its end
+        fields["zero_deg"] = rounded(horizontal.first_deg)
+    else:  # the last firing is one step before the end of the scan line
         width_deg = count * step_deg
-        fields["zero_deg"] = clean(horizontal.first_deg + width_deg / 2)
-        fields["mirror"] = {"motion": "sawtooth", "width_deg": clean(width_deg)}
+        fields["zero_deg"] = rounded(horizontal.first_deg + width_deg / 2)
+        fields["mirror"] = {"motion": "sawtooth", "width_deg": rounded(width_deg)}
     return {**fields, "beams": {"elevation_deg": elevations}}
 
 
 def _range_m(ranges: Element | None) -> tuple[float, float]:
-    """Return the shortest and the longest range, meters."""
+    """Return the minimum and the maximum range in meters."""
     if ranges is None:
         return 0.0, math.inf
     longest = (ranges.findtext("max") or "inf").strip()
     is_infinite = longest.lower().lstrip("+").startswith("inf")
-    max_range_m = math.inf if is_infinite else numbers_in(longest, "<max>", 1).item()
-    return numbers_of(ranges, "min", 1, "0", at_least=0).item(), max_range_m
+    max_range_m = math.inf if is_infinite else parse_numbers(longest, "<max>", 1).item()
+    return child_numbers(ranges, "min", 1, "0", at_least=0).item(), max_range_m
 
 
-def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
-    """Return the fields of a data file for noise.
-
-    Differences to Gazebo go to `left_out`.
-    """
+def _noise(element: Element, figures: Element, unsupported: list[str]) -> dict[str, Any]:
+    """Return the data file fields for noise, and add differences from Gazebo to `unsupported`."""
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:
         return {}
     kind = (noise.findtext("type") or noise.get("type") or "gaussian").strip()
     if kind not in ("gaussian", "gaussian_quantized", "none"):
-        left_out.append(f"noise of type {printable(kind)[:30]!r}")
+        unsupported.append(f"noise of type {printable(kind)[:30]!r}")
         return {}
-    for name, words in _NOISE_LEFT_OUT.items():
+    for name, words in _NOISE_UNSUPPORTED.items():
         is_used = name != "precision" or kind == "gaussian_quantized"
-        if is_used and numbers_of(noise, name, 1, "0").item():
-            left_out.append(words)
-    sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
-    return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}
+        if is_used and child_numbers(noise, name, 1, "0").item():
+            unsupported.append(words)
+    sigma_m = child_numbers(noise, "stddev", 1, "0", at_least=0).item()
+    return {"performance": {"range_m": rounded(sigma_m)}} if sigma_m and kind != "none" else {}

@@ -1,4 +1,4 @@
-"""Meshes of the links of models, in the frames of the links."""
+"""Read the meshes of links, in the frames of the links."""
 
 from __future__ import annotations
 
@@ -25,33 +25,31 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..files.dae import read_dae
-from .appearance import FULL_RETRO, Appearance, appearance_of
-from .bodies import Body, Link
-from .frames import numbers_of, pose_of
+from .appearance import FULL_RETRO, Appearance, read_appearance
+from .bodies import GazeboBody, Link
+from .frames import child_numbers, read_pose
 from .notes import Notes
-from .resources import MissingFileError, Resources, Source
+from .resources import ResourceNotFoundError, Resources, Source
 from .sdf_shapes import height_map_mesh, polyline_mesh, shape_mesh
-from .visibility_flags import ALL_BITS, flags_of
+from .visibility_flags import ALL_BITS, read_flags
 
-# Formats that Gazebo reads; worlds would be read without end.
+# Mesh formats that Gazebo reads. Worlds are excluded, because they could include each other.
 MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")
 
 
 class LinkMesh(NamedTuple):
-    """Shapes of a link that the same lidars see."""
+    """The shapes of a link that are visible to the same lidars."""
 
     mesh: SceneMesh
     flags: int  # <visibility_flags> of the first shape
-    suffix: str  # end of the object's name: empty for the first mesh of a link
+    suffix: str  # suffix of the object's name, empty for the first mesh of a link
 
 
 @dataclass(eq=False)
 class LinkMeshes:
-    """Reader of the visuals, or the collision shapes, of links.
+    """Reads the visuals or the collision shapes of links, each file once.
 
-    Each file is read once.
-
-    `masks` are the <visibility_mask>s of the world's lidars.
+    `masks` are the <visibility_mask> values of the lidars in the world.
     """
 
     resources: Resources
@@ -59,25 +57,23 @@ class LinkMeshes:
     notes: Notes
     allowance: Allowance
     masks: tuple[int, ...] = ()
-    # {(path, name of the function that reads it): meshes}
+    # {(path, name of the loading method): meshes}
     _files: dict[tuple[Path, str], list[SceneMesh]] = field(default_factory=dict)
     _links: dict[tuple[int, tuple[float, ...]], list[LinkMesh]] = field(default_factory=dict)
 
     @property
     def _collisions(self) -> bool:
-        """True if shapes for collisions are read in place of visuals."""
+        """Whether collision shapes are read instead of visuals."""
         return bool(self.options.own.geometry == "collision")
 
-    def meshes_of(
-        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+    def link_meshes(
+        self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the mesh of a link, which instances of the model share.
+        """Return the meshes of a link, which instances of the model share.
 
-        Returns an empty list without shapes.
-
-        A link has several meshes if a lidar of the world sees some of its visuals and not others.
-        `name` is the link's in the world, for notes; `scale` are three factors for all
-        shapes.
+        A link has several meshes if a lidar sees some of its visuals but not others, and none if it
+        has no shapes. `name` is the name of the link in the world, for notes. `scale` are factors
+        along the axes.
         """
         key = (id(link.element), scale)
         if key not in self._links:
@@ -86,10 +82,10 @@ class LinkMeshes:
         return self._links[key]
 
     def _read_link(
-        self, body: Body, link: Link, name: str, scale: tuple[float, ...]
+        self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the meshes of a link (`meshes_of`)."""
-        # {whether each mask sees a shape: the first shape, its flags, and meshes of all shapes}
+        """Read the meshes of a link, as `link_meshes` returns them."""
+        # Shapes grouped by which masks see them: the first shape, its flags, and all meshes
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):
             flags = ALL_BITS if self._collisions else self._flags_of(shape, name)
@@ -107,9 +103,9 @@ class LinkMeshes:
         ]
 
     def _flags_of(self, shape: Element, name: str) -> int:
-        """Return the flags of a visual, and note a visual that nothing sees."""
+        """Return the visibility flags of a visual, and note a visual that no lidar sees."""
         with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
-            flags = flags_of(shape)
+            flags = read_flags(shape)
         if not flags:
             self.notes.invisible[name] = None
         return flags
@@ -125,34 +121,34 @@ class LinkMeshes:
         return shapes
 
     def _shape_meshes(
-        self, body: Body, link: Link, shape: Element, name: str, scale: tuple[float, ...]
+        self, body: GazeboBody, link: Link, shape: Element, name: str, scale: tuple[float, ...]
     ) -> list[SceneMesh]:
-        """Return the meshes of a visual or a collision shape in the frame of its link."""
+        """Return the meshes of a visual or collision shape in the frame of its link."""
         self.notes.check_children(shape)
         with prefixed(f"{shape.tag} {printable(shape.get('name', ''))!r}"):
             retro = _retro(link.element, shape)
             if retro > FULL_RETRO:
                 self.notes.bright[name] = None
-            appearance = appearance_of(shape, retro)
+            appearance = read_appearance(shape, retro)
             if appearance.is_hidden:
                 self.notes.hidden[name] = None
                 return []
             geometry = shape.find("geometry")
-            parts = [] if geometry is None else self.geometry(geometry, link.source)
-            pose = pose_of(shape)
+            parts = [] if geometry is None else self.geometry_meshes(geometry, link.source)
+            pose = read_pose(shape)
             matrix = pose.matrix
             if pose.frame and pose.frame != link.name:
-                matrix = matmul(body.frames.between(pose.frame, link.name), matrix)
+                matrix = matmul(body.frames.transform_between(pose.frame, link.name), matrix)
         linear = matrix[:3, :3] * np.array(scale)
         moved = []
         for part in parts:
             self.allowance.take(part.vertices.nbytes + part.faces.nbytes)
             placed = part.moved(part.name, linear, matrix[:3, 3])
-            moved.append(self.painted(placed, appearance))
+            moved.append(self.with_appearance(placed, appearance))
         return moved
 
-    def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
-        """Return a mesh with color and material of its visual, unless its file has any."""
+    def with_appearance(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
+        """Apply the color and material of a visual, unless the mesh file defines its own."""
         color = appearance.color
         is_plain = mesh.colors is None or appearance.is_retro
         if self.options.colors and color is not None and is_plain:
@@ -161,8 +157,8 @@ class LinkMeshes:
             mesh = replace(mesh, materials=FaceMaterials.named(appearance.material))
         return mesh
 
-    def geometry(self, geometry: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a <geometry>, or [] for a shape without a size or file."""
+    def geometry_meshes(self, geometry: Element, source: Source) -> list[SceneMesh]:
+        """Return the meshes of a <geometry>, or none for a shape without a size or a file."""
         shapes = [child for child in geometry if ":" not in child.tag]
         if not shapes:
             return []
@@ -184,9 +180,9 @@ class LinkMeshes:
         return [] if mesh is None else [mesh]
 
     def _mesh(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a file, or of its <submesh>, scaled."""
+        """Return the scaled meshes in a file or of its <submesh>."""
         uri = (shape.findtext("uri") or "").strip()
-        scale = numbers_of(shape, "scale", 3, "1 1 1")
+        scale = child_numbers(shape, "scale", 3, "1 1 1")
         meshes = self.file_meshes(uri, source)
         part = shape.find("submesh")
         if part is not None:
@@ -196,7 +192,7 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
 
     def _part(self, meshes: list[SceneMesh], part: Element, uri: str) -> list[SceneMesh]:
-        """Return the meshes of a <submesh>, with the middle at zero if <center> is true."""
+        """Return the meshes of a <submesh>, centered at the origin if <center> is true."""
         name = printable(part.findtext("name") or "")
         if not name or not meshes:
             return meshes
@@ -215,7 +211,7 @@ class LinkMeshes:
         return chosen
 
     def _height_map(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the surface of a height map, or none if its image is missing or cannot be read."""
+        """Return the surface of a height map, or nothing if its image is unusable."""
         uri = (shape.findtext("uri") or "").strip()
         file = self._file(uri, source)
         if file is None:
@@ -231,25 +227,25 @@ class LinkMeshes:
             return []
 
     def file_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a file in its axes.
+        """Return the meshes in a file, in the axes of the file.
 
-        The list is empty, and a note says so, for an unusable file.
+        If the file is unusable, the list is empty, and a note is added.
         """
         return self._read_once(uri, source, self._load)
 
     def skin_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the skin of an actor at rest.
+        """Return the skin of an actor in its rest pose.
 
-        The list is empty, and a note says so, for an unusable file.
+        If the file is unusable, the list is empty, and a note is added.
         """
         return self._read_once(uri, source, self._load_skin)
 
     def _read_once(
         self, uri: str, source: Source, load: Callable[[Source], list[SceneMesh]]
     ) -> list[SceneMesh]:
-        """Return the meshes of a file, from the cache or by `load`.
+        """Return the meshes in a file from the cache, or load them.
 
-        The list is empty for an unusable file.
+        If the file is unusable, the list is empty, and a note is added.
         """
         file = self._file(uri, source)
         if file is None:
@@ -265,13 +261,13 @@ class LinkMeshes:
         return self._files[key]
 
     def _load(self, file: Source) -> list[SceneMesh]:
-        """Return the meshes of a file.
+        """Load the meshes in a file.
 
-        Raises LidarError for an unusable file.
+        Raises LidarError if the file is unusable.
         """
         if file.path.suffix.lower() not in MESHES:
             raise LidarError(f"Gazebo supports only meshes in {', '.join(MESHES)} files.")
-        # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
+        # Gazebo ignores the up axis in COLLADA and glTF files, but not the unit in COLLADA files.
         meshes = load_meshes(
             file.path,
             up_axis="z",
@@ -284,7 +280,7 @@ class LinkMeshes:
         return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
 
     def _load_skin(self, file: Source) -> list[SceneMesh]:
-        """Return the meshes of a file, with skins at rest."""
+        """Load the meshes in a file, with skins in their rest pose."""
         if file.path.suffix.lower() != ".dae":
             return self._load(file)
         options = self.options._replace(
@@ -302,30 +298,30 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
 
     def _asset_folders(self, file: Source) -> list[Path]:
-        """Return the folders with images for a mesh file, the model's textures first."""
+        """Return the folders with images for a mesh file, starting with the model's textures."""
         textures = (folder / "materials" / "textures" for folder in file.path.resolve().parents)
         within = (folder for folder in textures if folder.is_relative_to(file.root))
         existing = (folder for folder in within if folder.is_dir())
         return [*existing, file.root, *self.resources.trusted]
 
     def _file(self, uri: str, source: Source) -> Source | None:
-        """Return the file of a URI, or None, with a note, for a missing file."""
+        """Return the file at a URI, or add a note and return None if it is missing."""
         try:
-            return self.resources.file(uri, source)
-        except MissingFileError as error:
+            return self.resources.find_file(uri, source)
+        except ResourceNotFoundError as error:
             self.notes.missing_files[str(error) or "a mesh without <uri>"] += 1
             return None
 
 
 def _retro(link: Element, shape: Element) -> float:
-    """Return the <laser_retro> of a shape, or of the first collision shape that has any, else 0."""
+    """Return the <laser_retro> of a shape or of the first collision shape that has one, or 0."""
     for candidate in (shape, *link.findall("collision")):
-        value = float(numbers_of(candidate, "laser_retro", 1, "0").item())
+        value = float(child_numbers(candidate, "laser_retro", 1, "0").item())
         if value > 0:
             return value
     return 0.0
 
 
 def _without_path(line: str, path: Path) -> str:
-    """Return a line on a file with the file's name alone."""
+    """Replace the path of a file in a line of text by the file's name."""
     return line.replace(str(path), path.name)

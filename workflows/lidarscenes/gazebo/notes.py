@@ -1,4 +1,4 @@
-"""What a world lacks, or has and is not read: collected, to be told in a few lines."""
+"""Collect notes on what a world lacks and on content that is not read, and report them briefly."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.base.words import listed, plural, printable
 
-_MAX_NAMES = 12  # limit for the names that a note lists
+_MAX_NAMES = 12  # maximum number of names in a note
 
-# Elements by their parents, of SDFormat 1.0 to 1.12, used or without a meaning for lidars.
+# Child elements that SDFormat 1.0 to 1.12 defines. They are either read or irrelevant to lidars.
 _POSED = ("pose", "frame", "plugin", "origin")
 _KNOWN: dict[str, frozenset[str]] = {
     tag: frozenset(text.split())
@@ -48,9 +48,9 @@ _KNOWN: dict[str, frozenset[str]] = {
 
 
 def unknown_children(element: Element) -> list[str]:
-    """Return the children of an element that SDFormat does not define, as PARENT/TAG.
+    """Return the children of an element that are not defined by SDFormat, as PARENT/TAG.
 
-    Tags with a prefix are free.
+    Tags with a namespace prefix are allowed.
     """
     defined_tags = _KNOWN[element.tag]
     tags = dict.fromkeys(child.tag for child in element)
@@ -62,7 +62,7 @@ def unknown_children(element: Element) -> list[str]:
 
 
 class Notes:
-    """Notes of a world, each told once."""
+    """Notes on a world, each of which is reported once."""
 
     def __init__(self) -> None:
         self.missing_models: Counter[str] = Counter()  # {name: number of uses}
@@ -70,22 +70,19 @@ class Notes:
         self.unread_files: dict[str, str] = {}  # {name: reason}
         self.unknown: dict[str, None] = {}  # elements, as PARENT/TAG
         self.without_visuals: dict[str, None] = {}  # links with collision shapes only
-        self.hidden: dict[str, None] = {}  # links with visuals that are transparent altogether
-        self.invisible: dict[str, None] = {}  # links with visuals that nothing sees
+        self.hidden: dict[str, None] = {}  # links with fully transparent visuals
+        self.invisible: dict[str, None] = {}  # links with visuals that no lidar sees
         self.remote: dict[str, None] = {}  # models that are too far away
         self.bright: dict[str, None] = {}  # links with a <laser_retro> brighter than white
         self.further: dict[str, None] = {}  # clauses
         self.of_meshes: dict[str, None] = {}  # lines on mesh files
 
     def check_children(self, element: Element) -> None:
-        """Note the children of an element that SDFormat does not define.
-
-        Prefixes are free.
-        """
+        """Note the children of an element that are not defined by SDFormat."""
         self.unknown |= dict.fromkeys(unknown_children(element))
 
     def remote_lines(self) -> Iterator[str]:
-        """Yield a phrase for the models that are too far away, if any."""
+        """Yield a phrase on the models that are too far away, if there are any."""
         if self.remote:
             names = listed([*self.remote], _MAX_NAMES)
             yield (
@@ -94,7 +91,7 @@ class Notes:
             )
 
     def lines(self) -> Iterator[str]:
-        """Yield clauses that follow the file's name."""
+        """Yield the notes as clauses that follow the name of the file."""
         yield from _line("model", self.missing_models)
         yield from _line("file", self.missing_files)
         for name, reason in list(self.unread_files.items())[:_MAX_NAMES]:
@@ -118,7 +115,7 @@ class Notes:
 
 
 def _line(noun: str, names: Counter[str]) -> Iterator[str]:
-    """Yield a clause on missing things, if any, with all names up to a limit."""
+    """Yield a clause on missing models or files, if there are any."""
     if names:
         count = plural(len(names), f"missing {noun}")
         uses = f" in {names.total():,} places" if names.total() > len(names) else ""
@@ -127,7 +124,7 @@ def _line(noun: str, names: Counter[str]) -> Iterator[str]:
 
 
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
-    """Yield the first lines on meshes, and the number of further lines."""
+    """Yield the first notes on meshes, and the number of further notes."""
     all_lines = [*lines]
     yield from (f"has a note on a mesh: {line.rstrip('.')}" for line in all_lines[:max_lines])
     further = len(all_lines) - max_lines

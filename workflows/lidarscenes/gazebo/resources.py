@@ -1,4 +1,4 @@
-"""Files of models, meshes and images that worlds of Gazebo name by URIs."""
+"""Find the files of models, meshes, and images that Gazebo worlds refer to by URI."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import is_inside
 from lidarsim.base.words import natural, printable
 
-from ..files.lenient_xml import lenient_root
+from ..files.lenient_xml import parse_lenient_xml
 
-# Variables with folders of models and resources, of Gazebo Sim, then of Gazebo classic.
+# Environment variables with folders of models: first Gazebo Sim, then Gazebo classic.
 FOLDER_VARIABLES = (
     "GZ_SIM_RESOURCE_PATH",
     "IGN_GAZEBO_RESOURCE_PATH",
@@ -27,27 +27,27 @@ FOLDER_VARIABLES = (
 )
 CACHE_VARIABLES = ("GZ_FUEL_CACHE_PATH", "IGN_FUEL_CACHE_PATH")
 CACHES = ("~/.gz/fuel", "~/.ignition/fuel")
-_MODELS = "~/.gazebo/models"  # folder of Gazebo classic
+_MODELS = "~/.gazebo/models"  # model folder of Gazebo classic
 _MAX_FOLDERS_UP = 5  # folders above a world that are searched for models
-_PACKAGE = "package.xml"  # file in the folder of a package of ROS
+_PACKAGE = "package.xml"  # file in the folder of a ROS package
 _CONFIGS = ("model.config", "manifest.xml")
-_MODEL = "model.sdf"  # file of models without a configuration
+_MODEL = "model.sdf"  # file of a model without a configuration
 _WORLD_FOLDERS = ("worlds", "world")
-_SDF_VERSION = (1, 12)  # the newest that is known
+_SDF_VERSION = (1, 12)  # newest supported version
 
 
-class MissingFileError(Exception):
-    """A file or model that no folder has.
+class ResourceNotFoundError(Exception):
+    """A file or model was not found in any folder.
 
-    The text of the error is the name to report.
+    The argument of the error is the name to report.
     """
 
 
 class Candidate(NamedTuple):
-    """A path that a URI may mean, and the folder that must contain the path.
+    """A path that a URI may refer to, and the folder that must contain the path.
 
-    A folder that may not be read has nothing that marks the folder as a model or package, and is
-    found only because the folder is near the world.
+    If `is_allowed` is False, the path must not be read: its folder is merely near the world, and
+    contains no file that identifies it as a model or package.
     """
 
     path: Path
@@ -56,7 +56,7 @@ class Candidate(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A file of SDFormat, and the folder that must contain the files of its relative names."""
+    """An SDFormat file, and the folder that must contain files with relative names."""
 
     path: Path
     root: Path
@@ -64,23 +64,24 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True)
 class Resources:
-    """Finder of the files that a world names.
+    """Finds the files that a world refers to.
 
     Attributes
     ----------
     world
-        The world, and its folder: with a package.xml at most five folders above that one, else the
-        folder above a folder `worlds`.
+        The world, and the folder that must contain its files. This is the folder with a package.xml
+        that contains the world, at most five levels up. Otherwise, it is the parent of a folder
+        called ``worlds``, or the folder of the world.
     folders
-        Folders that are searched for models by name, in order. In folders above the world, only
-        folders with a model.config are models, and for ``package://`` folders with a package.xml.
+        Folders that are searched for models by name, in order. Above the folder of the world, a
+        folder is a model only if it contains a model.config or, for ``package://``, a package.xml.
     trusted
-        Resolved folders whose files may be read from anywhere.
+        Resolved folders whose files may be referred to from anywhere.
     unmarked
-        Resolved folders whose folders are all models: folders that the user names, the world's
-        folder, and the world's package if it has a package.xml.
+        Resolved folders in which every folder is a model: those that the user names, the folder of
+        the world, and the world's package if it has a package.xml.
     caches
-        Folders of downloads from Fuel.
+        Folders with downloads from Fuel.
     """
 
     world: Source
@@ -90,8 +91,8 @@ class Resources:
     caches: tuple[Path, ...]
 
     @classmethod
-    def of_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
-        """Return the resources of a world, which `assets` are searched for first."""
+    def for_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
+        """Return the resources of a world; the folders in `assets` are searched first."""
         folder = path.parent.resolve()
         above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
         default = folder.parent if folder.name.lower() in _WORLD_FOLDERS else folder
@@ -110,35 +111,35 @@ class Resources:
             caches=tuple(caches),
         )
 
-    def model(self, uri: str, source: Source) -> Source:
-        """Return the file of SDFormat of a model, the newest that its model.config names.
+    def find_model(self, uri: str, source: Source) -> Source:
+        """Return the SDFormat file of a model, in the newest version that its model.config lists.
 
         Raises
         ------
-        MissingFileError
-            If no folder has the model.
+        ResourceNotFoundError
+            If no folder contains the model.
         LidarError
-            If the name leaves the folder of the file that has the name.
+            If the model must not be read.
         """
         for target in self._targets(uri, source):
             if target.path.is_dir():
                 return Source(_newest_file(target.path), _resolved(target.path))
             if target.path.is_file():
                 return Source(target.path, target.root)
-        raise MissingFileError(short_name(uri))
+        raise ResourceNotFoundError(short_name(uri))
 
-    def file(self, uri: str, source: Source) -> Source:
-        """Return a file of a mesh or an image.
+    def find_file(self, uri: str, source: Source) -> Source:
+        """Return a mesh or image file.
 
-        Raises MissingFileError and LidarError as `model` does.
+        Raises ResourceNotFoundError and LidarError as `find_model` does.
         """
         for target in self._targets(uri, source):
             if target.path.is_file():
                 return target
-        raise MissingFileError(printable(uri))
+        raise ResourceNotFoundError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield the existing paths that a URI may name.
+        """Yield the existing paths that a URI may refer to.
 
         Raises LidarError if a path must not be read.
         """
@@ -168,7 +169,7 @@ class Resources:
             )
 
     def _candidates(self, uri: str, source: Source) -> Iterator[Candidate]:
-        """Yield the paths that a URI may mean."""
+        """Yield the paths that a URI may refer to."""
         name = unquote(uri.strip())
         scheme, mark, location = name.partition("://")
         if mark and scheme in ("http", "https"):
@@ -181,12 +182,12 @@ class Resources:
             if not location.startswith("/"):
                 yield from self._in_folders(location)
         else:
-            raise MissingFileError(printable(uri))
+            raise ResourceNotFoundError(printable(uri))
 
     def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
         """Yield the paths NAME/FILE in all folders."""
         name, _, file = location.lstrip("/").partition("/")
-        file = file.lstrip("/")  # else the file would be an absolute path
+        file = file.lstrip("/")  # otherwise, it would be an absolute path
         if name in ("", ".", ".."):
             return
         marks = (_CONFIGS[0], _PACKAGE) if scheme == "package" else _CONFIGS[:1]
@@ -195,7 +196,7 @@ class Resources:
         for folder in self.folders:
             if (folder / name).is_dir():
                 model = folder / name
-            elif folder.name == name:  # URI of the package or model itself
+            elif folder.name == name:  # the URI refers to the folder itself
                 model = folder
             else:
                 continue
@@ -206,7 +207,7 @@ class Resources:
             yield Candidate(model / file, root, is_allowed)
 
     def _downloads(self, uri: str) -> Iterator[Candidate]:
-        """Yield the paths of a model of Fuel, or of its file: in the caches, then by its name."""
+        """Yield the paths of a Fuel model or its file, first in the caches and then by name."""
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
             return
@@ -226,7 +227,7 @@ class Resources:
 
 
 def short_name(uri: str) -> str:
-    """Return the name of a model for messages: without the scheme, of Fuel with its owner."""
+    """Return a short name of a model for messages: OWNER/NAME on Fuel, otherwise the name."""
     name = printable(unquote(uri.strip()))
     parts = [part for part in name.split("/") if part]
     if name.startswith(("http://", "https://")) and len(parts) >= 6:
@@ -235,19 +236,19 @@ def short_name(uri: str) -> str:
 
 
 def _folders_of(variables: tuple[str, ...]) -> list[Path]:
-    """Return the folders that variables of the environment name, if they exist."""
+    """Return the existing folders in environment variables."""
     values = (os.environ.get(variable, "") for variable in variables)
     return _existing([folder for value in values for folder in value.split(os.pathsep) if folder])
 
 
 def _existing(names: list[str] | tuple[str, ...]) -> list[Path]:
-    """Return the folders that exist among names."""
+    """Return the names that are existing folders."""
     folders = [Path(os.path.expanduser(name)) for name in names]  # noqa: PTH111 - never fails
     return [folder for folder in folders if folder.is_dir()]
 
 
 def _existing_folders(parent: Path, name: str) -> list[Path]:
-    """Return the folders in a folder with a name, in upper or lower case, or with any name."""
+    """Return the subfolders with a name, ignoring case, or all subfolders for ``*``."""
     try:
         folders = [entry for entry in parent.iterdir() if entry.is_dir()]
     except OSError:
@@ -256,17 +257,17 @@ def _existing_folders(parent: Path, name: str) -> list[Path]:
 
 
 def _resolved(path: Path) -> Path:
-    """Return a path without links."""
+    """Return a path without symbolic links."""
     return path.resolve()
 
 
 def _newest_file(folder: Path) -> Path:
-    """Return the file of the newest version that is known, by a model's configuration.
+    """Return the newest supported SDFormat file that a model's configuration lists.
 
     Raises
     ------
-    MissingFileError
-        If the folder has no model.
+    ResourceNotFoundError
+        If the folder is not a model.
     """
     for name in _CONFIGS:
         if (folder / name).is_file():
@@ -277,19 +278,19 @@ def _newest_file(folder: Path) -> Path:
                     return file
     if (folder / _MODEL).is_file():
         return folder / _MODEL
-    raise MissingFileError(printable(folder.name))
+    raise ResourceNotFoundError(printable(folder.name))
 
 
 def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
-    """Return the files that a configuration names: {version: name}."""
+    """Return the file names in a model's configuration by version."""
     try:
-        root = lenient_root(read_input(path))
+        root = parse_lenient_xml(read_input(path))
     except (OSError, ValueError, LidarError):
         return {}
     return {_version(entry): (entry.text or "").strip() for entry in root.iter("sdf")}
 
 
 def _version(entry: Element) -> tuple[int, ...]:
-    """Return the version of an <sdf>, such as (1, 6), or (0,) without a version."""
+    """Return the version of an <sdf> element, for example (1, 6), or (0,) if it has none."""
     parts = entry.get("version", "").split(".")
     return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else (0,)

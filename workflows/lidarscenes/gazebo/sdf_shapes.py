@@ -1,4 +1,4 @@
-"""Shapes of SDFormat as meshes: boxes to polylines, height maps, roads."""
+"""Convert SDFormat shapes to meshes: primitives, polylines, height maps, and roads."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import length, matmul
+from lidarsim.base.vectors import matmul, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.masks import read_heights
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 from lidarsim.scene.shapes import capsule, revolve
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
-from .frames import numbers_in, numbers_of
+from .frames import child_numbers, parse_numbers
 
-_PIXEL_BYTES = 72  # bytes of a pixel of a height map: a vertex, and two triangles
-_PARALLEL = 1e-12  # limit for unit vectors: 1 minus the cosine between them
+_PIXEL_BYTES = 72  # memory per pixel of a height map, for a vertex and two triangles
+_PARALLEL = 1e-12  # unit vectors are parallel if 1 minus their cosine is smaller
 
 
 def shape_mesh(shape: Element) -> SceneMesh | None:
-    """Return the mesh of a shape without a file, in its frame, or None for a shape of size zero.
+    """Return the mesh of a primitive shape in its own frame, or None if its size is zero.
 
     Raises
     ------
     LidarError
-        If numbers of the shape are missing or impossible.
+        If values are missing or invalid.
     KeyError
         If the shape is unknown.
     """
@@ -39,8 +39,8 @@ def shape_mesh(shape: Element) -> SceneMesh | None:
 
 
 def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
-    """Return `count` sizes of a shape, which are not negative."""
-    return numbers_of(shape, name, count, default, at_least=0.0)
+    """Return `count` sizes of a shape, which must not be negative."""
+    return child_numbers(shape, name, count, default, at_least=0.0)
 
 
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
@@ -79,9 +79,9 @@ def _capsule(shape: Element) -> SceneMesh | None:
 
 
 def _plane(shape: Element) -> SceneMesh | None:
-    """Return a rectangle across a normal."""
-    normal = numbers_of(shape, "normal", 3, "0 0 1")
-    size = length(normal)
+    """Return a rectangle perpendicular to a normal."""
+    normal = child_numbers(shape, "normal", 3, "0 0 1")
+    size = norm(normal)
     if not size > 0:
         raise LidarError("<normal> of a <plane> has zero length.")
     x, y = (_sizes(shape, "size", 2, "1 1") / 2).tolist()
@@ -93,9 +93,9 @@ def _plane(shape: Element) -> SceneMesh | None:
 
 
 def _from_z(normal: Floats) -> Floats:
-    """Return the shortest rotation (3, 3) from z to a unit vector (3,)."""
+    """Return the shortest rotation (3, 3) from the z axis to a unit vector (3,)."""
     x, y, z = normal.tolist()
-    if 1 + z < _PARALLEL:  # half a turn, about x
+    if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
     cross = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
     return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + z))
@@ -118,9 +118,9 @@ _SHAPES: dict[str, Callable[[Element], SceneMesh | None]] = {
 
 
 def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
-    """Return outlines extruded along z to the height of the first, or None without an area.
+    """Extrude outlines along z to the height of the first outline, or return None without an area.
 
-    Further outlines within the first are its holes, others are outlines beside it.
+    Outlines inside another outline are holes.
     """
     rings = [_ring(polyline) for polyline in polylines]
     rings = [ring for ring in rings if len(ring) > 2]
@@ -133,7 +133,7 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
         starts = np.cumsum([0, *map(len, members)])
         flat = np.concatenate([np.pad(ring, ((0, 0), (0, 1))) for ring in members])
         rows = [np.arange(a, b) for a, b in pairwise(starts.tolist())]
-        bottom = with_holes(flat, rows)[:, ::-1]  # outlines run anticlockwise
+        bottom = with_holes(flat, rows)[:, ::-1]  # outlines are counterclockwise
         top = bottom[:, ::-1] + len(flat)
         walls = [_wall(ring, len(flat)) for ring in rows]
         vertices = np.concatenate([flat, flat + np.array([0, 0, height])])
@@ -143,9 +143,9 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
 
 
 def _ring(polyline: Element) -> Floats:
-    """Return the points (n, 2) of a polyline, each once."""
+    """Return the points (n, 2) of a polyline without repetitions."""
     texts = [point.text or "" for point in polyline.findall("point")]
-    points = np.array([numbers_in(text, "<point>", 2) for text in texts]).reshape(-1, 2)
+    points = np.array([parse_numbers(text, "<point>", 2) for text in texts]).reshape(-1, 2)
     follows = np.ones(len(points), np.bool_)
     follows[1:] = (points[1:] != points[:-1]).any(axis=1)
     points = points[follows]
@@ -153,13 +153,13 @@ def _ring(polyline: Element) -> Floats:
 
 
 def _area(ring: Floats) -> float:
-    """Return the area of a ring (n, 2), positive for an anticlockwise ring."""
+    """Return the signed area of a ring (n, 2), positive if it is counterclockwise."""
     x, y = (ring - ring[0]).T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 
 
 def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
-    """Return outlines, anticlockwise, and their holes, clockwise, the largest outline first."""
+    """Return counterclockwise outlines, the largest first, with their clockwise holes."""
     by_size = sorted(rings, key=lambda ring: -abs(_area(ring)))
     groups: list[tuple[Floats, list[Floats]]] = []
     for ring in by_size:
@@ -173,7 +173,7 @@ def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
 
 
 def _contains(ring: Floats, point: Floats) -> bool:
-    """Return True if a point (2,) is within a ring (n, 2)."""
+    """Return True if a point (2,) is inside a ring (n, 2)."""
     a = ring - point
     b = np.roll(a, -1, axis=0)
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
@@ -182,7 +182,11 @@ def _contains(ring: Floats, point: Floats) -> bool:
 
 
 def _wall(ring: Ints, above: int) -> Ints:
-    """Return the faces (2n, 3) between a ring (n,) of vertices and the ring `above` further on."""
+    """Return the faces (2n, 3) between two rings of vertices.
+
+    `ring` (n,) contains the vertices of the first ring. The vertices of the second ring have the
+    same order and are `above` larger.
+    """
     following = np.roll(ring, -1)
     lower = np.stack([ring, following, following + above], axis=1)
     upper = np.stack([ring, following + above, ring + above], axis=1)
@@ -190,19 +194,19 @@ def _wall(ring: Ints, above: int) -> Ints:
 
 
 def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneMesh:
-    """Return the surface of a height map, whose brightest pixel is as high as its size says.
+    """Return the surface of a height map.
 
-    The first row of the image is at the greatest y.
+    The brightest pixel has the full height, and the first row of the image has the largest y.
 
     Raises
     ------
     LidarError
-        If numbers are wrong, or the map has too many pixels.
+        If values are invalid, or the map has too many pixels.
     lidarsim.scene.masks.MaskError
         If the image cannot be read.
     """
     size = _sizes(shape, "size", 3, "1 1 1")
-    offset = numbers_of(shape, "pos", 3, "0 0 0")
+    offset = child_numbers(shape, "pos", 3, "0 0 0")
     values = read_heights(image, allowance, _PIXEL_BYTES)
     rows, columns = values.shape
     if min(rows, columns) < 2 or not size[:2].all():
@@ -224,17 +228,20 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
 
 
 def road_mesh(road: Element) -> SceneMesh | None:
-    """Return a strip of a road's width along its points, or None without two points."""
+    """Return a strip with the width of a road along its points.
+
+    Returns None if the road has fewer than two distinct points.
+    """
     width = _sizes(road, "width", 1, "1").item()
     texts = [point.text or "" for point in road.findall("point")]
-    points = np.array([numbers_in(text, "<point>", 3) for text in texts]).reshape(-1, 3)
+    points = np.array([parse_numbers(text, "<point>", 3) for text in texts]).reshape(-1, 3)
     follows = np.ones(len(points), np.bool_)
     follows[1:] = (points[1:, :2] != points[:-1, :2]).any(axis=1)
     points = points[follows]
     if len(points) < 2 or not width:
         return None
     steps = np.gradient(points[:, :2], axis=0)
-    lengths = length(steps)[:, None]
+    lengths = norm(steps)[:, None]
     directions = np.where(lengths > 0, steps / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
     across = np.column_stack([-directions[:, 1], directions[:, 0], np.zeros(len(points))])
     across *= width / 2

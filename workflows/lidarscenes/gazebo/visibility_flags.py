@@ -1,6 +1,7 @@
-"""Which visuals the lidars of a world see: <visibility_flags> and <visibility_mask>.
+"""Determine which visuals the lidars in a world see.
 
-A lidar sees a visual if its mask and the flags of the visual have a bit in common (SDFormat 1.12).
+A lidar sees a visual if its <visibility_mask> and the <visibility_flags> of the visual have a
+common bit (SDFormat 1.12).
 """
 
 from __future__ import annotations
@@ -12,50 +13,50 @@ from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.value_texts import shown
 from lidarsim.base.words import printable
 
-LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # types of sensors
-ALL_BITS = 0xFFFF_FFFF  # default of flags and masks
+LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # sensor types
+ALL_BITS = 0xFFFF_FFFF  # default for flags and masks
 
 
 def lidar_elements(link: Element) -> Iterator[Element]:
-    """Yield the <sensor>s of a link that are lidars."""
+    """Yield the <sensor> elements of a link that are lidars."""
     return (sensor for sensor in link.findall("sensor") if sensor.get("type") in LIDARS)
 
 
-def figures_of(sensor: Element) -> Element | None:
-    """Return the <lidar> or <ray> of a <sensor>, or None without any."""
+def lidar_settings(sensor: Element) -> Element | None:
+    """Return the <lidar> or <ray> element of a <sensor>, or None."""
     figures = sensor.find("lidar")
     return sensor.find("ray") if figures is None else figures
 
 
-def flags_of(visual: Element) -> int:
+def read_flags(visual: Element) -> int:
     """Return the <visibility_flags> of a visual.
 
-    Raises LidarError if they are not a number of 32 bits.
+    Raises LidarError if they are not a 32-bit number.
     """
     return _bits(visual, "visibility_flags")
 
 
-def mask_of(sensor: Element) -> int:
+def read_mask(sensor: Element) -> int:
     """Return the <visibility_mask> of a lidar.
 
-    Raises LidarError if it is not a number of 32 bits.
+    Raises LidarError if it is not a 32-bit number.
     """
-    figures = figures_of(sensor)
+    figures = lidar_settings(sensor)
     return ALL_BITS if figures is None else _bits(figures, "visibility_mask")
 
 
-def masks_of(links: Iterable[Element]) -> tuple[int, ...]:
-    """Return the distinct masks of the lidars of links, ascending."""
+def distinct_masks(links: Iterable[Element]) -> tuple[int, ...]:
+    """Return the distinct visibility masks of the lidars in links, in ascending order."""
     masks = set()
     for link in links:
         for sensor in lidar_elements(link):
             with prefixed(f"sensor {printable(sensor.get('name', ''))!r}"):
-                masks.add(mask_of(sensor))
+                masks.add(read_mask(sensor))
     return tuple(sorted(masks))
 
 
 def _bits(element: Element, name: str) -> int:
-    """Return a child element's number of 32 bits, by default with all bits."""
+    """Return the 32-bit number in a child element, or all bits if it is missing."""
     text = (element.findtext(name) or "").strip()
     if not text:
         return ALL_BITS

@@ -1,4 +1,4 @@
-"""Actors of Gazebo: skins that follow waypoints."""
+"""Read Gazebo actors, which are skins that follow waypoints."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.scene_graph import PlacedNode, RigidPart
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .frames import matrix_of, numbers_of, pose_of
+from .frames import child_numbers, read_matrix, read_pose
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Source
 
-_LOOP_S = 600.0  # duration of the repetitions of a script that loops
-_MAX_POSES = 5000  # limit for the poses of an actor
-_JUMP_S = 1e-3  # time of an actor between its last waypoint and its first
+_LOOP_S = 600.0  # duration for which a looping script is repeated
+_MAX_POSES = 5000  # maximum number of poses of an actor
+_JUMP_S = 1e-3  # time in which an actor returns from its last waypoint to the first
 
 
 class Actors(NamedTuple):
-    """Actors of a world."""
+    """The actors in a world."""
 
     moving: list[RigidPart]
     standing: list[PlacedNode]
 
 
-def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
-    """Return the actors of a world, with their skins at rest."""
+def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
+    """Return the actors in a world, with their skins in the rest pose."""
     actors = Actors([], [])
     for element in world.findall("actor"):
         notes.check_children(element)
@@ -52,12 +52,12 @@ def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) 
 
 
 def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
-    """Return the skin of an actor, or None without a skin, or if its file is missing."""
+    """Return the skin of an actor, or None if there is none or its file is missing."""
     skin = actor.find("skin")
     if skin is None:
         return None
     parts = meshes.skin_meshes((skin.findtext("filename") or "").strip(), source)
-    scale = numbers_of(skin, "scale", 1, "1").item()
+    scale = child_numbers(skin, "scale", 1, "1").item()
     if not parts or not scale:
         return None
     joined = join_meshes("skin", parts)
@@ -65,20 +65,20 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
-    """Return times (k,), seconds, and poses (k, 4, 4) of an actor.
+    """Return the times (k,) in seconds and the poses (k, 4, 4) of an actor.
 
-    For an actor that stands, k is 1.
+    A stationary actor has a single pose.
     """
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
     if not entries:
-        return np.zeros(1), pose_of(actor).matrix[None]
-    times_s = np.array([numbers_of(entry, "time", 1, "0").item() for entry in entries])
+        return np.zeros(1), read_pose(actor).matrix[None]
+    times_s = np.array([child_numbers(entry, "time", 1, "0").item() for entry in entries])
     poses = np.array([_waypoint_pose(entry) for entry in entries])
     times_s, rows = np.unique(times_s, return_index=True)
     poses = poses[rows]
-    assert script is not None, "of entries"
-    delay_s = numbers_of(script, "delay_start", 1, "0").item()
+    assert script is not None, "a script that has waypoints"
+    delay_s = child_numbers(script, "delay_start", 1, "0").item()
     if (script.findtext("loop") or "true").strip() in ("true", "1") and times_s[-1] > 0:
         times_s, poses = _repeated(times_s, poses)
         if times_s[-1] < _LOOP_S:
@@ -92,18 +92,18 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
 def _waypoint_pose(waypoint: Element) -> Floats:
     """Return the pose (4, 4) of a waypoint in the world.
 
-    Raises LidarError without a pose.
+    Raises LidarError if the waypoint has no pose.
     """
     pose = waypoint.find("pose")
     if pose is None:
         raise LidarError("a <waypoint> has no <pose>.")
-    return matrix_of(pose)
+    return read_matrix(pose)
 
 
 def _repeated(times_s: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """Return waypoints repeated for `_LOOP_S` or longer, but `_MAX_POSES` at most."""
+    """Repeat waypoints for at least `_LOOP_S`, but with at most `_MAX_POSES` poses."""
     duration_s = float(times_s[-1])
-    # A second round begins a moment after the first one ends.
+    # Each repetition begins shortly after the previous one ends.
     start_s = np.maximum(times_s, _JUMP_S) if duration_s > _JUMP_S else times_s
     start_s, rows = np.unique(start_s, return_index=True)
     rounds = int(min(np.ceil(_LOOP_S / duration_s), _MAX_POSES // len(poses)))

@@ -1,8 +1,8 @@
-"""Worlds and models of Gazebo, .sdf and .world, as scenes.
+"""Read Gazebo worlds and models (.sdf and .world) as scenes.
 
-After the specification of SDFormat 1.12 (http://sdformat.org/spec) and what Gazebo does where the
-specification leaves questions open. No package of the index reads SDFormat: libsdformat comes with
-Gazebo alone.
+The reader follows the specification of SDFormat 1.12 (http://sdformat.org/spec) and, where it is
+ambiguous, the behavior of Gazebo. No package on PyPI reads SDFormat; libsdformat is only available
+as a part of Gazebo.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import about
 from lidarsim.base.errors import prefixed
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import listed, printable
 from lidarsim.scene.files.scene_graph import (
@@ -32,31 +31,30 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..files.lenient_xml import lenient_root
-from .appearance import appearance_of
-from .bodies import Body, BodyReader, Instance, Link, scoped
-from .frames import matrix_of, numbers_of
+from ..files.lenient_xml import parse_lenient_xml
+from .appearance import read_appearance
+from .bodies import BodyReader, GazeboBody, Link, PlacedModel, scoped_name
+from .frames import child_numbers, read_matrix
 from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Resources, Source
 from .sdf_shapes import road_mesh
-from .visibility_flags import ALL_BITS, masks_of
-from .waypoint_actors import actors_of
+from .visibility_flags import ALL_BITS, distinct_masks
+from .waypoint_actors import read_actors
 
 _ADVICE = "simplify its meshes, or export them in parts"
-_OLD_ROOT = "gazebo"  # root of Gazebo before 1.9
+_OLD_ROOT = "gazebo"  # root element before Gazebo 1.9
 _NO_SCALE = (1.0, 1.0, 1.0)
 
 
-# A model that is farther along x, y or z from the origin of its world has fallen, or physics has
-# thrown it there: northings of maps reach 10,000 km, and no world is 1,000 km high.
+# A model that is farther from the origin along x, y, or z has fallen or was moved by physics. Map
+# northings reach 10,000 km, and no world is 1,000 km high.
 _REACH_M = np.array([1e7, 1e7, 1e6])
 
 
 @dataclass(frozen=True)
-@checked_fields
 class GazeboOptions:
-    """Options of worlds of Gazebo."""
+    """Options for reading Gazebo worlds."""
 
     geometry: Annotated[
         Literal["visual", "collision"],
@@ -65,21 +63,21 @@ class GazeboOptions:
 
 
 class PlacedLink(NamedTuple):
-    """A link in the world."""
+    """A link placed in the world."""
 
-    path: tuple[str, ...]  # names of the models that contain it, and its own
-    body: Body
+    path: tuple[str, ...]  # names of the enclosing models and of the link
+    body: GazeboBody
     link: Link
-    matrix: Floats  # (4, 4), to the world
-    model: Floats  # (4, 4), of the outermost model
+    matrix: Floats  # (4, 4) matrix to the world
+    model: Floats  # (4, 4) matrix of the outermost model
     scale: tuple[float, ...]
 
 
 @dataclass
 class _State:
-    """The <state> of a world of Gazebo classic: poses that replace the poses of the models.
+    """The <state> of a Gazebo classic world, whose poses replace those of the models.
 
-    Poses are in world coordinates by the names of models and links, MODEL::LINK.
+    Poses are in world coordinates, by the names of models and links (MODEL::LINK).
     """
 
     poses: dict[str, Floats] = field(default_factory=dict)  # (4, 4)
@@ -94,7 +92,7 @@ class World:
 
     element: Element
     source: Source
-    body: Body
+    body: GazeboBody
     state: _State
     resources: Resources
     notes: Notes
@@ -102,20 +100,20 @@ class World:
 
     @cached_property
     def links(self) -> list[PlacedLink]:
-        """All links, but those that are too far away, whose models are noted."""
+        """All links except those that are too far away, whose models are noted."""
         links = []
         for link in self._placed_links():
             if is_in_reach(link.matrix):
                 links.append(link)
             else:
-                self.notes.remote[scoped(link.path[:-1])] = None
+                self.notes.remote[scoped_name(link.path[:-1])] = None
         return links
 
     def _placed_links(self) -> Iterator[PlacedLink]:
-        """Yield the links of all models, the state's poses first."""
+        """Yield the links of all models, with poses from the state where it has any."""
         state = self.state
-        # Instances with the names of the models around them, and the matrix of these models.
-        stack: list[tuple[Instance, tuple[str, ...], Floats | None, Floats | None]] = [
+        # Models with the names, the matrix, and the outermost matrix of their enclosing models
+        stack: list[tuple[PlacedModel, tuple[str, ...], Floats | None, Floats | None]] = [
             (child, (), None, None)
             for child in reversed(self.body.children)
             if child.name not in state.deleted
@@ -126,15 +124,15 @@ class World:
             matrix = instance.matrix
             if outer_matrix is not None:
                 matrix = matmul(outer_matrix, matrix)
-            matrix = state.poses.get(scoped(path), matrix)
+            matrix = state.poses.get(scoped_name(path), matrix)
             outermost = matrix if outermost is None else outermost
             scale = state.scales.get(path[0], _NO_SCALE)
             for link in instance.body.links:
-                with prefixed(f"model {scoped(path)[:80]!r}, link {link.name!r}"):
+                with prefixed(f"model {scoped_name(path)[:80]!r}, link {link.name!r}"):
                     in_model = instance.body.frames.matrix(link.name)
                 placed = matmul(matrix, in_model)
                 link_path = (*path, link.name)
-                placed = state.poses.get(scoped(link_path), placed)
+                placed = state.poses.get(scoped_name(link_path), placed)
                 yield PlacedLink(link_path, instance.body, link, placed, outermost, scale)
             stack += [
                 (child, path, matrix, outermost) for child in reversed(instance.body.children)
@@ -142,21 +140,21 @@ class World:
 
 
 class PlacedObject(NamedTuple):
-    """An object that stands in the world."""
+    """A stationary object in the world."""
 
     node: PlacedNode
     flags: int  # <visibility_flags> of its visuals
 
 
 def is_in_reach(matrix: Floats) -> bool:
-    """Return True if a matrix (4, 4) is of a position that a world may have."""
+    """Return True if the position of a matrix (4, 4) is finite and plausible for a world."""
     return bool(np.isfinite(matrix).all() and (np.abs(matrix[:3, 3]) < _REACH_M).all())
 
 
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visuals, or the collision shapes, of all links, and the moving actors."""
+    """Read the visuals or the collision shapes of all links, and the moving actors."""
     world = load_world(data, path, options.folders)
-    content = content_of(world, options)[0]
+    content = build_content(world, options)[0]
     if not content.meshes and not content.moving:
         missing = [*world.notes.missing_models, *world.notes.missing_files]
         reason = f". It refers to missing models or files: {listed(missing, 12)}" if missing else ""
@@ -167,18 +165,21 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     return content
 
 
-def content_of(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
-    """Return the content of a world, and its objects that stand, also those without an area."""
+def build_content(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
+    """Return the content of a world, and its stationary objects.
+
+    The objects include those without an area, which the content lacks.
+    """
     notes = world.notes
-    masks = masks_of(link.link.element for link in world.links)
+    masks = distinct_masks(link.link.element for link in world.links)
     meshes = LinkMeshes(world.resources, options, notes, world.allowance, masks)
     objects = []
     for link in world.links:
-        parts = meshes.meshes_of(link.body, link.link, scoped(link.path), link.scale)
+        parts = meshes.link_meshes(link.body, link.link, scoped_name(link.path), link.scale)
         for part in parts:
             name = "/".join(link.path) + part.suffix
             objects.append(PlacedObject(PlacedNode(part.mesh, link.matrix, name), part.flags))
-    actors = actors_of(world.element, world.source, meshes, notes)
+    actors = read_actors(world.element, world.source, meshes, notes)
     standing = [node for node in actors.standing if is_in_reach(node.matrix)]
     notes.remote |= {node.name: None for node in actors.standing if not is_in_reach(node.matrix)}
     objects += [PlacedObject(node, ALL_BITS) for node in (*_roads(world, meshes), *standing)]
@@ -191,23 +192,23 @@ def content_of(world: World, options: ReadOptions) -> tuple[Content, list[Placed
 
 
 def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
-    """Read a file of SDFormat, and the included models.
+    """Read an SDFormat file and the models that it includes.
 
     Parameters
     ----------
     data
         Content of the file.
     path
-        The file.
+        Path of the file.
     folders
-        The file's folder, and further folders that are searched for models.
+        Folder of the file, followed by additional folders that are searched for models.
 
     Raises
     ------
     LidarError, ValueError, lidarsim.scene.files.scene_graph.MeshFileError
-        If the file is broken, or none of Gazebo.
+        If the file is invalid or not an SDFormat file.
     """
-    root = lenient_root(data)
+    root = parse_lenient_xml(data)
     if root.tag == _OLD_ROOT:
         raise MeshFileError(
             "uses the file format of Gazebo before version 1.9. Convert it with `gz sdf -k` from "
@@ -219,7 +220,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
         )
     notes = Notes()
     allowance = Allowance(len(data), _ADVICE)
-    resources = Resources.of_world(path, folders[1:])
+    resources = Resources.for_world(path, folders[1:])
     element = _world_element(root, notes)
     state = _state_of(element)
     for model in state.inserted:
@@ -237,7 +238,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
 
 
 def _world_element(root: Element, notes: Notes) -> Element:
-    """Return the <world> of a file, or a <world> with its models."""
+    """Return the <world> of a file, or a new <world> that contains its models."""
     if root.tag == "world":
         return root
     if root.tag == "sdf":
@@ -253,20 +254,20 @@ def _world_element(root: Element, notes: Notes) -> Element:
 
 
 def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
-    """Yield the roads of a world."""
+    """Yield the roads in a world."""
     for road in world.element.findall("road"):
         world.notes.check_children(road)
         name = printable(road.get("name", "")) or "road"
         with prefixed(f"road {name!r}"):
             mesh: SceneMesh | None = road_mesh(road)
             if mesh is not None:
-                mesh = meshes.painted(mesh, appearance_of(road, 0.0))
+                mesh = meshes.with_appearance(mesh, read_appearance(road, 0.0))
                 matrix = world.body.frames.matrix(world.body.frames.root)
                 yield PlacedNode(replace(mesh, name=name), matrix, name)
 
 
 def _state_of(world: Element) -> _State:
-    """Return the last state of a world, or an empty state without <state>."""
+    """Return the last <state> of a world, or an empty state if there is none."""
     state = _State()
     elements = world.findall("state")
     if not elements:
@@ -275,13 +276,13 @@ def _state_of(world: Element) -> _State:
     state.inserted = element.findall("insertions/model")
     state.deleted = {printable(name.text or "") for name in element.findall("deletions/name")}
     for path, entry in _state_entries(element, ()):
-        name = scoped(path)
+        name = scoped_name(path)
         with prefixed(f"state of {name[:80]!r}"):
             pose = entry.find("pose")
             if pose is not None and (pose.text or "").strip():
-                state.poses[name] = matrix_of(pose)
+                state.poses[name] = read_matrix(pose)
             if entry.tag == "model":
-                scale = tuple(numbers_of(entry, "scale", 3, "1 1 1").tolist())
+                scale = tuple(child_numbers(entry, "scale", 3, "1 1 1").tolist())
                 if scale != _NO_SCALE:
                     state.scales[name] = scale
     return state
@@ -290,7 +291,7 @@ def _state_of(world: Element) -> _State:
 def _state_entries(
     element: Element, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], Element]]:
-    """Yield the models and links in a state, with their names."""
+    """Yield the names and elements of the models and links in a state."""
     for child in element:
         if child.tag in ("model", "link"):
             inner = (*path, printable(child.get("name", "")))

@@ -1,6 +1,6 @@
-"""Surveys and scanners of HELIOS++ as scenarios."""
+"""Convert HELIOS++ surveys and scanners to scenarios."""
 
 from .import_scanner import import_scanner, is_scanner
-from .survey_xml import Imported, import_survey
+from .survey_xml import ImportedSurvey, import_survey
 
-__all__ = ["Imported", "import_scanner", "import_survey", "is_scanner"]
+__all__ = ["ImportedSurvey", "import_scanner", "import_survey", "is_scanner"]

@@ -1,4 +1,4 @@
-"""XML files of HELIOS++: finding files, and reading values."""
+"""Find the XML files of a HELIOS++ survey, and read values from them."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from lidarsim.scene.transform import rotation_about
 # Folder in a checkout of HELIOS++ that contains its surveys' data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")
 _MAX_FOLDERS_UP = 5  # folders above a survey that are searched for its files
-_MAX_TEMPLATES = 10  # length of a chain
+_MAX_TEMPLATES = 10  # maximum length of a chain of templates
 
 
 class Asset(NamedTuple):
-    """An element of an XML file."""
+    """An element in an XML file."""
 
     element: Element
-    home: Path  # the file for names without a file
+    home: Path  # file that contains the element, for references without a file
 
 
 class Assets:
-    """Files that a survey names, in `folders` or in the folders above the survey.
+    """The files that a survey may refer to.
 
-    Files in other folders are refused (`named_files.py`).
+    Files are searched for in `folders`, in the folder of the survey, and in its parent folders. All
+    other files are refused.
     """
 
     def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
@@ -50,10 +51,10 @@ class Assets:
         self._allowed = [folder.resolve() for folder in self.folders]
         self.root = cache(_root)
 
-    def check(self, file: Path, name: str) -> None:
-        """Check that a file that the survey names may be read.
+    def check_allowed(self, file: Path, name: str) -> None:
+        """Check that the survey may refer to a file.
 
-        LidarError if the file is outside of all folders.
+        Raises LidarError if the file is outside all folders.
         """
         with suppress(OSError, ValueError, RuntimeError):  # no file can have this name
             if is_inside(file, self._allowed):
@@ -64,31 +65,34 @@ class Assets:
                 "--assets DIR."
             )
 
-    def file(self, name: str) -> Path:
-        """Return the path of a file by its name.
+    def find_file(self, name: str) -> Path:
+        """Return the path of a file, given its name.
 
-        Raises LidarError if no folder has the file, or if the file must not be read.
+        Raises LidarError if no folder contains the file, or if the survey may not refer to it.
         """
         for folder in self.folders:
             if (folder / name).is_file():
-                self.check(folder / name, name)
+                self.check_allowed(folder / name, name)
                 return folder / name
         raise LidarError(
             f"the file {name!r} is neither in the folder of the survey nor in a parent folder. "
             "Pass the folder to which its path is relative with --assets DIR."
         )
 
-    def asset(self, reference: str, kind: str, home: Path) -> Asset:
-        """Return the element of a kind that FILE.xml#ID names, or ID in the file `home`."""
+    def find_element(self, reference: str, kind: str, home: Path) -> Asset:
+        """Return the element of a kind for a reference such as FILE.xml#ID.
+
+        A reference without a file refers to the file `home`.
+        """
         file, _, name = reference.rpartition("#")
-        path = self.file(file) if file else home
+        path = self.find_file(file) if file else home
         elements = {element.get("id", ""): element for element in self.root(path).findall(kind)}
         if name not in elements:
             raise LidarError(f"{path} has no <{kind}> {name!r}.{did_you_mean(name, elements)}")
         return Asset(elements[name], path)
 
-    def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
-        """Return the attributes of settings, with the attributes of their template as defaults."""
+    def read_settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
+        """Return the attributes of a settings element, with defaults from its template."""
         if element is None:
             return {}
         attributes = dict(element.attrib)
@@ -98,18 +102,18 @@ class Assets:
             raise LidarError(
                 f"the template {template!r} refers to itself or to too many other templates."
             )
-        defaults = self.asset(template, element.tag, home)
-        return self.settings(*defaults, depth + 1) | attributes
+        defaults = self.find_element(template, element.tag, home)
+        return self.read_settings(*defaults, depth + 1) | attributes
 
 
 def _root(path: Path) -> Element:
-    """Return the <document> of a file.
+    """Return the <document> element of a file.
 
-    Raises LidarError if the file is not a document of HELIOS++.
+    Raises LidarError if the file is not a HELIOS++ document.
     """
     try:
         with explained(f"{path} cannot be read"):
-            root = xml_root(read(path))
+            root = xml_root(read_file(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LidarError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "document":
@@ -120,19 +124,19 @@ def _root(path: Path) -> Element:
     return root
 
 
-def read(path: Path) -> bytes:
+def read_file(path: Path) -> bytes:
     """Read a regular file completely.
 
-    Raises LidarError if the file does not fit into memory.
+    Raises LidarError if the file cannot be read or does not fit into memory.
     """
     with explained(f"{path} cannot be read"), prefixed(path):
         return read_input(path)
 
 
-def number(values: Element | dict[str, str], name: str, default: float) -> float:
+def read_number(values: Element | dict[str, str], name: str, default: float) -> float:
     """Return an attribute as a finite number.
 
-    Raises LidarError for text that is not a finite number.
+    Raises LidarError if the attribute is not a finite number.
     """
     text = values.get(name)
     if text is None:
@@ -143,40 +147,39 @@ def number(values: Element | dict[str, str], name: str, default: float) -> float
     raise LidarError(f"{name} is {text!r}; it must be a number.")
 
 
-def flag(values: dict[str, str], name: str, default: bool) -> bool:
-    """Return an attribute as true or false."""
+def read_flag(values: dict[str, str], name: str, default: bool) -> bool:
+    """Return an attribute as a Boolean value."""
     return values[name].lower() in ("true", "1") if name in values else default
 
 
-def vector(values: Element | dict[str, str] | None) -> Floats:
-    """Return x, y and z of an element or its attributes: (3,), or zeros for missing attributes."""
-    return np.array([number({} if values is None else values, axis, 0.0) for axis in "xyz"])
+def read_vector(values: Element | dict[str, str] | None) -> Floats:
+    """Return the attributes x, y, and z as an array (3,), with zeros for missing attributes."""
+    return np.array([read_number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
-def rotation(element: Element | None) -> Floats:
-    """Return the product (3, 3) of the rotations <rot> in an element, in their order.
+def read_rotation(element: Element | None) -> Floats:
+    """Return the product (3, 3) of the <rot> rotations in an element, in their order.
 
-    Rotations are about the axes around the element; with rotations="local" about the axes that the
-    rotations before have rotated.
+    The axes are fixed unless the element states ``rotations="local"``, in which case each rotation
+    is about the axes that the previous rotations have rotated.
     """
     total = np.eye(3)
     for step in () if element is None else element.findall("rot"):
         axis = step.get("axis", "").lower()
         if axis not in ("x", "y", "z"):
             raise LidarError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
-        step_rotation = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
+        step_rotation = rotation_about(
+            np.eye(3)["xyz".index(axis)], read_number(step, "angle_deg", 0.0)
+        )
         local = element is not None and element.get("rotations") == "local"
         total = total @ step_rotation if local else step_rotation @ total
     return total
 
 
-def clean(values: Floats | float | Sequence[float]) -> list[float] | float:
-    """Return numbers for a scenario, rounded to 12 digits.
-
-    Roundings of zero are zero.
-    """
+def rounded(values: Floats | float | Sequence[float]) -> list[float] | float:
+    """Round numbers to 12 significant digits for a scenario, with tiny values set to zero."""
     array = np.asarray(values, np.float64)
     if array.ndim:
-        return [clean(value) for value in array.tolist()]  # type: ignore[misc]
+        return [rounded(value) for value in array.tolist()]  # type: ignore[misc]
     value = array.item()
     return float(f"{value:.12g}") if abs(value) > 1e-9 else 0.0

@@ -1,4 +1,7 @@
-"""Scanners of HELIOS++ without a survey, as scenarios: a sensor, or a sensor for each channel."""
+"""Convert HELIOS++ scanners without a survey to scenarios.
+
+Channels become separate sensors unless they differ only in their beams.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +24,22 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.lidar_scenario import SCENARIO_FILE
-from .files import Assets, clean, number
-from .scanner_xml import Device, HeliosScanner, channels, device, unsupported_features
+from .files import Assets, read_number, rounded
+from .scanner_xml import Device, HeliosScanner, make_device, read_channels, unsupported_features
 from .survey_xml import AHEAD, returns_section
 
-_MAX_NAMES = 12  # limit for scanners in a message
+_MAX_NAMES = 12  # maximum number of scanners in a message
 
 
 class _Reference(NamedTuple):
-    """A scanner of a file: FILE.xml#ID, or FILE.xml with a single scanner."""
+    """A reference to a scanner: FILE.xml#ID, or FILE.xml if the file has a single scanner."""
 
     file: Path
-    scanner: str  # its id; empty without one
+    scanner: str  # ID of the scanner, or empty
 
     @classmethod
-    def of(cls, survey: Path) -> _Reference:
-        """Return the file and the id in a path, as surveys write them."""
+    def from_path(cls, survey: Path) -> _Reference:
+        """Return the file and the scanner ID in a path such as FILE.xml#ID."""
         name, mark, scanner = survey.name.rpartition("#")
         if mark and not survey.exists():
             return cls(survey.with_name(name), scanner)
@@ -44,49 +47,50 @@ class _Reference(NamedTuple):
 
 
 def is_scanner(survey: Path) -> bool:
-    """Return True if a path is of a file of HELIOS++ with scanners and without a survey."""
+    """Return True if a path refers to a HELIOS++ file with scanners and without a survey."""
     with suppress(OSError, LidarError, ValueError, ParseError):
-        root = xml_root(read_input(_Reference.of(survey).file))
+        root = xml_root(read_input(_Reference.from_path(survey).file))
         has_scanner = root.find("scanner") is not None
         return root.tag == "document" and has_scanner and root.find("survey") is None
     return False
 
 
 def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a scanner of HELIOS++ as a scenario into a folder.
+    """Write a HELIOS++ scanner as a scenario.
 
-    The folder gets `scenario.yaml`, with the scene of `lidarpool demo`, and the sensor's data file.
-    Axes of the platform become axes of the carrier: y of HELIOS++ is x.
+    The folder gets `scenario.yaml`, with the scene of `lidarpool demo`, and the data files of the
+    sensors. The axes are converted: y in HELIOS++ becomes x.
 
     Parameters
     ----------
     survey
-        The file, whose <scannerSettings> have the rates; with several scanners, FILE.xml#ID.
+        File with <scannerSettings> that state the rates. If the file has several scanners, write
+        FILE.xml#ID.
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
         Folders that are searched first for referenced files.
 
     Returns
     -------
-    What is not as in HELIOS++, a line each.
+    Unsupported features, one line each.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, the scanner is not named or has no sensor like it.
+        If the file cannot be read, the reference is ambiguous, or the scanner is not supported.
     """
-    reference = _Reference.of(survey)
+    reference = _Reference.from_path(survey)
     files = Assets(reference.file, list(assets))
     element = _element(files, reference)
-    scanners = channels(element)
+    scanners = read_channels(element)
     first = next(iter(scanners.values()))
     lines = [line for scanner in scanners.values() for line in unsupported_features(scanner)]
     settings = _settings(files, reference.file, element)
     if settings is None:
         lines.append("scanners without <scannerSettings> (the highest rates are used)")
         settings = _highest_rates(first)
-    devices = {name: device(scanner, settings) for name, scanner in scanners.items()}
+    devices = {name: make_device(scanner, settings) for name, scanner in scanners.items()}
     sensors = _merged(devices)
     if len(sensors) > MAX_SENSORS:
         raise LidarError(
@@ -100,9 +104,9 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
 
 
 def _element(files: Assets, reference: _Reference) -> Element:
-    """Return the <scanner> of a reference.
+    """Return the <scanner> element of a reference.
 
-    Raises LidarError if the reference does not name one.
+    Raises LidarError if the reference is ambiguous or invalid.
     """
     elements = files.root(reference.file).findall("scanner")
     by_id = {element.get("id", ""): element for element in elements}
@@ -121,18 +125,21 @@ def _element(files: Assets, reference: _Reference) -> Element:
 
 
 def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | None:
-    """Return the settings beside a scanner, by its id, or the only ones, or None without any."""
+    """Return the scanner settings with the scanner's ID or, if unambiguous, the only settings.
+
+    Returns None if the file has no such settings.
+    """
     elements = files.root(home).findall("scannerSettings")
     fitting = [e for e in elements if e.get("id") == scanner.get("id")]
     if not fitting and len(files.root(home).findall("scanner")) == 1 and len(elements) == 1:
         fitting = elements
-    return files.settings(fitting[0], home) if fitting else None
+    return files.read_settings(fitting[0], home) if fitting else None
 
 
 def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:
-    """Return the settings of the highest rates of a scanner."""
+    """Return settings with the highest rates that a scanner supports."""
     pulses = scanner.values.get("pulseFreqs_Hz", "").split(",")
-    settings = {"pulseFreq_hz": max(pulses, key=lambda hz: number({"hz": hz}, "hz", 0))}
+    settings = {"pulseFreq_hz": max(pulses, key=lambda hz: read_number({"hz": hz}, "hz", 0))}
     if scanner.number("scanFreqMax_Hz") > 0:
         settings["scanFreq_hz"] = scanner.values["scanFreqMax_Hz"]
     if scanner.number("scanAngleMax_deg") > 0:
@@ -144,7 +151,10 @@ def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:
 
 
 def _merged(devices: dict[str, Device]) -> dict[str, Device]:
-    """Return a single sensor for channels that differ in their beams alone, else a sensor each."""
+    """Merge channels that differ only in their beams into a single sensor.
+
+    Otherwise, each channel remains a separate sensor.
+    """
     first, *others = devices.values()
     tables = [mounted.data.get("beams", {}) for mounted in devices.values()]
     shared = {name: value for name, value in first.data.items() if name != "beams"}
@@ -155,7 +165,7 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
         for other in others
     )
     starts = np.array([mounted.position for mounted in devices.values()])
-    # A start beside the axis would turn with the head here, and does not in HELIOS++.
+    # A beam origin off the axis would rotate with the head here, but not in HELIOS++.
     on_axis = not np.ptp(starts[:, :2], axis=0).any()
     single = all(_count(table) == 1 for table in tables)
     if not (others and is_shared and single and on_axis):
@@ -164,7 +174,7 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
         "elevation_deg": [_only(table.get("elevation_deg", 0.0)) for table in tables],
         "azimuth_deg": [_only(table.get("azimuth_deg", 0.0)) for table in tables],
     }
-    heights = clean(starts[:, 2] - starts[0, 2])
+    heights = rounded(starts[:, 2] - starts[0, 2])
     if np.any(heights):
         beams["origin_m"] = [[0.0, 0.0, height] for height in np.atleast_1d(heights).tolist()]
     merged = replace(first, data=shared | {"beams": beams})
@@ -172,13 +182,13 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
 
 
 def _count(table: dict[str, Any]) -> int:
-    """Return the number of beams of a table of one or several beams."""
+    """Return the number of beams in a beam table."""
     angles = table.get("elevation_deg", [0.0])
     return int(angles["count"]) if isinstance(angles, dict) else len(angles)
 
 
 def _only(angles: Any) -> float:
-    """Return the only angle of a table's column."""
+    """Return the single angle in a column of a beam table."""
     if isinstance(angles, dict):
         return float(angles["first"])
     return float(angles[0]) if isinstance(angles, list) else float(angles)
@@ -206,7 +216,7 @@ def _write(
         content: dict[str, Any] = {"scene": "seed", "sensor": only}
     else:
         content = {"scene": "seed", "sensors": entries}
-    if accuracy_m := clean(first.number("accuracy_m")):
+    if accuracy_m := rounded(first.number("accuracy_m")):
         content["noise"] = {"range_m": accuracy_m}
     waveforms = first.child("FWFSettings")
     if waveforms is not None or first.number("maxNOR"):
@@ -223,19 +233,19 @@ def _write(
 
 
 def _entry(file: str, mounted: Device) -> dict[str, Any]:
-    """Return the entry of a sensor in a scenario."""
+    """Return the scenario entry of a sensor."""
     min_range_m, max_range_m = mounted.range_m
     pose = Pose.from_rotation(AHEAD @ mounted.position, AHEAD @ mounted.rotation)
     mount: dict[str, Any] = {
         name: angle
         for name in ("yaw_deg", "pitch_deg", "roll_deg")
-        if (angle := clean(getattr(pose, name)))
+        if (angle := rounded(getattr(pose, name)))
     }
-    if any(position := clean(pose.position)):  # type: ignore[arg-type]
+    if any(position := rounded(pose.position)):  # type: ignore[arg-type]
         mount = {"position": position, **mount}
     entry: dict[str, Any] = {"model": file}
     if min_range_m:
-        entry["min_range_m"] = clean(min_range_m)
+        entry["min_range_m"] = rounded(min_range_m)
     if np.isfinite(max_range_m):
-        entry["max_range_m"] = clean(max_range_m)
+        entry["max_range_m"] = rounded(max_range_m)
     return {**entry, "mount": mount} if mount else entry

@@ -1,4 +1,7 @@
-"""Legs of HELIOS++ as a trajectory: from leg to leg, standing at each, or from a file."""
+"""Convert HELIOS++ legs to a trajectory.
+
+The platform moves from leg to leg, is stationary at each leg, or follows a trajectory file.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,10 @@ from lidarsim.base.time_units import seconds_of
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.scene.transform import rotation_about
 
-from .files import Assets, clean, flag, number, read, vector
+from .files import Assets, read_file, read_flag, read_number, read_vector, rounded
 
-_SPEED = 70.0  # default, meters a second
-_BETWEEN_S = 0.001  # time between legs: the carrier turns on the spot or goes to its next leg
+_SPEED = 70.0  # default speed in m/s
+_BETWEEN_S = 0.001  # time in which the platform turns on the spot or moves to the next leg
 _AFTER_S = 1.0  # duration of the trajectory after the last leg
 _FACING_Y_DEG = 90.0  # yaw of platforms that do not turn
 TRAJECTORY_FILE = "trajectory.tum"
@@ -30,23 +33,23 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass
 class Leg:
-    """A leg of a survey: its start and its settings."""
+    """A leg of a survey, with its start position and its settings."""
 
     number: int
-    position: Floats  # (3,): of the start, meters
+    position: Floats  # (3,) start in meters
     scanner: dict[str, str]  # settings
     platform: dict[str, str]  # settings
     longest_s: float  # maximum duration; infinite without a limit
 
     @property
     def active(self) -> bool:
-        """Whether the scanner scans during the leg."""
-        return flag(self.scanner, "active", True)
+        """Whether the scanner is active during the leg."""
+        return read_flag(self.scanner, "active", True)
 
 
 @dataclass
-class Stretch:
-    """Part of the trajectory: a leg, from its start to its end."""
+class LegSegment:
+    """The part of the trajectory that belongs to a leg."""
 
     leg: int  # number
     active: bool
@@ -56,20 +59,21 @@ class Stretch:
 
 @dataclass
 class HeliosTrajectory:
-    """Poses of a carrier, and the stretches of its legs.
+    """The poses of a platform, and the segments of its legs.
 
-    `rows` hold seconds, x, y, z and yaw in degrees, or quaternions x, y, z, w in its place.
+    The columns of `rows` are time in seconds, x, y, z, and either the yaw in degrees or a
+    quaternion x, y, z, w.
     """
 
     rows: Floats
-    stretches: list[Stretch]
+    segments: list[LegSegment]
 
     def section_and_files(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
-        """Return the section `trajectory` of a scenario, and its files {name: text}."""
+        """Return the `trajectory` section of a scenario, and the text of the files it refers to."""
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
-            points = [dict(zip(names, map(clean, row), strict=True)) for row in rows]
+            points = [dict(zip(names, map(rounded, row), strict=True)) for row in rows]
             return {"points": points}, {}
         text = io.StringIO()
         np.savetxt(text, self.rows, "%.9g")
@@ -81,17 +85,19 @@ def read_legs(
 ) -> list[Leg]:
     """Return the legs of a survey.
 
-    `height` returns the height of the ground at x, y, meters.
+    `height` returns the height of the ground at x, y in meters.
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
         with prefixed(f"leg {index}"):
-            platform = assets.settings(element.find("platformSettings"), home)
-            scanner = assets.settings(element.find("scannerSettings"), home)
-            position = vector(platform)
-            if flag(platform, "onGround", False) and "trajectory" not in platform:
+            platform = assets.read_settings(element.find("platformSettings"), home)
+            scanner = assets.read_settings(element.find("scannerSettings"), home)
+            position = read_vector(platform)
+            if read_flag(platform, "onGround", False) and "trajectory" not in platform:
                 position[2] = height(position[0], position[1])
-            longest = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
+            longest = read_number(
+                element, "maxDuration_s", read_number(scanner, "maxDuration_s", -1)
+            )
         legs.append(Leg(index, position, scanner, platform, longest if longest > 0 else np.inf))
     if not legs:
         raise LidarError("its <survey> has no <leg>.")
@@ -99,9 +105,12 @@ def read_legs(
 
 
 def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
-    """Return a trajectory straight from leg to leg, at the speed of each, turning on the spot."""
+    """Return a trajectory that moves straight from leg to leg at the speed of each leg.
+
+    The platform turns on the spot between legs.
+    """
     rows = []
-    stretches = []
+    segments = []
     clock = 0.0
     position = legs[0].position
     yaw = _FACING_Y_DEG
@@ -110,7 +119,7 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
         length = float(np.linalg.norm(displacement))
         if not length:
             continue
-        speed = number(leg.platform, "movePerSec_m", _SPEED)
+        speed = read_number(leg.platform, "movePerSec_m", _SPEED)
         if speed <= 0:
             raise LidarError(f"leg {leg.number}: movePerSec_m is {speed:g}; it must be above 0.")
         seconds = min(length / speed, leg.longest_s)
@@ -118,22 +127,22 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
             yaw = float(np.degrees(np.arctan2(displacement[1], displacement[0])))
         target = position + displacement * (seconds * speed / length)
         rows += [[clock, *position, yaw], [clock + seconds, *target, yaw]]
-        stretches.append(Stretch(leg.number, leg.active, clock, seconds))
+        segments.append(LegSegment(leg.number, leg.active, clock, seconds))
         clock = clock + seconds + _BETWEEN_S
         position = target
     if not rows:
         raise LidarError("its platform moves, but all legs have the same position.")
     rows.append([clock + _AFTER_S, *position, yaw])
-    return HeliosTrajectory(np.array(rows), stretches)
+    return HeliosTrajectory(np.array(rows), segments)
 
 
-def standing_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
-    """Return a trajectory that stands at each leg until its head has turned.
+def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
+    """Return a trajectory that is stationary at each leg until the scanner head has rotated.
 
-    `heads` are durations of the heads' rotations, {number of a leg: seconds}, 0 without rotation.
+    `heads` are the rotation times in seconds by leg number, 0 for a head that does not rotate.
     """
     rows = []
-    stretches = []
+    segments = []
     clock = 0.0
     for leg in legs:
         if not leg.active:
@@ -146,27 +155,24 @@ def standing_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosT
             )
         pose = [*leg.position, _FACING_Y_DEG]
         rows += [[clock, *pose], [clock + seconds, *pose]]
-        stretches.append(Stretch(leg.number, True, clock, seconds))
+        segments.append(LegSegment(leg.number, True, clock, seconds))
         clock += seconds + _BETWEEN_S
     if not rows:
         raise LidarError("no leg has an active scanner.")
     rows.append([clock + _AFTER_S, *rows[-1][1:]])
-    return HeliosTrajectory(np.array(rows), stretches)
+    return HeliosTrajectory(np.array(rows), segments)
 
 
 def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
-    """Return the trajectory in the file of an interpolated platform.
-
-    Legs are its stretches.
-    """
+    """Read the trajectory file of an interpolated platform, and return a segment for each leg."""
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarError("all legs of an interpolated platform must name the same trajectory.")
-    path = assets.file(files.pop())
+    path = assets.find_file(files.pop())
     settings: dict[str, str] = {}
     for leg in reversed(legs):
         settings |= leg.platform
-    columns = _columns(read(path).decode("utf-8", "replace"), settings)
+    columns = _columns(read_file(path).decode("utf-8", "replace"), settings)
     try:
         columns["t"] = seconds_of(columns["t"], None, advice="HELIOS++ expects seconds")
     except ValueError as error:
@@ -177,30 +183,30 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     columns = {name: column[first] for name, column in columns.items()}
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     if settings.get("interpolationDomain") != "position" and "yaw" in columns:
-        scale = 1.0 if flag(settings, "toRadians", True) else 180 / np.pi
+        scale = 1.0 if read_flag(settings, "toRadians", True) else 180 / np.pi
         angles = scale * np.stack([columns[name] for name in ("roll", "pitch", "yaw")], axis=1)
         kind = survey.get("rotationSpec", "ARINC 705")
         rotations = np.array([_platform_rotation(kind, *row) for row in angles.tolist()])
-    stretches = [_stretch_between(leg, times[0], times[-1]) for leg in legs]
+    segments = [_segment_between(leg, times[0], times[-1]) for leg in legs]
     positions = [columns[axis] for axis in "xyz"]
     quaternions = quaternions_of(rotations @ rotation_about(_Z, _FACING_Y_DEG))
     rows = np.column_stack([times - times[0], *positions, quaternions])
-    return HeliosTrajectory(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
+    return HeliosTrajectory(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), segments)
 
 
-def _stretch_between(leg: Leg, first_s: float, last_s: float) -> Stretch:
-    """Return the stretch of a leg in a trajectory from `first_s` to `last_s`."""
-    start = max(number(leg.platform, "tStart", first_s), first_s)
-    stop = min(number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
+def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
+    """Return the segment of a leg in a trajectory between two times."""
+    start = max(read_number(leg.platform, "tStart", first_s), first_s)
+    stop = min(read_number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
     if stop <= start:
         raise LidarError(
             f"leg {leg.number}: tStart and tEnd are outside the time range of the trajectory."
         )
-    return Stretch(leg.number, leg.active, float(start - first_s), float(stop - start))
+    return LegSegment(leg.number, leg.active, float(start - first_s), float(stop - start))
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the rotation (3, 3) of a platform by angles in degrees, as HELIOS++ reads files."""
+    """Return a platform rotation (3, 3) for angles in degrees, as HELIOS++ interprets them."""
     if kind == "CANONICAL":
         return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":
@@ -209,7 +215,10 @@ def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floa
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
-    """Return the columns of a trajectory {name: values}, named by indices, header or default."""
+    """Return the columns of a trajectory by name.
+
+    The names come from column indices in the settings, from the header, or from the default order.
+    """
     default_names = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     separator = settings.get("trajectory_seperator", ",")
@@ -223,7 +232,8 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
     if any(f"{name}Index" in settings for name in default_names):
         index_names = {
-            int(number(settings, f"{name}Index", i)): name for i, name in enumerate(default_names)
+            int(read_number(settings, f"{name}Index", i)): name
+            for i, name in enumerate(default_names)
         }
         names = [index_names.get(index, "") for index in range(width)]
     elif header is not None:
@@ -233,7 +243,7 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     description = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
         raise LidarError(f"{description}. It must have t, x, y and z.")
-    used = [name for name in names if name]  # indices may leave columns out
+    used = [name for name in names if name]  # column indices may skip columns
     unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
         fault = "A name occurs twice."

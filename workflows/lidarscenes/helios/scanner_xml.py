@@ -1,7 +1,7 @@
-"""Scanners of HELIOS++ as sensors: data files, and rotations on their platforms.
+"""Convert HELIOS++ scanners to sensors: data files, and rotations on their platforms.
 
-HELIOS++ looks along y with z up and x to the right. Every pulse is a step: mirrors and heads move
-by their step between two pulses, which is reproduced, including the rounding of lines.
+HELIOS++ scanners look along y, with z up and x to the right. Mirrors and heads move by a step
+between two pulses. This is reproduced, including the rounding to whole pulses per scan line.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.transform import rotation_about
 
-from .files import clean, number, rotation, vector
+from .files import read_number, read_rotation, read_vector, rounded
 
 _Z = np.array([0.0, 0.0, 1.0])
-# Rotations from the sensor frame to the frame of HELIOS++: of a line to both sides, of a cone about
-# the direction ahead, of prisms that look ahead, of a head.
+# Rotations from the sensor frame to the frame of HELIOS++, for a scan line to both sides, for a
+# cone about the forward direction, for forward-looking prisms, and for a head.
 _LINE = rotation_about(np.array([1.0, 0.0, 0.0]), 90)
 _CONE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
-_HEAD_STEP_DEG = 10.0  # rotation of a head in a scan; without a head, a scan is at most a cycle
-_FRAME_HZ = 10.0  # prisms have no cycle
-_SLACK = 1e-9  # slack for divisions whose exact quotients are whole numbers
+_HEAD_STEP_DEG = 10.0  # maximum rotation per scan with a head; without, it is a full cycle
+_FRAME_HZ = 10.0  # arbitrary, because prism patterns do not repeat
+_SLACK = 1e-9  # tolerance for divisions whose exact results are integers
 
-# A data file without name and light, and the rotation from the sensor frame to HELIOS++'s frame.
+# A data file without name and optics, and the rotation from the sensor frame to HELIOS++'s frame.
 ScannerSection = tuple[dict[str, Any], Floats]
 
 
@@ -45,11 +45,11 @@ class Device:
     data
         Content of the sensor's data file.
     rotation
-        Rotation (3, 3) from the sensor frame to the frame of the platform's mount.
+        Rotation (3, 3) from the sensor frame to the mount on the platform.
     position
-        Start of the light (3,), meters beside the mount.
+        Origin of the beams (3,), relative to the mount, in meters.
     head_s
-        Duration of the head's rotation from start to stop, seconds; None without a head.
+        Time in seconds that the head takes to rotate from start to stop; None without a head.
     range_m
         Minimum and maximum range.
     """
@@ -61,16 +61,16 @@ class Device:
     range_m: tuple[float, float]
 
     def steps(self, seconds: float) -> tuple[float, int]:
-        """Return the rotation of a time step, degrees, and the number of steps in `seconds`."""
+        """Return the rotation per time step in degrees, and the number of steps in a time."""
         turned = 360 * self.data["rate_hz"] * seconds
         count = max(ceil(turned / (360 if self.head_s is None else _HEAD_STEP_DEG) - _SLACK), 1)
         return turned / count, count
 
 
 class HeliosScanner:
-    """Attributes of a scanner.
+    """The attributes of a scanner or of one of its channels.
 
-    For a channel, its attributes take precedence over the scanner's.
+    The attributes of a channel take precedence over those of the scanner.
     """
 
     def __init__(self, element: Element, channel: Element | None = None) -> None:
@@ -85,13 +85,13 @@ class HeliosScanner:
 
     def number(self, name: str, default: float = 0.0) -> float:
         """Return an attribute as a number."""
-        return number(self.values, name, default)
+        return read_number(self.values, name, default)
 
 
-def channels(element: Element) -> dict[str, HeliosScanner]:
-    """Return the channels of a scanner {id: channel}.
+def read_channels(element: Element) -> dict[str, HeliosScanner]:
+    """Return the channels of a scanner by ID.
 
-    {"": scanner} without channels.
+    A scanner without channels is returned with an empty ID.
     """
     elements = element.findall("channels/channel")
     if not elements:
@@ -103,7 +103,7 @@ def channels(element: Element) -> dict[str, HeliosScanner]:
 
 
 def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
-    """Yield the features of a scanner that a scenario does not support, in words."""
+    """Describe the features of a scanner that a scenario does not support."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
             yield f"<{tag}> of {scanner.name}"
@@ -115,16 +115,16 @@ def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
         yield f"turning points of the oscillating mirror of {scanner.name} (its speed is constant)"
 
 
-def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
-    """Return a scanner with the settings of a leg.
+def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
+    """Convert a scanner with the settings of a leg.
 
     Raises
     ------
     LidarError
-        If no sensor has the kind of optics, or the settings make no line.
+        If the scanner's optics are not supported, or if the settings result in no pulses.
     """
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
-    pulse_hz = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
+    pulse_hz = read_number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
     if pulse_hz <= 0:
         raise LidarError(f"{scanner.name} must have a pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
@@ -139,28 +139,30 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     if head.deg_per_s:
         data, sensor_rotation = _turning_head(scanner, head, line)
     elif line is not None:
-        data, line_rotation = line.standing()
-        sensor_rotation = rotation(emitter) @ line_rotation
+        data, line_rotation = line.mirror_sections()
+        sensor_rotation = read_rotation(emitter) @ line_rotation
     else:
         data, optics_rotation = _OPTICS[optics](scanner, settings, pulse_hz)
-        sensor_rotation = rotation(emitter) @ optics_rotation
+        sensor_rotation = read_rotation(emitter) @ optics_rotation
     return Device(
         data={
             "name": scanner.name,
             "sources": {"all": "a HELIOS++ survey and the files that it refers to"},
             **data,
-            "optics": {name: clean(value) for name, value in _light(scanner, settings).items()},
+            "optics": {name: rounded(value) for name, value in _light(scanner, settings).items()},
         },
         rotation=rotation_about(head.axis, head.start_deg) @ sensor_rotation,
-        position=vector(emitter),
+        position=read_vector(emitter),
         head_s=abs(head.range_deg / head.deg_per_s) if head.deg_per_s else None,
-        range_m=(scanner.number("rangeMin_m"), number(scanner.values, "rangeMax_m", np.inf)),
+        range_m=(scanner.number("rangeMin_m"), read_number(scanner.values, "rangeMax_m", np.inf)),
     )
 
 
 def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
-    """Return the fields of `optics` of a scanner with the settings of a leg."""
-    divergence = number(settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4))
+    """Return the `optics` fields of a scanner with the settings of a leg."""
+    divergence = read_number(
+        settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4)
+    )
     return {
         "wavelength_nm": scanner.number("wavelength_nm", 1064),
         "divergence_mrad": 1e3 * divergence,
@@ -170,12 +172,12 @@ def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]
 
 
 class _Head(NamedTuple):
-    """Rotation of a scanner's head."""
+    """The rotation of a scanner's head."""
 
     axis: Floats  # (3,)
     start_deg: float
     range_deg: float  # angle between start and stop
-    deg_per_s: float  # 0 if the head stands
+    deg_per_s: float  # 0 if the head does not rotate
 
     @classmethod
     def from_settings(
@@ -183,27 +185,27 @@ class _Head(NamedTuple):
     ) -> _Head:
         """Return the head of a scanner with the settings of a leg.
 
-        `line` is the line of rotating optics.
+        `line` is the scan line of rotating optics, or None for other optics.
         """
-        axis = vector(scanner.child("headRotateAxis"))
+        axis = read_vector(scanner.child("headRotateAxis"))
         axis = axis if np.linalg.norm(axis) > 0.1 else _Z
-        start_deg = number(settings, "headRotateStart_deg", 0)
-        range_deg = number(settings, "headRotateStop_deg", 0) - start_deg
+        start_deg = read_number(settings, "headRotateStart_deg", 0)
+        range_deg = read_number(settings, "headRotateStop_deg", 0) - start_deg
         max_deg_per_s = scanner.number("headRotatePerSecMax_deg")
-        deg_per_s = number(settings, "headRotatePerSec_deg", 0)
-        if line is not None:  # a distance between lines takes precedence
-            by_lines = number(settings, "horizontalResolution_deg", 0) * line.scan_hz
+        deg_per_s = read_number(settings, "headRotatePerSec_deg", 0)
+        if line is not None:  # a distance between scan lines takes precedence
+            by_lines = read_number(settings, "horizontalResolution_deg", 0) * line.scan_hz
             deg_per_s = by_lines or deg_per_s
         limited = float(np.clip(deg_per_s, -max_deg_per_s, max_deg_per_s))
         return cls(axis, start_deg, range_deg, limited)
 
 
 def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
-    """Return a sensor whose head turns.
+    """Return the section of a sensor with a rotating head.
 
-    Raises LidarError if the head cannot turn as the settings say.
+    Raises LidarError if the settings do not describe a supported rotation.
     """
-    aim = _aim(rotation(scanner.child("beamOrigin")))
+    aim = _aim(read_rotation(scanner.child("beamOrigin")))
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
     if line is None or aim is None or not vertical:
         raise LidarError(
@@ -216,18 +218,18 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
             f"{head.deg_per_s:g} degrees per second, so it never reaches "
             f"{head.start_deg + head.range_deg:g} degrees."
         )
-    return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
+    return line.head_sections(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
 
 
 class _Aim(NamedTuple):
-    """Rotation of an emitter: first about x, then about z."""
+    """The rotation of an emitter, first about x and then about z."""
 
     tilt_deg: float
     azimuth_deg: float
 
 
 def _aim(emitter: Floats) -> _Aim | None:
-    """Return the angles of a rotation (3, 3), or None if the rotation rolls."""
+    """Decompose a rotation (3, 3), or return None if it includes a roll."""
     if abs(emitter[2, 0]) > 1e-12:
         return None
     tilt = np.arctan2(emitter[2, 1], emitter[2, 2])
@@ -236,16 +238,16 @@ def _aim(emitter: Floats) -> _Aim | None:
 
 
 def _exact_us(pulses: int, pulse_hz: float) -> int | str:
-    """Return the exact duration of `pulses`, microseconds, with a fraction as text."""
+    """Return the exact duration of `pulses` in microseconds, as text if it is a fraction."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """Pulses of a polygon's line.
+    """The pulses of a scan line made by a rotating polygon mirror.
 
-    A line has time for `pulses_per_line` pulses. `count` pulses are within its angles.
+    A scan line takes the time of `pulses_per_line` pulses, of which `count` are within its angles.
     """
 
     first_deg: float
@@ -253,36 +255,37 @@ class _Line:
     count: int
     pulses_per_line: int
     pulse_hz: float
-    scan_hz: float  # 0 if the mirror stands
+    scan_hz: float  # 0 if the mirror does not move
 
     @classmethod
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
     ) -> _Line:
-        """Return the line of a scanner with the settings of a leg.
+        """Return the scan line of a scanner with the settings of a leg.
 
-        Raises LidarError without pulses.
+        Raises LidarError if the scan line contains no pulse.
         """
         max_deg = scanner.number("scanAngleMax_deg")
         effective_deg = scanner.number("scanAngleEffectiveMax_deg")
-        resolution_deg = number(settings, "verticalResolution_deg", 0)
+        resolution_deg = read_number(settings, "verticalResolution_deg", 0)
         min_hz = scanner.number("scanFreqMin_Hz")
-        if not (resolution_deg or min_hz or number(settings, "scanFreq_hz", 0)):
-            return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
+        if not (resolution_deg or min_hz or read_number(settings, "scanFreq_hz", 0)):
+            return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror does not move
         scan_hz = _scan_hz(
             scanner, settings, pulse_hz * resolution_deg / (2 * max_deg) if resolution_deg else None
         )
         half_deg = min(effective_deg, _half_angle_deg(scanner, settings))
-        lowest_deg = number(settings, "verticalAngleMin_deg", -half_deg)
-        highest_deg = number(settings, "verticalAngleMax_deg", half_deg)
+        lowest_deg = read_number(settings, "verticalAngleMin_deg", -half_deg)
+        highest_deg = read_number(settings, "verticalAngleMax_deg", half_deg)
         if (
             highest_deg - lowest_deg > 2 * effective_deg + _SLACK
-        ):  # HELIOS++ 1 leaves such pulses out, 2 refuses them
+        ):  # HELIOS++ 1 omits such pulses, and HELIOS++ 2 refuses them
             lowest_deg = max(lowest_deg, -effective_deg)
             highest_deg = min(highest_deg, effective_deg)
         step_deg = 2 * max_deg * scan_hz / pulse_hz
         pulses_per_line = ceil(pulse_hz / scan_hz - _SLACK)
-        # Angles above the lowest, up to the highest; the next line starts before a full revolution.
+        # The lowest angle is exclusive and the highest inclusive. The next scan line starts before
+        # a full revolution.
         first = floor((lowest_deg + max_deg) / step_deg + _SLACK) + 1
         last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), pulses_per_line - 1)
         if last < first:
@@ -299,29 +302,29 @@ class _Line:
             scan_hz,
         )
 
-    def standing(self) -> ScannerSection:
-        """Return a sensor with a mirror, whose firings are pulses.
+    def mirror_sections(self) -> ScannerSection:
+        """Return the section of a sensor with a mirror and no head, whose firings are pulses.
 
         Raises
         ------
         LidarError
-            If the mirror stands.
+            If the mirror does not move.
         """
         if not self.scan_hz:
             raise LidarError("scanFreq_hz is 0, and the head does not rotate.")
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
-            "width_deg": clean(min(width, 360)),
-            "duty": clean(self.count / self.pulses_per_line),
+            "width_deg": rounded(min(width, 360)),
+            "duty": rounded(self.count / self.pulses_per_line),
         }
         middle = self.first_deg + width / 2
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
-    def turning(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
-        """Return a sensor with a head, whose firings are lines that an emitter aims."""
+    def head_sections(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
+        """Return the section of a sensor with a rotating head, whose firings are scan lines."""
         between_us = 1e6 / self.pulse_hz
-        last = clean((self.count - 1) * between_us)
+        last = rounded((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
             "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
@@ -337,73 +340,79 @@ class _Line:
         """
         angles = self.first_deg + aim.tilt_deg + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
-            first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
+            first, last = (rounded(end) for end in angles[[0, -1]].clip(-90, 90))
             elevations_deg = {"first": first, "last": last, "count": self.count}
-            if not clean(aim.azimuth_deg):
+            if not rounded(aim.azimuth_deg):
                 return {"elevation_deg": elevations_deg}
-            azimuths_deg = clean(np.full(self.count, aim.azimuth_deg))
+            azimuths_deg = rounded(np.full(self.count, aim.azimuth_deg))
             return {"elevation_deg": elevations_deg, "azimuth_deg": azimuths_deg}
         angles = (angles + 180) % 360 - 180
         behind = np.abs(angles) > 90
         elevations = np.where(behind, np.copysign(180, angles) - angles, angles)
         return {
-            "elevation_deg": clean(elevations),
-            "azimuth_deg": clean(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
+            "elevation_deg": rounded(elevations),
+            "azimuth_deg": rounded(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
         }
 
 
 def _mirror(
     firings: int, rate_hz: float, mirror: dict[str, Any], middle: float = 0.0
 ) -> dict[str, Any]:
-    """Return a sensor with a mirror, whose lines have their middle at `middle` degrees."""
+    """Return the section of a sensor with a mirror.
+
+    The center of the scan lines is at `middle` degrees.
+    """
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
-    return data | ({"zero_deg": clean(middle)} if clean(middle) else {}) | {"mirror": mirror}
+    return data | ({"zero_deg": rounded(middle)} if rounded(middle) else {}) | {"mirror": mirror}
 
 
 def _oscillating(
     scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
 ) -> ScannerSection:
-    """Return a sensor with a mirror that swings.
+    """Return the section of a sensor with an oscillating mirror.
 
-    The scan product limits the angle of the mirror.
+    The angle of the mirror is limited by the scan product.
     """
     scan_hz = _scan_hz(scanner, settings)
     max_deg = scanner.number("scanProduct", 1e6) / scan_hz
-    half_deg = min(number(settings, "scanAngle_deg", 0), max_deg)
+    half_deg = min(read_number(settings, "scanAngle_deg", 0), max_deg)
     firings = floor(pulse_hz / scan_hz + _SLACK)
     if half_deg <= 0 or not firings:
         raise LidarError(
             f"{scanner.name} must have a scanAngle_deg above 0 and at least one pulse per scan "
             "line."
         )
-    mirror = {"motion": "triangle", "width_deg": clean(2 * half_deg)}
+    mirror = {"motion": "triangle", "width_deg": rounded(2 * half_deg)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with fibers side by side, each with a pulse in a line."""
+    """Return the section of a sensor with adjacent fibers that each fire once per scan line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
-    mirror = {"motion": "sawtooth", "width_deg": clean(2 * _half_angle_deg(scanner, settings))}
+    mirror = {"motion": "sawtooth", "width_deg": rounded(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
 def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with a rotating wedge (Palmer), at its greatest rate, as in HELIOS++."""
+    """Return the section of a sensor with a rotating wedge (Palmer scanner).
+
+    As in HELIOS++, the wedge rotates at its maximum rate.
+    """
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
-    beams = {"elevation_deg": [clean(90 - _half_angle_deg(scanner, settings))]}
+    beams = {"elevation_deg": [rounded(90 - _half_angle_deg(scanner, settings))]}
     return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with Risley prisms."""
+    """Return the section of a sensor with Risley prisms."""
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
-            "wedge_deg": clean(abs(angle)),
-            "index": clean(scanner.number(f"refrIndex{i}", 1) / air),
-            "rpm": clean(60 * scanner.number(f"rotorFreq{i}_Hz")),
+            "wedge_deg": rounded(abs(angle)),
+            "index": rounded(scanner.number(f"refrIndex{i}", 1) / air),
+            "rpm": rounded(60 * scanner.number(f"rotorFreq{i}_Hz")),
             "inclined_first": angle > 0,
         }
         for i in (1, 2, 3)
@@ -417,12 +426,12 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
         "prisms": prisms,
     }
     if (incident := scanner.child("incidentBeam")) is not None:
-        x, y, z = _PRISM.T @ vector(incident)
+        x, y, z = _PRISM.T @ read_vector(incident)
         elevation = np.arctan2(z, np.hypot(x, y))
         azimuth = np.arctan2(y, x)
         section["beams"] = {
-            "elevation_deg": [clean(np.degrees(elevation))],
-            "azimuth_deg": [clean(np.degrees(azimuth))],
+            "elevation_deg": [rounded(np.degrees(elevation))],
+            "azimuth_deg": [rounded(np.degrees(azimuth))],
         }
     return section, _PRISM
 
@@ -436,9 +445,12 @@ _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSecti
 
 
 def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
-    """Return the scan angle to either side, degrees: at most, and by default, the scanner's."""
+    """Return the scan angle to either side, which is limited by the scanner's maximum.
+
+    The maximum is also the default.
+    """
     max_deg = scanner.number("scanAngleMax_deg")
-    half_deg = min(max(number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
+    half_deg = min(max(read_number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
     if half_deg <= 0:
         raise LidarError(f"{scanner.name} must have a scanAngleMax_deg above 0.")
     return half_deg
@@ -447,11 +459,11 @@ def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
 def _scan_hz(
     scanner: HeliosScanner, settings: dict[str, str], requested_hz: float | None = None
 ) -> float:
-    """Return the lines a second.
+    """Return the number of scan lines per second.
 
-    Raises LidarError if they are not within the scanner's limits.
+    Raises LidarError if it is outside the scanner's limits.
     """
-    rate_hz = number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
+    rate_hz = read_number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
     min_hz = scanner.number("scanFreqMin_Hz")
     max_hz = scanner.number("scanFreqMax_Hz") or np.inf
     if not min_hz <= rate_hz <= max_hz or rate_hz <= 0:

@@ -1,4 +1,4 @@
-"""Scenes of HELIOS++ as entries of `scene.files`."""
+"""Convert HELIOS++ scenes to entries of `scene.files`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
 
-from ..procedural.floor import heights_at
-from .files import Assets, clean, number, read, rotation
+from ..procedural.floor import surface_heights
+from .files import Assets, read_file, read_number, read_rotation, rounded
 
-# Makes a mesh of surfels, a surfel for each cubic cell with points: of the path of the file, points
-# (n, 3) in meters, and the edge of the cells in meters.
+# Makes a mesh with a surfel for each cubic cell that contains points. The arguments are the path of
+# the file, the points (n, 3) in meters, and the edge length of the cells in meters.
 SurfelMaker = Callable[[Path, Floats, float], SceneMesh]
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
@@ -39,29 +39,29 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 @dataclass
 class HeliosPart:
-    """A mesh file of a scene and its placement: rotated, scaled, moved."""
+    """A mesh file in a scene with its placement: rotation, scale, and translation."""
 
     assets: Assets
     file: Path
     up_axis: str | None
     rotation: Floats  # (3, 3)
     scale: float
-    offset: Floats  # (3,): meters
-    falls: bool  # whether it is moved down or up to stand on the ground
-    library: Path | None = None  # file other than .obj, for the material
-    material: str = ""  # name in the library
-    surfels: SceneMesh | None = None  # surfels from a file of points
+    offset: Floats  # (3,) in meters
+    falls: bool  # whether the part is moved vertically to stand on the ground
+    library: Path | None = None  # file with the material of a part that is not an .obj file
+    material: str = ""  # name of the material in the library
+    surfels: SceneMesh | None = None  # surfels made from a file of points
 
     @cached_property
     def materials(self) -> dict[str, dict[str, str]]:
-        """Values that HELIOS++ reads of the materials of the faces, {name: values}."""
+        """The HELIOS++ attributes of each material that the faces use."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
         values_by_material: dict[str, dict[str, str]] = {}  # {name of a material: values}
         names = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in names]
         for name, library in zip(names, libraries, strict=True):
-            self.assets.check(library, name)
+            self.assets.check_allowed(library, name)
         libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
@@ -74,37 +74,37 @@ class HeliosPart:
                     values[words[0].removeprefix("helios_")] = words[1]
         return {name: values for name, values in values_by_material.items() if name in used}
 
-    def kinds(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
-        """Return reflectance and class of each material, {name: fields of `materials`}.
+    def material_fields(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
+        """Return the `materials` fields, reflectance and class, for each material.
 
-        `spectra` returns the reflectance by the name of a spectrum.
+        `spectra` returns a reflectance by the name of a spectrum.
         """
         kinds: dict[str, dict[str, Any]] = {}
         for name, values in self.materials.items():
             share = None
             if "reflectance" in values:
-                share = number(values, "reflectance", 0)
+                share = read_number(values, "reflectance", 0)
                 share = share if share <= 1 else share / 100
             elif "spectra" in values:
                 share = spectra(values["spectra"])
             kind: dict[str, Any] = {}
             if share is not None:
-                kind["reflectance"] = clean(np.clip(share, 0, 1))
+                kind["reflectance"] = rounded(np.clip(share, 0, 1))
             if "classification" in values:
-                kind["class"] = int(number(values, "classification", 0))
+                kind["class"] = int(read_number(values, "classification", 0))
             kinds[name] = kind
         return kinds
 
     @property
     def is_ground(self) -> bool:
-        """True if platforms and parts can stand on the part, and for points without material."""
+        """Whether platforms and other parts can stand on the part."""
         if self.surfels is not None and self.library is None:
             return True
         grounds = (values.get("isGround", "").lower() for values in self.materials.values())
         return any(ground in ("true", "1") for ground in grounds)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return the meshes of the part, in world coordinates."""
+        """Return the meshes of the part in world coordinates."""
         placed = Transform(self.rotation * self.scale, self.offset)
         if (points := self.surfels) is not None:
             return (points.moved(points.name, placed.linear, placed.offset),)
@@ -117,23 +117,23 @@ class HeliosPart:
         )
 
     def entry(self, name: str) -> dict[str, Any]:
-        """Return the entry of `scene.files` for the part, whose file is written as `name`."""
+        """Return the entry of the part in `scene.files`, with `name` as its file."""
         angles = Pose.from_rotation((0, 0, 0), self.rotation)
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
             "up_axis": (self.up_axis, None),
-            "scale": (clean(self.scale), 1.0),
-            "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
-            "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
+            "scale": (rounded(self.scale), 1.0),
+            "rotation_deg": (rounded(degrees), [0.0, 0.0, 0.0]),
+            "translation": (rounded(self.offset), [0.0, 0.0, 0.0]),
         }
         changed = {key: value for key, (value, default) in placement.items() if value != default}
         return {"file": name, **changed}
 
 
 class HeliosScene:
-    """The parts of a scene, and the ground among the parts.
+    """The parts of a scene, some of which form the ground.
 
-    `folder` is for meshes of points.
+    `folder` receives the meshes that are made from points.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class HeliosScene:
         self._surfels = surfels
         self.unread: list[str] = []
         self._missing: set[str] = set()
-        self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by their motion
+        self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by kind of motion
         self.parts: list[HeliosPart] = []
         name = f"scene {element.get('id')!r}"
         for index, part in enumerate(element.findall("part")):
@@ -160,7 +160,7 @@ class HeliosScene:
                 self._let_fall(falling)
 
     def _read(self, part: Element, name: str) -> list[HeliosPart]:
-        """Read a <part>: a part for each file of its loader, placed by its filters."""
+        """Read a <part>, which results in a part for each file of its loader."""
         for tag, moving in self._moving.items():
             if part.find(tag) is not None:
                 moving.append(name)
@@ -183,13 +183,13 @@ class HeliosScene:
         return draft.parts(self._assets)
 
     def _load(self, draft: _PartDraft, kind: str, text: dict[str, str], name: str) -> None:
-        """Set the files of a part by a loader with the parameters {name: text}."""
+        """Set the files of a part according to the parameters of a loader."""
         draft.files = _files(text, self._assets)
         if kind == "objloader":
             draft.up_axis = text.get("up")
         else:
             draft.material = text.get("matname", "")
-            draft.library = self._assets.file(text["matfile"]) if "matfile" in text else None
+            draft.library = self._assets.find_file(text["matfile"]) if "matfile" in text else None
         if kind == "xyzloader":
             draft.surfels = [self._surfels(file, *_points(file, text)) for file in draft.files]
             number_of_part = name.split()[-1]
@@ -201,28 +201,28 @@ class HeliosScene:
 
     @cached_property
     def _ground(self) -> Scene | None:
-        """Simplified scene of the parts that are ground, or None."""
+        """The simplified scene of the ground parts, or None."""
         meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
         return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
-        """Return the height of the lowest ground at x, y, in meters, or 0 without ground."""
-        heights = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
+        """Return the height of the lowest ground at x, y in meters, or 0 without ground."""
+        heights = np.zeros(0) if self._ground is None else surface_heights(self._ground, x, y)
         if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
             return 0.0
         return float(heights.min())
 
     def _let_fall(self, part: HeliosPart) -> None:
-        """Move a part up or down so that its lowest point stands on the ground."""
+        """Move a part vertically so that its lowest point touches the ground."""
         points = join_meshes("", part.meshes()).vertices
         x, y, z = points[points[:, 2].argmin()].tolist()
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """Return the entries of `materials` for objects, or for faces of several materials."""
+        """Return the entries of `materials` for all objects, or for their faces if these differ."""
         spectra = partial(self._reflectance, wavelength_nm)
-        kinds = [part.kinds(spectra) for part in self.parts]
+        kinds = [part.material_fields(spectra) for part in self.parts]
         if not any(kind for part_kinds in kinds for kind in part_kinds.values()):
             return []
         meshes = [part.meshes() for part in self.parts]
@@ -236,16 +236,16 @@ class HeliosScene:
         return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
-        """Return the reflectance at a wavelength by a named spectrum.
+        """Return the reflectance of a named spectrum at a wavelength.
 
-        Returns None without the spectrum.
+        Returns None if the spectrum is missing.
         """
         for root in self._assets.folders:
             for folder in (root / "spectra", root / "data" / "spectra"):
-                self._assets.check(folder / f"{name}.txt", name)
+                self._assets.check_allowed(folder / f"{name}.txt", name)
                 text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
-                if rows:  # micrometers and per cent
+                if rows:  # micrometers and percent
                     lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
                     return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
         self.unread.append(
@@ -253,8 +253,8 @@ class HeliosScene:
         )
         return None
 
-    def left_out(self) -> list[str]:
-        """Return the unsupported features in words, after all parts have been read."""
+    def unsupported_features(self) -> list[str]:
+        """Describe the unsupported features of the scene, after all parts have been read."""
         lines = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
@@ -271,7 +271,7 @@ class HeliosScene:
 
 @dataclass
 class _PartDraft:
-    """A <part> whose filters are being read, in their order."""
+    """A <part> while its filters are being applied in their order."""
 
     files: list[Path] = field(default_factory=list)
     up_axis: str | None = None
@@ -284,9 +284,9 @@ class _PartDraft:
     surfels: list[SceneMesh | None] = field(default_factory=lambda: [None])
 
     def transform(self, kind: str, text: dict[str, str], rotations: Element | None) -> None:
-        """Rotate, scale or move the part by a filter with the parameters {name: text}."""
+        """Apply a filter that rotates, scales, or moves the part."""
         if kind == "rotate":
-            self.rotation = rotation(rotations) @ self.rotation
+            self.rotation = read_rotation(rotations) @ self.rotation
         elif kind == "scale":
             (scale,) = _numbers(text.get("scale", ""), 1)
             self.scale = float(scale or 1.0)
@@ -302,7 +302,7 @@ class _PartDraft:
     def parts(self, assets: Assets) -> list[HeliosPart]:
         """Return a part for each file.
 
-        Raises LidarError without files.
+        Raises LidarError if there are no files.
         """
         if not self.files:
             raise LidarError("none of its filters loads a file.")
@@ -326,13 +326,10 @@ class _PartDraft:
 def _entries(
     name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the entries of `materials` for an object.
-
-    `kinds` are {name of a material: fields}.
-    """
+    """Return the entries of `materials` for an object, given the fields of each material."""
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
-    if shape.materials is None:  # a file without materials: the part has at most one
+    if shape.materials is None:  # the part has at most one material
         return [{"objects": objects, **kind} for kind in kinds.values() if kind][:1]
     object_kinds = {material: kinds.get(material, {}) for material in shape.materials.names}
     first, *following = object_kinds.values()
@@ -346,9 +343,9 @@ def _entries(
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
-    """Return the files of a loader: by name, or in a folder by a regular expression for names."""
+    """Return the files of a loader, given by name or by a folder and a regular expression."""
     if "efilepath" not in text:
-        return [assets.file(text.get("filepath", ""))]
+        return [assets.find_file(text.get("filepath", ""))]
     folder, _, names = text["efilepath"].rpartition("/")
     try:
         fits = re.compile(names)
@@ -360,19 +357,16 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
         if (root / folder).is_dir():
             paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
             for path in paths:
-                assets.check(path, text["efilepath"])
+                assets.check_allowed(path, text["efilepath"])
             if paths:
                 return paths
     raise LidarError(f"no file matches the efilepath {text['efilepath']!r}.")
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
-    """Return the points (n, 3) of a file for an `xyzloader`, and the edge of a surfel's cell.
-
-    Both are in meters.
-    """
+    """Return the points (n, 3) in a file and the cell size of its surfels, both in meters."""
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
-    lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
+    lines = read_file(path).decode("utf-8", "replace").translate(separators).splitlines()
     if not any(line.partition("//")[0].strip() for line in lines):
         raise LidarError(f"{path} has no points.")
     try:
@@ -381,26 +375,26 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
         raise LidarError(
             f"{path} has rows that are not points: {str(error).rstrip('.')}."
         ) from error
-    if not (np.abs(points) <= MAX_COORDINATE_M).all():  # NaN is not either
+    if not (np.abs(points) <= MAX_COORDINATE_M).all():  # also rejects NaN
         raise LidarError(
             f"{path} has points that are not finite, or more than {MAX_COORDINATE_M / 1000:,.0f} "
             "km away. Remove these points."
         )
-    return points, number(settings, "voxelSize", 1.0) or 1.0
+    return points, read_number(settings, "voxelSize", 1.0) or 1.0
 
 
 def _text(path: Path) -> str:
-    """Return the content of a file, or empty content if the file cannot be read."""
+    """Return the content of a file, or an empty string if the file cannot be read."""
     try:
         return read_input_text(path, "replace")
-    except (OSError, ValueError, LidarError):  # a zero in the name
+    except (OSError, ValueError, LidarError):  # ValueError for a null character in the name
         return ""
 
 
 def _numbers(text: str, count: int) -> Floats:
-    """Return `count` finite numbers separated by semicolons.
+    """Parse `count` finite numbers separated by semicolons.
 
-    Raises LidarError for wrong text.
+    Raises LidarError if the text is invalid.
     """
     try:
         values = np.array([float(word) for word in text.split(";")])

@@ -1,4 +1,7 @@
-"""Surveys of HELIOS++ as scenarios: a sensor for each leg that scans, on one trajectory."""
+"""Convert HELIOS++ surveys to scenarios.
+
+Each active leg becomes a sensor, and all sensors share a trajectory.
+"""
 
 from __future__ import annotations
 
@@ -25,30 +28,30 @@ from lidarsim.sensor.disc import SUBRAYS
 from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
-from .files import Assets, clean, number, rotation, vector
+from .files import Assets, read_number, read_rotation, read_vector, rounded
 from .legs import (
     HeliosTrajectory,
     Leg,
-    Stretch,
+    LegSegment,
     moving_trajectory,
     read_legs,
     read_trajectory,
-    standing_trajectory,
+    stationary_trajectory,
 )
-from .scanner_xml import Device, channels, device, unsupported_features
+from .scanner_xml import Device, make_device, read_channels, unsupported_features
 from .scene_xml import HeliosScene, SurfelMaker
 
 SCENARIO_FILE = "scenario.yaml"
-# Carriers look along x, the platforms of HELIOS++ along y.
+# Vehicles in lidarsim look along x, platforms in HELIOS++ along y.
 AHEAD = rotation_about((0, 0, 1), -90)
 
 
 @dataclass
-class Imported:
-    """The file of a written scenario, and the unsupported features of its survey."""
+class ImportedSurvey:
+    """The path of a converted scenario, and the unsupported features of its survey."""
 
     path: Path
-    left_out: list[str]
+    unsupported: list[str]
 
 
 def import_survey(
@@ -58,31 +61,31 @@ def import_survey(
     *,
     check: Callable[[Path], object],
     surfels: SurfelMaker,
-) -> Imported:
-    """Write a HELIOS++ survey as a scenario, into a new folder.
+) -> ImportedSurvey:
+    """Convert a HELIOS++ survey to a scenario in a new folder.
 
-    The folder holds `scenario.yaml`, data files of its sensors, meshes of scanned points, and the
-    trajectory if the survey has a file of poses.
+    The folder contains `scenario.yaml`, the data files of its sensors, meshes made from points and,
+    if the survey refers to a file of poses, the trajectory.
 
     Parameters
     ----------
     survey
-        The XML file of the survey.
+        XML file of the survey.
     folder
-        The new folder.
+        New folder.
     assets
-        Folders that are searched first for referenced files, before the folder of the survey and
-        the folders above.
+        Folders that are searched for referenced files before the folder of the survey and its
+        parent folders.
     check
-        Reads the written `scenario.yaml` and raises a LidarError if it cannot be simulated.
+        Reads the written `scenario.yaml`, and raises a LidarError if it cannot be simulated.
     surfels
-        Makes a mesh of the points of a file that an `xyzloader` reads.
+        Makes a mesh from the points of a file that an `xyzloader` reads.
 
     Raises
     ------
     LidarError
-        If a file is missing or broken, an essential feature is not supported, or `check` refuses
-        the scenario; nothing is written then.
+        If a file is missing or invalid, an essential feature is not supported, or `check` refuses
+        the scenario. In this case, nothing is written.
     """
     survey = Path(survey)
     folder = Path(folder)
@@ -104,21 +107,18 @@ def import_survey(
             if part.surfels is not None:
                 write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
         check(partial / SCENARIO_FILE)
-        partial.chmod(0o755)  # mkdtemp gives a folder to its owner alone
+        partial.chmod(0o755)  # only its owner can read a folder from mkdtemp
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
         raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Imported(folder / SCENARIO_FILE, survey_import.left_out)
+    return ImportedSurvey(folder / SCENARIO_FILE, survey_import.unsupported)
 
 
 class _Import:
-    """A survey whose XML files have been read.
-
-    `files` returns the scenario's files.
-    """
+    """A survey whose XML files have been read and converted."""
 
     def __init__(
         self, survey: Path, asset_folders: Sequence[Path], folder: Path, surfels: SurfelMaker
@@ -130,11 +130,11 @@ class _Import:
             raise LidarError("it has no <survey>.")
         self._element = element
         self._name = element.get("name") or survey.stem
-        self._scanners = channels(self._asset("scanner"))
+        self._scanners = read_channels(self._asset("scanner"))
         self._first = next(iter(self._scanners.values()))
         self.scene = HeliosScene(self._asset("scene"), self._assets, folder, surfels)
         self._notes: list[str] = []
-        self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
+        self._files: dict[str, dict[str, Any]] = {}  # {name of a data file: its content}
         self._sensors: dict[str, dict[str, Any]] = {}
         self._trajectory = self._read_legs()
         if not self._sensors:
@@ -147,20 +147,22 @@ class _Import:
         self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
         if element.get("legRandomOffset", "false") in ("true", "1"):
             self._notes.append("legRandomOffset (legs are at their specified positions)")
-        if number(element, "numRuns", 1) > 1:
+        if read_number(element, "numRuns", 1) > 1:
             self._notes.append("numRuns (a single run is simulated)")
-        if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
+        if read_number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
             self._notes.append("maxFullwaveRange_ns (waveforms are as long as their echoes)")
         unsupported = (
             line for scanner in self._scanners.values() for line in unsupported_features(scanner)
         )
-        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self.scene.left_out()]))
+        self.unsupported = list(
+            dict.fromkeys([*self._notes, *unsupported, *self.scene.unsupported_features()])
+        )
 
     def _asset(self, kind: str) -> Element:
-        """Return the element that the survey names for a kind, such as «scanner»."""
+        """Return the element of a kind, such as "scanner", that the survey refers to."""
         if not (reference := self._element.get(kind)):
             raise LidarError(f"its <survey> has no {kind}.")
-        return self._assets.asset(reference, kind, self._home).element
+        return self._assets.find_element(reference, kind, self._home).element
 
     def _read_legs(self) -> HeliosTrajectory:
         """Read the legs and the platform, fill `_sensors`, and return the trajectory."""
@@ -183,16 +185,16 @@ class _Import:
                 leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
                 for leg, by_channel in devices.items()
             }
-            trajectory = standing_trajectory(legs, heads)
+            trajectory = stationary_trajectory(legs, heads)
         self._mount_devices(mount, devices, trajectory)
         return trajectory
 
     def _interpolated_mount(self) -> Element | None:
-        """Return the <scannerMount> of an interpolated platform, or of its base platform."""
+        """Return the <scannerMount> of an interpolated platform or of its base platform."""
         mount = self._element.find("scannerMount")
         base = self._element.get("basePlatform")
         if mount is None and base:
-            platform = self._assets.asset(base, "platform", self._home).element
+            platform = self._assets.find_element(base, "platform", self._home).element
             return platform.find("scannerMount")
         return mount
 
@@ -212,13 +214,13 @@ class _Import:
         return kind in ("linearpath", "groundvehicle", "multicopter")
 
     def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
-        """Return the scanners of the legs that scan: {number of a leg: {channel: scanner}}."""
+        """Return the devices of each active leg, by leg number and channel."""
         devices = {}
         for leg in legs:
             with prefixed(f"leg {leg.number}"):
                 if leg.active:
                     devices[leg.number] = {
-                        channel: device(scanner, leg.scanner)
+                        channel: make_device(scanner, leg.scanner)
                         for channel, scanner in self._scanners.items()
                     }
         return devices
@@ -230,10 +232,10 @@ class _Import:
         trajectory: HeliosTrajectory,
     ) -> None:
         """Move the trajectory to the position of the scanners, and fill `_sensors`."""
-        mount_rotation = rotation(mount)
-        mount_position = vector(mount)
+        mount_rotation = read_rotation(mount)
+        mount_position = read_vector(mount)
         positions = {
-            tuple(clean(mount_position + mounted.position))  # type: ignore[arg-type]
+            tuple(rounded(mount_position + mounted.position))  # type: ignore[arg-type]
             for by_channel in devices.values()
             for mounted in by_channel.values()
         }
@@ -242,34 +244,36 @@ class _Import:
                 "different positions of channels (all channels have the same position)"
             )
         trajectory.rows[:, 1:4] += min(positions, default=(0, 0, 0))
-        for stretch in trajectory.stretches:
-            if not stretch.active:
+        for segment in trajectory.segments:
+            if not segment.active:
                 continue
-            for channel, mounted in devices[stretch.leg].items():
-                name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
-                self._sensors[name] = self._sensor(mounted, stretch, mount_rotation)
+            for channel, mounted in devices[segment.leg].items():
+                name = f"leg{segment.leg}" + (f"-{channel}" if channel else "")
+                self._sensors[name] = self._sensor(mounted, segment, mount_rotation)
 
-    def _sensor(self, mounted: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
-        """Return the entry of `sensors` for a device on a stretch, rotated by its mount (3, 3)."""
-        step_deg, steps = mounted.steps(stretch.seconds)
+    def _sensor(self, mounted: Device, segment: LegSegment, mount: Floats) -> dict[str, Any]:
+        """Return the `sensors` entry for a device during a segment.
+
+        `mount` is the rotation (3, 3) of its mount.
+        """
+        step_deg, steps = mounted.steps(segment.seconds)
         min_range_m, max_range_m = mounted.range_m
         pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
-        angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+        angles = {
+            name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")
+        }
         return {
             "model": self._file_of(mounted.data),
             "step_deg": step_deg,
-            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": clean(max_range_m)} if np.isfinite(max_range_m) else {}),
+            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": rounded(max_range_m)} if np.isfinite(max_range_m) else {}),
             "mount": {name: angle for name, angle in angles.items() if angle},
-            "start_s": clean(stretch.start_s),
+            "start_s": rounded(segment.start_s),
             "steps": steps,
         }
 
     def _file_of(self, data: dict[str, Any]) -> str:
-        """Return the name of a sensor's file.
-
-        Equal sensors share a file.
-        """
+        """Return the name of a sensor's data file, which identical sensors share."""
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
         name = f"{stem}.yaml"
         number = 1
@@ -279,7 +283,7 @@ class _Import:
         return name
 
     def files(self, folder: Path) -> dict[str, str]:
-        """Return the text files for the folder: {name: text}."""
+        """Return the text files for the folder by name."""
         trajectory, files = self._trajectory.section_and_files()
         light, range_m = self._light()
         names = [
@@ -300,14 +304,14 @@ class _Import:
         }
         head = [
             f"Created from the HELIOS++ survey {self._name!r} by lidarpool import.",
-            *(f"Not supported: {line}." for line in self.left_out),
+            *(f"Not supported: {line}." for line in self.unsupported),
         ]
         text = "".join(f"# {line}\n" for line in head) + _dumped(data)
         sensors = {name: _dumped(sensor) for name, sensor in self._files.items()}
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """Return the FWFSettings of the scanner, after the settings of the survey."""
+        """Return the FWFSettings of the scanner, overridden by those of the survey."""
         elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
         settings: dict[str, str] = {}
         for element in elements:
@@ -316,7 +320,7 @@ class _Import:
         return settings
 
     def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
-        """Return sections on light, and ranges that the survey sets for its scanner."""
+        """Return the sections that concern light, and the ranges that the survey sets."""
         scanner = self._first
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
@@ -326,18 +330,18 @@ class _Import:
                 waveform_settings, scanner.number("maxNOR"), scanner.number("pulseLength_ns", 4)
             ),
             "noise": {
-                "range_m": clean(
-                    number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
+                "range_m": rounded(
+                    read_number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
                 )
             },
-            # HELIOS++ has the visibility at a contrast of 2 %.
+            # HELIOS++ defines visibility at a contrast of 2 %.
             "weather": {
-                "visibility_km": clean(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
+                "visibility_km": rounded(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
             },
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
         return sections, {
-            field: number(detector_settings, name, 0)
+            field: read_number(detector_settings, name, 0)
             for field, name in ranges.items()
             if name in detector_settings
         }
@@ -346,8 +350,8 @@ class _Import:
 def returns_section(
     settings: dict[str, str], max_returns: float, pulse_ns: float
 ) -> dict[str, Any]:
-    """Return the section `returns` by FWFSettings, maxNOR and the length of a pulse."""
-    quality = number(settings, "beamSampleQuality", 3.0)
+    """Return the `returns` section for FWFSettings, maxNOR, and the pulse length."""
+    quality = read_number(settings, "beamSampleQuality", 3.0)
     return {
         "mode": "first" if max_returns == 1 else "all",
         "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
@@ -356,17 +360,15 @@ def returns_section(
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
-    """Return the fields of `returns` by FWFSettings.
+    """Return the waveform fields of `returns`, or none without waveform settings.
 
-    There are none without settings of waveforms.
-
-    The time of HELIOS++ is range over the speed of light: half of the time that light takes to a
-    surface and back.
+    Times in HELIOS++ are range divided by the speed of light, which is half of the time that light
+    takes to a surface and back.
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}
-    sample_ns = 2 * number(settings, "binSize_ns", 0.25)
-    return {"waveform": "peaks", "sample_ns": clean(min(sample_ns, pulse_ns / 2))}
+    sample_ns = 2 * read_number(settings, "binSize_ns", 0.25)
+    return {"waveform": "peaks", "sample_ns": rounded(min(sample_ns, pulse_ns / 2))}
 
 
 def _dumped(data: dict[str, Any]) -> str:

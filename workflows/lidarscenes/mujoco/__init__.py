@@ -1,1 +1,1 @@
-"""Models of MuJoCo, .xml of MJCF, as scenes, and their rangefinders as sensors."""
+"""Read MuJoCo models (MJCF) as scenes, and their rangefinders as sensors."""

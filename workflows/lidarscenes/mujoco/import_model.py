@@ -1,7 +1,7 @@
-"""Models of MuJoCo as scenarios: their rangefinders are sensors, on one carrier that stands.
+"""Convert MuJoCo models to scenarios, with rangefinders as sensors on a stationary platform.
 
-The rangefinders of all sites of a body are the beams of one sensor. The rangefinders of a camera
-are the beams of another sensor. After
+The rangefinders at all sites of a body are the beams of a sensor. The rangefinders of a camera are
+the beams of another sensor. The reader follows
 https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
 """
 
@@ -19,25 +19,25 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import arctan2, cos, sin
 from lidarsim.base.errors import LidarError, explained, unreadable
 from lidarsim.base.input_files import read_input
-from lidarsim.base.vectors import length, turned
+from lidarsim.base.vectors import norm, rotate
 from lidarsim.base.words import printable
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
 from lidarsim.worlds.mujoco_bodies import Choice, names_of, seen_geoms
 
-from ..writers.lidar_scenario import Lidar, clean, write_scenario
-from .model_file import MujocoOptions, body_matrix, load_model, objects_of_bodies
+from ..writers.lidar_scenario import Lidar, rounded, write_scenario
+from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
 _ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC, of cam_projection
-_MAX_RAYS = 65_536  # rays of a camera
+_MAX_RAYS = 65_536  # maximum number of rays of a camera
 _MAX_RATE_HZ = 1e6
 
 
 class _Group(NamedTuple):
-    """Rangefinders that are the beams of a sensor."""
+    """Rangefinders that become the beams of a sensor."""
 
     body: int  # body that carries the rangefinders
     camera: int | None  # camera of the beams; None for beams of sites
@@ -47,34 +47,34 @@ class _Group(NamedTuple):
 
 
 def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a model as a scenario into a folder: `scenario.yaml`, and a data file of each sensor.
+    """Write a model as a scenario: `scenario.yaml`, and a data file for each sensor.
 
     Parameters
     ----------
     path
-        An .xml of MuJoCo with rangefinders.
+        A MuJoCo .xml file with rangefinders.
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
-        A folder besides the model's whose files may be read.
+        At most one additional folder whose files may be read.
 
     Returns
     -------
-    What is not as in MuJoCo, a line each.
+    Differences from MuJoCo, one line each.
 
     Raises
     ------
     LidarError
-        If the model cannot be read, or has no rangefinder.
+        If the model cannot be read or has no rangefinder.
     """
     if len(assets) > 1:
         raise LidarError("it is a MuJoCo model, for which only one `--assets` folder is allowed.")
     model = _loaded(path, assets)
     groups = _groups(model)
-    left_out = _differences(model, groups)
+    unsupported = _differences(model, groups)
     groups = {group: sites for group, sites in groups.items() if not _unusable(model, group.camera)}
     if not groups:
-        reason = "".join(f" Not supported: {line}." for line in left_out)
+        reason = "".join(f" Not supported: {line}." for line in unsupported)
         raise LidarError(
             "it has no rangefinder that can become a sensor. To use another sensor, create a "
             f"scenario with `lidarpool init --mesh {path.name}`.{reason}"
@@ -86,7 +86,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     ]
     entry: dict[str, Any] = {"file": path, **({"assets": assets[0]} if assets else {})}
     carriers = [body for body in dict.fromkeys(group.body for group in groups) if body]
-    objects = objects_of_bodies(model, _options(path, assets)) if len(carriers) > 1 else {}
+    objects = body_object_names(model, _options(path, assets)) if len(carriers) > 1 else {}
     lidars = [
         lidar._replace(unseen=(escape(objects[group.body]),)) if group.body in objects else lidar
         for lidar, group in zip(lidars, groups, strict=True)
@@ -94,17 +94,17 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     if excluded := [body for body in carriers if body not in objects]:
         bodies = names_of(model, "body")
         entry["exclude"] = [bodies[body] for body in excluded]
-    return write_scenario(folder, "MuJoCo", entry, lidars, {}, left_out)
+    return write_scenario(folder, "MuJoCo", entry, lidars, {}, unsupported)
 
 
 def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
-    """Return the options of reading a model without its images."""
+    """Return options for reading a model without its images."""
     folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
     return ReadOptions(masks=False, colors=False, folders=folders, own=MujocoOptions())
 
 
 def _loaded(path: Path, assets: Sequence[Path]) -> Any:
-    """Return the arrays of a model.
+    """Load the arrays of a model.
 
     Raises LidarError if the file cannot be read.
     """
@@ -119,7 +119,7 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
 
 
 def _groups(model: Any) -> dict[_Group, list[int]]:
-    """Return the rangefinders as groups, each with the numbers of its sites."""
+    """Group the rangefinders, and return the sites of each group."""
     groups: dict[_Group, list[int]] = {}
     for sensor in np.flatnonzero(model.sensor_type == _RANGEFINDER).tolist():
         number = int(model.sensor_objid[sensor])
@@ -137,7 +137,7 @@ def _groups(model: Any) -> dict[_Group, list[int]]:
 
 
 def _rate_hz(model: Any, sensor: int) -> float:
-    """Return how often a sensor measures: at its interval, else at each step of the model."""
+    """Return the measurement rate of a sensor: its own, or that of the simulation steps."""
     intervals = getattr(model, "sensor_interval", None)  # since MuJoCo 4
     interval_s = 0.0 if intervals is None else float(np.atleast_1d(intervals[sensor])[0])
     interval_s = interval_s if interval_s > 0 else model.timestep_s
@@ -145,18 +145,18 @@ def _rate_hz(model: Any, sensor: int) -> float:
 
 
 def _name(model: Any, group: _Group) -> str:
-    """Return the name of a sensor: the name of its camera, else of its body."""
+    """Return the name of a sensor, which is the name of its camera or its body."""
     if group.camera is not None:
         return printable(names_of(model, "cam")[group.camera])
     return printable(names_of(model, "body")[group.body])
 
 
 def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
-    """Return the sensor of a group of rangefinders."""
+    """Convert a group of rangefinders to a sensor."""
     matrix, origins, directions = _beams(model, group, sites)
     x, y, z = directions.T
-    elevations_deg = np.array(_degrees(arctan2(z, length(directions[:, :2]))))
-    order = np.argsort(elevations_deg, kind="stable")  # order of the channels, as in any sensor
+    elevations_deg = np.array(_degrees(arctan2(z, norm(directions[:, :2]))))
+    order = np.argsort(elevations_deg, kind="stable")  # channels are ordered by elevation
     origins = origins[order]
     beams: dict[str, Any] = {
         "elevation_deg": elevations_deg[order].tolist(),
@@ -165,16 +165,16 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     site_names = names_of(model, "site")
     channels = ", ".join(printable(site_names[sites[row]]) for row in order) if sites else ""
     if origins.any():
-        beams["origin_m"] = [[clean(value) for value in origin] for origin in origins.tolist()]
+        beams["origin_m"] = [[rounded(value) for value in origin] for origin in origins.tolist()]
     data: dict[str, Any] = {
         "name": f"{name} of MuJoCo",
         "sources": {"channels": f"rangefinders of {channels or 'the pixels, lowest first'}"},
-        "rate_hz": clean(group.rate_hz),
+        "rate_hz": rounded(group.rate_hz),
         "firings_per_turn": 1,
         "beams": beams,
     }
     if group.noise_m > 0:
-        data["performance"] = {"range_m": clean(group.noise_m)}
+        data["performance"] = {"range_m": rounded(group.noise_m)}
     root = int(model.body_rootid[group.body])
     return Lidar(
         name=name,
@@ -188,10 +188,10 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
 
 
 def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats, Floats]:
-    """Return the frame of a sensor in the world (4, 4), and origins and directions in it (k, 3).
+    """Return the frame (4, 4) of a sensor in the world, and its beam origins and directions (k, 3).
 
-    The frame of sites has the axes of the body, with their mean position as its origin. The frame
-    of a camera looks along x, with z up in the image.
+    For sites, the frame has the axes of the body, and its origin is the mean position of the sites.
+    For a camera, the frame looks along x, with z pointing up in the image.
     """
     if group.camera is not None:
         axes = model.cam_xmat[group.camera].reshape(3, 3)
@@ -205,18 +205,18 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
     directions = model.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
     return (
         affine(axes, center),
-        turned(positions - center, axes.T),
-        turned(directions, axes.T),
+        rotate(positions - center, axes.T),
+        rotate(directions, axes.T),
     )
 
 
 def _pixel_directions(model: Any, camera: int) -> Floats:
-    """Return the directions of the rays of a camera, row by row (pixels, 3): x ahead, z up."""
+    """Return the ray directions (pixels, 3) of a camera, row by row, with x forward and z up."""
     width, height = model.cam_resolution[camera].tolist()
     sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
     row, column = np.divmod(np.arange(width * height), width)
     if sensor_m[1] > 0:
-        # The rays of MuJoCo 4.0 take the principal point from the upper left corner.
+        # MuJoCo 4.0 measures the principal point from the upper left corner.
         focal_x, focal_y, principal_x, principal_y = model.cam_intrinsic[camera].tolist()
         right = ((column + 0.5) / width * sensor_m[0] - principal_x) / focal_x
         down = ((row + 0.5) / height * sensor_m[1] - principal_y) / focal_y
@@ -226,16 +226,16 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
         right = (column + 0.5 - width / 2) / focal
         down = (row + 0.5 - height / 2) / focal
     directions = np.stack([np.ones(len(row)), -right, -down], axis=1)
-    return np.asarray(directions / length(directions)[:, None])
+    return np.asarray(directions / norm(directions)[:, None])
 
 
 def _degrees(angles: Floats) -> list[float]:
-    """Return angles as numbers for a file, degrees."""
-    return [clean(angle) for angle in np.degrees(angles).tolist()]
+    """Return angles in degrees, rounded for a file."""
+    return [rounded(angle) for angle in np.degrees(angles).tolist()]
 
 
 def _unusable(model: Any, camera: int | None) -> str:
-    """Return why the rays of a camera do not become a sensor, or empty."""
+    """Return why a camera cannot become a sensor, or an empty string."""
     if camera is None:
         return ""
     projections = getattr(model, "cam_projection", None)
@@ -246,7 +246,7 @@ def _unusable(model: Any, camera: int | None) -> str:
 
 
 def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
-    """Return what is not as in MuJoCo, a clause each."""
+    """Describe the differences from MuJoCo, one clause each."""
     lines = [
         f"the rangefinder of {_name(model, group)!r} ({reason})"
         for group in groups

@@ -1,8 +1,8 @@
-"""Reads a model of MuJoCo in a process that `model_file.py` starts: a script, not a module.
+"""Read a MuJoCo model in the process that `model_file.py` starts; this is a script, not a module.
 
-Broken files can end the process, and some models take any memory; here both end this process only.
-The script imports nothing of lidarpool. Standard output gets one frame: a line of JSON, and the
-bytes of the arrays of the model at its initial state, named by `names` of the line.
+Invalid files can crash the process, and some models need unlimited memory. Here, this affects only
+this process. The script imports nothing from lidarpool. It writes one frame to standard output: a
+line of JSON, followed by the bytes of the arrays that the line lists.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_WAIT_S = 120  # broken files may take for ever
+MAX_WAIT_S = 120  # invalid files may never finish
 
-# Memory for simulating. Each ray of a camera takes 24 bytes.
+# Memory for the simulation. Each ray of a camera needs 24 bytes.
 _ARENA_BYTES = 128 * 2**20
 
-# Prefixes of the names of arrays, and the names after the prefix.
+# Prefixes of array names, and the names that follow each prefix.
 _OF_MODEL = {
     "name": ("s", "_bodyadr", "_geomadr", "_matadr", "_siteadr", "_camadr"),
     "body": ("_parentid", "_rootid", "_weldid", "_mocapid", "_pos", "_quat"),
@@ -42,7 +42,7 @@ _OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
 class NoKeyframeError(Exception):
     """The model lacks a keyframe.
 
-    The argument of the error has the names of its keyframes.
+    The argument of the error is the list of the existing keyframes.
     """
 
 
@@ -51,13 +51,14 @@ def main(path: str, request: dict[str, Any]) -> None:
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     warnings: list[str] = []
-    mujoco.set_mju_user_warning(warnings.append)  # else into a file of the working directory
+    # By default, MuJoCo writes warnings to a file in the working directory.
+    mujoco.set_mju_user_warning(warnings.append)
     frame: dict[str, Any]
     arrays: list[NDArray[Any]] = []
     try:
         model, data = _state(path, request["keyframe"])
         names = [prefix + name for prefix, rest in _OF_MODEL.items() for name in rest]
-        # Older versions lack some.
+        # Older versions of MuJoCo lack some fields.
         fields = {name: getattr(model, name) for name in names if hasattr(model, name)}
         if not request["colors"]:
             fields["tex_data"] = fields["tex_data"][:0]
@@ -75,10 +76,10 @@ def main(path: str, request: dict[str, Any]) -> None:
         arrays = [np.ascontiguousarray(array) for array in fields.values()]
     except NoKeyframeError as error:
         frame = {"what": "keyframes", "names": error.args[0][:1000]}
-    except Exception as error:  # readers of broken files raise errors of any type
+    except Exception as error:  # MuJoCo raises errors of any type
         reason = " ".join(str(error).split())
         frame = {"what": "error", "reason": reason.replace(os.path.dirname(path) + "/", "")}  # noqa: PTH120
-    signal.alarm(0)  # who reads this may take long
+    signal.alarm(0)  # the receiving process may take long
     frame["arrays"] = [(array.dtype.str, array.shape) for array in arrays]
     output.write(json.dumps(frame).encode() + b"\n")
     for array in arrays:
@@ -87,7 +88,7 @@ def main(path: str, request: dict[str, Any]) -> None:
 
 
 def _state(path: str, keyframe: str | None) -> tuple[Any, Any]:
-    """Return the model of a file, and its data at the reference pose or at a keyframe."""
+    """Return the model in a file, and its data at the reference pose or at a keyframe."""
     spec = mujoco.MjSpec.from_file(path)
     spec.memory = _ARENA_BYTES
     spec.nstack = -1  # old files have sizes that conflict with the memory

@@ -1,7 +1,7 @@
-"""Models of MuJoCo, .xml of MJCF, as scenes: the geoms that a lidar sees, at the initial state.
+"""Read MuJoCo models (MJCF) as scenes of the geoms that a lidar sees in the initial state.
 
-MuJoCo itself (Apache-2.0) reads the files, in a separate process: `model_child.py`. Geoms become
-meshes as for `lidarsim.worlds.MujocoScanner`.
+MuJoCo itself (Apache-2.0) reads the files in a separate process; see `model_child.py`. Geoms are
+converted to meshes as in `lidarsim.worlds.MujocoScanner`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.declared import Several, Text, about
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import listed, name_hint, printable
 from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
@@ -47,22 +46,21 @@ from lidarsim.worlds.mujoco_bodies import (
 )
 from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, segments
 
-from ..files.child_process import Child
+from ..files.child_process import ReaderProcess
 from .model_sources import check_sources
 
-MUJOCO_BYTES = 512 * 2**20  # bytes that MuJoCo takes for any file
+MUJOCO_BYTES = 512 * 2**20  # memory that MuJoCo needs for any file
 _ADVICE = "simplify its meshes, or divide the model"
-# Half of the side of planes without a size: at least meters, and as a multiple of the model's size.
+# Half the side of planes without a size: a minimum in meters, and a multiple of the model's size.
 _MIN_PLANE_M = 200.0
 _PLANE_SIZES = 5.0
-_MAX_ROUND_TRIANGLES = 4_000_000  # triangles of balls, ellipsoids, capsules and cylinders in all
+_MAX_ROUND_TRIANGLES = 4_000_000  # total for spheres, ellipsoids, capsules, and cylinders
 _MAX_SAG_M = 1.0
 
 
 @dataclass(frozen=True)
-@checked_fields
 class MujocoOptions:
-    """Options of models of MuJoCo."""
+    """Options for reading MuJoCo models."""
 
     keyframe: Annotated[
         Text | None,
@@ -78,9 +76,9 @@ class MujocoOptions:
 
 
 def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the geoms of a model at its initial state, as objects of its bodies.
+    """Read the geoms of a model in its initial state, with an object for each body.
 
-    Geoms of the world itself are separate objects if they have names.
+    Named geoms of the world body are separate objects.
     """
     model = load_model(data, path, options)
     content = placed_content(_placed(model, options))
@@ -97,14 +95,14 @@ def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace:
-    """Return the arrays of a model and of its initial state, by the names of MuJoCo.
+    """Return the arrays of a model and of its initial state, by their MuJoCo names.
 
     Raises
     ------
     ValueError
         If MuJoCo refuses the model.
     LidarError, MeshFileError
-        If MuJoCo is not installed, the file is not a model, or takes too much memory.
+        If MuJoCo is not installed, or the file is not a model or needs too much memory.
     """
     allowance = Allowance(0, _ADVICE)
     check_sources(data, path, options, allowance)
@@ -113,15 +111,15 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         raise MeshFileError(
             f"is a MuJoCo model, which requires the package mujoco. Install it with `{command}`"
         )
-    if sys.platform == "win32":  # where a process has no limits of memory
+    if sys.platform == "win32":  # memory limits of processes are not supported
         raise MeshFileError("is a MuJoCo model, which is not supported on Windows")
     request = {"keyframe": options.own.keyframe, "colors": options.colors}
     with TemporaryDirectory() as folder:
-        child = Child(
+        child = ReaderProcess(
             Path(__file__).with_name("model_child.py"),
             "MuJoCo",
             allowance.limit + MUJOCO_BYTES,
-            Path(folder),  # MuJoCo writes a log into it
+            Path(folder),  # MuJoCo writes a log file to it
             hidden=("MUJOCO_",),
         )
         frames = child.frames(path, request, lambda _, size: allowance.take(size))
@@ -132,21 +130,21 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         hint = name_hint(keyframe, frame["names"])
         raise LidarError(f"the model has no keyframe {keyframe!r}.{hint}")
     fields = dict(zip(frame.pop("names"), arrays, strict=True))
-    if not options.colors:  # without the pixels of textures
+    if not options.colors:  # the pixels of textures were not read
         fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)
     return SimpleNamespace(**frame, **fields)
 
 
-def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
-    """Return the names of the objects of a model's bodies in its scene: {body: name}.
+def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
+    """Return the names of the scene objects that correspond to the bodies of a model.
 
-    Bodies without an object, and the world itself, are missing.
+    Bodies without an object, and the world body, are missing.
     """
     bodies, geoms = excluded(model, options.own.exclude)
     seen = seen_geoms(model, _choice(model, options.own, bodies, geoms))
     content = placed_content(_placed(model, options))
     names = [printable(item.name) for item in content.meshes]
-    # The last object of a name is a body's: geoms of the world come first.
+    # If names repeat, the last object belongs to the body, because geoms of the world come first.
     unique = dict(zip(names, unique_names(names), strict=True))
     body_names = [printable(name) for name in names_of(model, "body")]
     with_geoms = {int(body) for body in np.asarray(model.geom_bodyid)[seen]} - {0}
@@ -154,7 +152,7 @@ def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
 
 
 def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
-    """Return the meshes of the bodies of a model, at the poses of its initial state."""
+    """Return the meshes of the bodies of a model, at their poses in the initial state."""
     bodies, geoms = excluded(model, options.own.exclude)
     choice = _choice(model, options.own, bodies, geoms)
     named = _named_geoms_of_world(model)
@@ -180,9 +178,9 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
 
 
 def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]) -> Choice:
-    """Return what is seen of a model.
+    """Return which parts of a model are visible.
 
-    Raises MeshFileError for too many geoms.
+    Raises MeshFileError if there are too many geoms.
     """
     plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
     choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)
@@ -195,7 +193,7 @@ def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[i
 
 
 def _sag_m(model: Any, geoms: Ints) -> float:
-    """Return the sag of round geoms, larger for many of them, meters."""
+    """Return the sag of round geoms in meters, which is larger if there are many of them."""
     kinds = np.column_stack([model.geom_type[geoms], model.geom_size[geoms]])
     shapes, counts = np.unique(kinds, axis=0, return_counts=True)
     sag_m = SAG_M
@@ -211,7 +209,7 @@ def _sag_m(model: Any, geoms: Ints) -> float:
 
 
 def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
-    """Return the number of triangles of a round geom, or 0 of other geoms."""
+    """Return the number of triangles of a round geom, or 0 for other geoms."""
     match kind:
         case GeomType.SPHERE | GeomType.CAPSULE | GeomType.ELLIPSOID:
             radius = float(size.max() if kind == GeomType.ELLIPSOID else size[0])
@@ -222,7 +220,7 @@ def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
 
 
 def _named_geoms_of_world(model: Any) -> list[int]:
-    """Return the numbers of the geoms of the world itself that have a name."""
+    """Return the indices of the named geoms of the world body."""
     names = names_of(model, "geom")
     return [
         geom
@@ -232,12 +230,12 @@ def _named_geoms_of_world(model: Any) -> list[int]:
 
 
 def body_matrix(model: Any, body: int) -> Floats:
-    """Return the matrix from the frame of a body to the world, (4, 4)."""
+    """Return the matrix (4, 4) from the frame of a body to the world."""
     return affine(model.xmat[body].reshape(3, 3), model.xpos[body])
 
 
 def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
-    """Return a mesh with the colors and materials that are asked for."""
+    """Remove colors and materials that are not requested from a mesh."""
     return replace(
         mesh,
         colors=mesh.colors if options.colors else None,
@@ -246,7 +244,7 @@ def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
 
 
 def _notes(model: Any, options: ReadOptions) -> list[str]:
-    """Return notes on what is not in the scene, as clauses that follow the file's name."""
+    """Return notes on content that is not in the scene, as clauses that follow the file name."""
     notes = (
         [f"contains soft bodies, which were skipped: {soft}"]
         if (soft := soft_bodies(model))

@@ -1,7 +1,7 @@
-"""Files of a model of MuJoCo: included files, files of meshes, and files of textures.
+"""Check the files that a MuJoCo model refers to: included models, meshes, and textures.
 
-MuJoCo opens these files itself. The files are looked up here first, so that a model takes data from
-its own folder and from named folders only.
+MuJoCo opens these files itself. They are checked here first, so that a model reads data only from
+its own folder and from folders that the user allows.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from lidarsim.base.input_files import check_input, read_input
 from lidarsim.scene.files.companions import outside
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 
-from ..files.lenient_xml import lenient_root
+from ..files.lenient_xml import parse_lenient_xml
 
 ROOT = "mujoco"
 _INCLUDED_ROOTS = (ROOT, "mujocoinclude")
-_OF_XML = ("include", "model")  # elements that name further files of MJCF
+_OF_XML = ("include", "model")  # elements that refer to other MJCF files
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 _MAX_FILES = 20_000
 _OTHER_ROOTS = {  # {root element of other XML files: advice}
@@ -33,18 +33,18 @@ _OTHER_ROOTS = {  # {root element of other XML files: advice}
 
 
 def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allowance) -> None:
-    """Check that a file is a model of MuJoCo, and that its files may be read.
+    """Check that a file is a MuJoCo model, and that the files it refers to may be read.
 
-    The sizes of all files are added to the allowance. Missing files are left to MuJoCo.
+    The sizes of all files are added to the allowance. Missing files are reported by MuJoCo later.
 
     Raises
     ------
     ValueError
         If a file is not XML.
     MeshFileError
-        If a file is not a model of MuJoCo, or a file is in a folder that is not allowed.
+        If a file is not a MuJoCo model, or is in a folder that is not allowed.
     """
-    root = lenient_root(data)
+    root = parse_lenient_xml(data)
     if root.tag != ROOT:
         advice = "is an XML file, but not a MuJoCo model. Its root element is <{}>"
         raise MeshFileError(_OTHER_ROOTS.get(root.tag, advice.format(root.tag[:40])))
@@ -74,13 +74,13 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
 
 
 def _count(count: int) -> None:
-    """Raise MeshFileError if a model names too many files."""
+    """Raise MeshFileError if a model refers to too many files."""
     if count > _MAX_FILES:
         raise MeshFileError(f"refers to more than {_MAX_FILES:,} files. Divide the model")
 
 
 def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the names of the files that elements name, or only elements with `tags`."""
+    """Yield the names of the files that elements refer to, optionally only elements with `tags`."""
     for element in root.iter():
         if not tags or element.tag in tags:
             for attribute, name in element.items():
@@ -89,9 +89,9 @@ def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
 
 
 def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Path]:
-    """Yield the existing files that a name may mean in some folders.
+    """Yield the existing files that a name may refer to in several folders.
 
-    MeshFileError for a file in a folder that is not allowed.
+    Raises MeshFileError if a file is in a folder that is not allowed.
     """
     names = {name, name.replace("\\", "/"), name.replace("\\", "/").rpartition("/")[2]}
     for folder in folders:
@@ -111,10 +111,10 @@ def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Pa
 def _included_root(file: Path) -> Element:
     """Return the root element of an included file.
 
-    Raises ValueError if it is not XML.
+    Raises ValueError if it is not an MJCF file.
     """
     try:
-        root = lenient_root(read_input(file))
+        root = parse_lenient_xml(read_input(file))
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from error
     if root.tag not in _INCLUDED_ROOTS:

@@ -1,1 +1,1 @@
-"""Generated scenes: cities, terrain with forests, cars."""
+"""Generate scenes such as cities and terrain, with trees and cars."""

@@ -1,4 +1,4 @@
-"""Cars of a few hundred triangles: a body with recessed windows on four wheels."""
+"""Generate cars with a few hundred triangles: a body with recessed windows on four wheels."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import numpy as np
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
-from .city_kinds import loft, lying, regular
+from .city_kinds import lay_down, loft, regular_polygon
 
 _RECESS_M = 0.03  # depth of a window
-_FRAME = 0.12  # share of a window's width that is frame
+_FRAME = 0.12  # width of the frame as a share of the window
 
 
 @dataclass(frozen=True)
-class Model:
-    """Outline of a car that faces x, from the front to the back, meters.
+class CarModel:
+    """The outline of a car that faces x, from front to back, in meters.
 
-    A station is (x, half width, height of the belt line, height of the roof); without a cabin the
-    two heights are nearly the same. Windows are beside and between the stations of the cabin.
+    Each station is (x, half width, height of the beltline, height of the roof). Without a cabin,
+    the two heights are nearly equal. Windows are beside and between the stations of the cabin.
     """
 
     name: str
     stations: tuple[tuple[float, float, float, float], ...]
-    glazed: range  # stations after which there are windows
+    glazed: range  # stations that are followed by windows
     axles: tuple[float, float]
     wheel_m: float = 0.33  # radius
 
 
 MODELS = (
-    Model(
+    CarModel(
         "Saloon",
         (
             (2.28, 0.62, 0.6, 0.62), (2.1, 0.82, 0.72, 0.76), (1.0, 0.89, 0.88, 0.94),
@@ -41,7 +41,7 @@ MODELS = (
         range(2, 6),
         (1.4, -1.35),
     ),
-    Model(
+    CarModel(
         "Estate",
         (
             (2.3, 0.62, 0.6, 0.62), (2.12, 0.83, 0.74, 0.78), (1.05, 0.9, 0.9, 0.96),
@@ -51,7 +51,7 @@ MODELS = (
         range(2, 7),
         (1.42, -1.4),
     ),
-    Model(
+    CarModel(
         "Panel van",
         (
             (2.48, 0.7, 0.7, 0.72), (2.35, 0.9, 0.95, 1.0), (1.75, 0.96, 1.12, 1.2),
@@ -65,8 +65,8 @@ MODELS = (
 )  # fmt: skip
 
 
-def car(model: Model) -> SceneMesh:
-    """Return a car that stands on z = 0 around the origin.
+def car(model: CarModel) -> SceneMesh:
+    """Return a car that stands on z = 0, centered at the origin.
 
     Examples
     --------
@@ -74,10 +74,12 @@ def car(model: Model) -> SceneMesh:
     >>> saloon.name, 400 < len(saloon.faces) < 800
     ('Saloon', True)
     """
-    wheel = loft(regular(12, model.wheel_m), [(-0.11, 0.03), (-0.08, 0), (0.08, 0), (0.11, 0.03)])
+    wheel = loft(
+        regular_polygon(12, model.wheel_m), [(-0.11, 0.03), (-0.08, 0), (0.08, 0), (0.11, 0.03)]
+    )
     track = max(half for _, half, _, _ in model.stations) - 0.1
     down = -wheel.vertices[:, 1].min()
-    wheels = [lying(wheel).moved(x, y, down) for x in model.axles for y in (-track, track)]
+    wheels = [lay_down(wheel).translated(x, y, down) for x in model.axles for y in (-track, track)]
     return SceneMesh(model.name, *stacked([_body(model), *wheels]))
 
 
@@ -86,8 +88,11 @@ def all_cars() -> tuple[SceneMesh, ...]:
     return tuple(car(model) for model in MODELS)
 
 
-def _body(model: Model) -> tuple[Floats, Ints]:
-    """Return vertices and faces of a body: rings of eight corners, joined by quadrangles."""
+def _body(model: CarModel) -> tuple[Floats, Ints]:
+    """Return the vertices and faces of a car body.
+
+    The body consists of rings with eight corners each, connected by quadrilaterals.
+    """
     rings = []
     for x, half, belt, roof in model.stations:
         top = half * (0.74 if roof - belt > 0.2 else 0.86)
@@ -100,7 +105,8 @@ def _body(model: Model) -> tuple[Floats, Ints]:
         for side in range(8):
             next_side = (side + 1) % 8
             quad = ring[[k, k + 1, k + 1, k], [next_side, next_side, side, side]]
-            # 2 and 4 are beside the belt line, 3 is the roof, or a windscreen if it slopes.
+            # Sides 2 and 4 are above the beltline. Side 3 is the roof or, if it slopes, a
+            # windshield.
             slopes = abs(ring[k, 3, 2] - ring[k + 1, 3, 2]) > 0.25
             glass = k in model.glazed and (side in (2, 4) or (side == 3 and slopes))
             quads += _window(quad) if glass else [quad]
@@ -112,7 +118,7 @@ def _body(model: Model) -> tuple[Floats, Ints]:
 
 
 def _window(quad: Floats) -> list[Floats]:
-    """Return the quadrangles of a window: a pane, the sides of its recess, and a frame."""
+    """Return the quadrilaterals of a window: a pane, the sides of its recess, and a frame."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
     hole = quad + _FRAME * (middle - quad)

@@ -1,20 +1,20 @@
-"""A generated city of any size: streets, houses, towers, trees, cars, lamps.
+"""Generate a city of any size, with streets, houses, towers, trees, cars, and street lamps.
 
-Streets run along x and y, and two streets cross at (0, 0). Blocks between streets are divided into
-lots, two rows back to back; lots near the center have more towers. Objects are made for all blocks
-at once, by arrays, so that ten million triangles take a few seconds more than a thousand.
+Streets run along x and y, and two streets cross at (0, 0). The blocks between streets are divided
+into lots in two rows, back to back. Lots near the center have more towers. The objects of all
+blocks are created at once with array operations, so ten million triangles take only a few seconds
+longer than a thousand.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.arrays import AnyArray, Floats, Ints
+from lidarsim.base.checks import check_fits, check_number
 from lidarsim.base.declared import Seed
-from lidarsim.base.validation import checked
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 
@@ -24,7 +24,7 @@ from .city_kinds import Solid
 from .plants import MAX_TREES
 from .terrain import grid_faces
 
-# A row for each object: position and size; `block` is counted from the center.
+# A row for each object. Blocks are numbered from the center.
 _OBJECT = np.dtype({
     "names": ["kind", "owner", "block", "place", "yaw", "scale"],
     "formats": ["i8", "i8", "i8", "3f8", "f8", "3f8"],
@@ -33,49 +33,49 @@ _OBJECT = np.dtype({
 CLASSES = ("pavement", "building", "tree", "car", "lamp")
 PAVEMENT, BUILDING, TREE, CAR, LAMP = range(len(CLASSES))
 
-_GROUND_SHARE = 0.03  # minimum share of the triangles
+_GROUND_SHARE = 0.03  # minimum share of the triangles that are used for the ground
 _MARGIN_M = 12.0
 _STREET_M = 13.0
 _AVENUE_M = 24.0
 _AVENUE_EVERY = 4
 _BLOCK_M = ((60.0, 100.0), (46.0, 62.0))  # along x, along y
 _PAVEMENT_M = 3.5  # width
-_KERB_M = 0.15  # height
+_CURB_M = 0.15  # height of the pavement
 _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
 
-@checked
 def city(
-    triangles: Annotated[int, Field(ge=1_000, le=100_000_000)] = 100_000,
-    seed: Seed = 0,
-    trees: Annotated[int, Field(ge=0, le=MAX_TREES)] = 0,
-    cars: Annotated[int, Field(ge=0, le=MAX_CARS)] = 0,
+    triangles: int = 100_000,
+    seed: int = 0,
+    trees: int = 0,
+    cars: int = 0,
 ) -> Scene:
-    """Return a city of a number of triangles: more triangles make the city larger, not finer.
+    """Return a city with a given number of triangles.
 
-    There is a crossing at (0, 0), where a sensor may stand. The ground, at z = 0, is an object, the
-    pavement of all blocks too, and each building, tree, car and lamp: building-12, tree-7, counted
-    from the center.
+    More triangles make the city larger, not finer. There is a crossing at (0, 0), where a sensor
+    may stand. The ground at z = 0 is an object, and so is the pavement of all blocks. Each
+    building, tree, car, and street lamp is an object with a number counted from the center, such as
+    building-12.
 
     Parameters
     ----------
     triangles
         Number of triangles; the scene has up to 2 % fewer.
     seed
-        The same seed and number give the same city.
+        Seed of the random generator. The same arguments always result in the same city.
     trees
-        Number of trees with branches and leaves in place of simple trees: instances of a mesh for
-        each of `SPECIES` in plants.py, at streets, in yards and in parks. Ground, buildings and
-        lamps stay the same.
+        Number of trees with branches and leaves. They replace the simple trees, and are instances
+        of the `SPECIES` in plants.py along streets, in yards, and in parks. The ground, buildings,
+        and lamps stay the same.
     cars
-        Number of cars with windows and wheels in place of simple cars: instances of a mesh for each
-        of `lidarscenes.procedural.cars.MODELS`, parked at the kerbs.
+        Number of cars with windows and wheels. They replace the simple cars, and are instances of
+        `lidarscenes.procedural.cars.MODELS` parked along the curbs.
 
     Raises
     ------
     LidarError
-        For a number that is out of range, or trees or cars that do not fit.
+        If a number is out of range, or if there is not enough space for the trees or cars.
 
     Examples
     --------
@@ -83,6 +83,10 @@ def city(
     >>> scene.names[:2], 19_800 <= len(scene.faces) <= 20_000
     (('ground', 'pavement'), True)
     """
+    check_number("triangles", triangles, whole=True, ge=1_000, le=100_000_000)
+    check_fits("seed", seed, Seed)
+    check_number("trees", trees, whole=True, ge=0, le=MAX_TREES)
+    check_number("cars", cars, whole=True, ge=0, le=MAX_CARS)
     kinds = city_kinds.all_kinds(seed)
     solids = [solid for group in kinds.values() for solid in group]
     sizes = np.array([len(solid.faces) for solid in solids])
@@ -99,7 +103,7 @@ def city(
 def _furniture(
     scene: Scene, objects: AnyArray, trees: int, cars: int, seed: int
 ) -> list[SceneInstance]:
-    """Return detailed trees and cars, placed among the objects of a scene."""
+    """Return detailed trees and cars, placed between the objects of a scene."""
     pavement = objects[objects["owner"] == PAVEMENT]
     blocks = np.stack([pavement["place"][:, :2], pavement["scale"][:, :2]], axis=1)
     prefix = CLASSES[BUILDING] + "-"
@@ -111,25 +115,25 @@ def _furniture(
     lamp_starts = np.searchsorted(lamps["block"], pavement["block"][1:])
     lamps_by_block = np.split(lamps["place"][:, :2], lamp_starts)
     return [
-        *street_trees(blocks, boxes_by_block, lamps_by_block, _KERB_M, trees, seed),
+        *street_trees(blocks, boxes_by_block, lamps_by_block, _CURB_M, trees, seed),
         *parked_cars(blocks, cars, seed),
     ]
 
 
 def _select_objects(kinds: dict[str, list[Solid]], sizes: Ints, budget: int, seed: int) -> AnyArray:
-    """Return objects from the center outwards, within the budget of triangles."""
+    """Return objects from the center outward, within a budget of triangles."""
     rings = 1
     while True:
         objects = _CityBlocks(kinds, rings, seed).objects()
         used = np.cumsum(sizes[objects["kind"]])
         if used[-1] >= budget:
             return objects[: int(np.searchsorted(used, budget, side="right"))]
-        # Triangles grow with the square of the rings; the center's towers have the most.
+        # The number of triangles grows with the square of the number of rings.
         rings = max(rings + 1, int(np.sqrt(budget / used[-1]) * rings))
 
 
 def _ground(objects: AnyArray, triangles: int) -> Solid:
-    """Return flat ground under all objects, of at most a number of triangles."""
+    """Return flat ground below all objects, with at most the given number of triangles."""
     blocks = objects[objects["owner"] == PAVEMENT]
     reach = (np.abs(blocks["place"]) + blocks["scale"] / 2).max(axis=0) + _MARGIN_M
     rows = max(1, int(np.sqrt(triangles / 2)))
@@ -141,7 +145,7 @@ def _ground(objects: AnyArray, triangles: int) -> Solid:
 
 
 def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
-    """Return a scene of the ground and of copies of the solids."""
+    """Combine the ground and copies of the solids into a scene."""
     points = np.array([len(solid.vertices) for solid in solids])[objects["kind"]]
     sides = np.array([len(solid.faces) for solid in solids])[objects["kind"]]
     first_point = len(ground.vertices) + np.cumsum(points) - points
@@ -163,7 +167,7 @@ def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
 
 
 def _copies(solid: Solid, objects: AnyArray) -> Floats:
-    """Return the vertices of a solid repeated for each object: (objects, v, 3), meters."""
+    """Return the vertices (objects, v, 3) of the copies of a solid, in meters."""
     vertices = solid.vertices * objects["scale"][:, None]
     cos = np.cos(objects["yaw"])[:, None]
     sin = np.sin(objects["yaw"])[:, None]
@@ -176,7 +180,7 @@ def _copies(solid: Solid, objects: AnyArray) -> Floats:
 
 
 def _names(objects: AnyArray) -> list[str]:
-    """Return names of all objects but pavements: class and number, from 1 at the center."""
+    """Return the names of all objects except pavements, numbered from the center outward."""
     numbers = dict.fromkeys(CLASSES, 0)
     names = []
     for owner in objects["owner"].tolist():
@@ -187,24 +191,24 @@ def _names(objects: AnyArray) -> list[str]:
 
 
 class _Lots(NamedTuple):
-    """Lots of the blocks without parks, in two rows back to back, along x."""
+    """Lots in the blocks without parks, in two rows along x, back to back."""
 
-    block: Ints  # (n,): number of the block
-    size: Floats  # (n, 2): meters
-    side: Floats  # (n,): -1 if the street is to the south, 1 if it is to the north
-    x: Floats  # (n,): of the middle, meters
-    edge: Floats  # (n,): y of the edge at the pavement
-    yaw: Floats  # (n,): of buildings
-    centrality: Floats  # (n,): 1 at the center of the city, falling to 0
+    block: Ints  # (n,) number of the block
+    size: Floats  # (n, 2) meters
+    side: Floats  # (n,) -1 if the street is to the south, 1 if it is to the north
+    x: Floats  # (n,) x of the center in meters
+    edge: Floats  # (n,) y of the edge at the pavement
+    yaw: Floats  # (n,) yaw of buildings
+    centrality: Floats  # (n,) 1 at the center of the city, falling to 0
 
 
 class _StreetPositions(NamedTuple):
     """Positions along the edges of blocks."""
 
-    block: Ints  # (n,): number of the block
-    xy: Floats  # (n, 2): meters
-    yaw: Floats  # (n,): outwards over the edge
-    along_edge: Floats  # (n, 2): unit vectors along the edge, to the left of outwards
+    block: Ints  # (n,) number of the block
+    xy: Floats  # (n, 2) meters
+    yaw: Floats  # (n,) direction from the block to the street
+    along_edge: Floats  # (n, 2) unit vectors along the edge, to the left of that direction
 
 
 class _CityBlocks:
@@ -213,7 +217,11 @@ class _CityBlocks:
     Parameters
     ----------
     kinds
-        {group: solids}; kinds are numbered through all groups.
+        Solids by group. They are numbered consecutively over all groups.
+    rings
+        Number of rings of blocks around the center.
+    seed
+        Seed of the random generator.
     """
 
     def __init__(self, kinds: dict[str, list[Solid]], rings: int, seed: int) -> None:
@@ -224,7 +232,7 @@ class _CityBlocks:
         self._lay_blocks(rings)
 
     def _lay_blocks(self, rings: int) -> None:
-        """Set middles and sizes (n, 2) of the blocks between streets, from the center outwards."""
+        """Set the centers and sizes (n, 2) of the blocks, from the center outward."""
         spans = []
         for min_m, max_m in _BLOCK_M:
             halves = []
@@ -247,7 +255,7 @@ class _CityBlocks:
         self._park = park
 
     def objects(self) -> AnyArray:
-        """Return all objects by block, in random order after the pavement of the block."""
+        """Return all objects by block: the pavement, followed by the others in random order."""
         n = len(self._middle)
         slab = np.column_stack([self._size, np.ones(n)])
         objects = np.concatenate(
@@ -264,9 +272,9 @@ class _CityBlocks:
                 ),
                 *self._lots(),
                 self._park_trees(),
-                self._along_streets(TREE, inwards=1.6, spacing=9.0, chance=0.55),
-                self._along_streets(CAR, inwards=-1.3, spacing=6.5, chance=0.35),
-                self._along_streets(LAMP, inwards=0.6, spacing=26.0, chance=0.95),
+                self._along_streets(TREE, inward=1.6, spacing=9.0, chance=0.55),
+                self._along_streets(CAR, inward=-1.3, spacing=6.5, chance=0.35),
+                self._along_streets(LAMP, inward=0.6, spacing=26.0, chance=0.95),
             ]
         )
         order = np.where(objects["owner"] == PAVEMENT, -1.0, self._rng.random(len(objects)))
@@ -282,9 +290,12 @@ class _CityBlocks:
         yaw: Floats | float,
         scale: Floats | float,
         *,
-        z: float = _KERB_M,
+        z: float = _CURB_M,
     ) -> AnyArray:
-        """Return rows of a class, with `kind` counted within its group."""
+        """Return rows for objects of a class.
+
+        `kind` is the number of the solid within its group.
+        """
         rows = np.empty(len(block), _OBJECT)
         rows["kind"] = self._start[group] + kind
         rows["owner"] = owner
@@ -296,7 +307,7 @@ class _CityBlocks:
         return rows
 
     def _lots(self) -> list[AnyArray]:
-        """Return towers and houses, and the trees behind the houses."""
+        """Return towers, houses, and the trees behind the houses."""
         lots = self._divide_blocks()
         tower = self._rng.random(len(lots.block)) < 0.9 * lots.centrality
         towers = self._towers(lots, np.flatnonzero(tower))
@@ -305,7 +316,7 @@ class _CityBlocks:
         return [towers, houses, self._yard_trees(lots, np.repeat(house_lots, 2))]
 
     def _divide_blocks(self) -> _Lots:
-        """Return the lots of the blocks without parks."""
+        """Divide the blocks without parks into lots."""
         built = np.flatnonzero(~self._park)
         inner = self._size[built] - 2 * _PAVEMENT_M
         across = np.maximum(2, np.round(inner[:, 0] / _LOT_M)).astype(np.int64)
@@ -330,7 +341,7 @@ class _CityBlocks:
         )
 
     def _towers(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return towers on lots, by the rows of the lots (n,)."""
+        """Return towers on the lots with the given indices (n,)."""
         rng = self._rng
         n = len(lot_indices)
         height = np.clip(lots.centrality[lot_indices] * rng.uniform(0.2, 1.15, n), 0, 0.999)
@@ -357,7 +368,7 @@ class _CityBlocks:
         )
 
     def _houses(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return houses on lots, by the rows of the lots (n,)."""
+        """Return houses on the lots with the given indices (n,)."""
         rng = self._rng
         n = len(lot_indices)
         kind = rng.integers(self._count["house"], size=n)
@@ -376,7 +387,7 @@ class _CityBlocks:
         )
 
     def _yard_trees(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return trees behind houses, by the rows of the lots (n,)."""
+        """Return trees behind houses on the lots with the given indices (n,)."""
         rng = self._rng
         n = len(lot_indices)
         depth = rng.uniform(0.72, 0.95, n) * lots.size[lot_indices, 1]
@@ -413,11 +424,11 @@ class _CityBlocks:
         )
 
     def _along_streets(
-        self, owner: int, *, inwards: float, spacing: float, chance: float
+        self, owner: int, *, inward: float, spacing: float, chance: float
     ) -> AnyArray:
         """Return objects of a class along all four edges of each block, with gaps."""
         rng = self._rng
-        positions = self._street_positions(inwards, spacing, chance)
+        positions = self._street_positions(inward, spacing, chance)
         block = positions.block
         xy = positions.xy
         if owner == TREE:
@@ -433,15 +444,15 @@ class _CityBlocks:
         xy = xy + positions.along_edge * rng.uniform(-0.5, 0.5, (n, 1))
         return self._rows(CAR, "car", kind=kind, block=block, xy=xy, yaw=yaw, scale=scale, z=0.0)
 
-    def _street_positions(self, inwards: float, spacing: float, chance: float) -> _StreetPositions:
-        """Return positions along all four edges of each block, each kept with a chance."""
+    def _street_positions(self, inward: float, spacing: float, chance: float) -> _StreetPositions:
+        """Return positions along all four edges of each block, each kept with a probability."""
         n = len(self._middle)
         block = np.tile(np.arange(n), 4)
-        yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # outwards over the edge
+        yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # from the block to the street
         along_x = np.repeat([True, False, True, False], n)
         size = self._size[block]
         length = np.where(along_x, size[:, 0], size[:, 1]) - 8
-        distance = np.where(along_x, size[:, 1], size[:, 0]) / 2 - inwards
+        distance = np.where(along_x, size[:, 1], size[:, 0]) / 2 - inward
         count = (length / spacing).astype(np.int64) + 1
         edge = np.repeat(np.arange(4 * n), count)
         step = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)

@@ -1,4 +1,4 @@
-"""Positions of detailed trees and cars in a generated city."""
+"""Place detailed trees and cars in a generated city."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from .plants import SCALES, SPECIES, all_trees, place_instances
 
 MAX_CARS = 50_000
 
-# Along the edge of a block: meters between positions, from the edge inwards, and free at corners.
+# Along the edges of a block, in meters: distance between positions, inward offset from the edge,
+# and free space at corners.
 _TREE_APART_M = 7.0
-_TREE_INWARDS_M = 1.3
+_TREE_INWARD_M = 1.3
 _TREE_CORNER_M = 5.0
 _CAR_APART_M = 6.5
-_CAR_INWARDS_M = -1.3
+_CAR_INWARD_M = -1.3
 _CAR_CORNER_M = 8.0
 _CAR_SHIFT_M = 0.5  # maximum, along the street
-_KERB_AT_RIGHT = 0.9  # share of cars with the kerb at their right
-_STREET_REACH_M = 3.5  # crowns at streets leave the middle of the carriageway free
-# Yards and parks have at most a tree in the middle part of a cell: size of cells, and that part.
+_CURB_ON_RIGHT = 0.9  # share of cars with the curb on their right
+_STREET_REACH_M = 3.5  # maximum crown radius at streets, which keeps the center of the road free
+# Yards and parks have at most one tree per cell, in its central part.
 _YARD_M = 6.0
 _YARD_MIDDLE = 0.4
-_STREETS_FIRST = 4.0  # weight of a position at a street; in yards and parks 1
+_STREETS_FIRST = 4.0  # weight of positions at streets; the weight in yards and parks is 1
 _LAMP_M = 1.5  # minimum distance from a trunk
 _ROOT_M = 0.1
 
@@ -36,23 +37,27 @@ _ROOT_M = 0.1
 def street_trees(
     blocks: Floats, boxes: list[Floats], lamps: list[Floats], z: float, count: int, seed: int
 ) -> list[SceneInstance]:
-    """Return trees along streets, in yards and parks, whose crowns touch no building.
+    """Place trees along streets, in yards, and in parks, with crowns that do not touch buildings.
 
     Parameters
     ----------
     blocks
-        (b, 2, 2): middles and sizes, meters.
+        (b, 2, 2) centers and sizes of the blocks in meters.
     boxes
-        For each block: lowest and highest corners of its buildings, (n, 2, 2).
+        For each block, the lower and upper corners (n, 2, 2) of its buildings.
     lamps
-        For each block: positions of its lamps, (n, 2).
+        For each block, the positions (n, 2) of its street lamps.
     z
-        Height of the ground, meters.
+        Height of the ground in meters.
+    count
+        Number of trees.
+    seed
+        Seed of the random generator.
 
     Raises
     ------
     LidarError
-        If the trees do not fit.
+        If there is not enough space for the trees.
     """
     rng = np.random.default_rng([seed, count])
     meshes = all_trees(seed, _ROOT_M)
@@ -76,20 +81,21 @@ def street_trees(
 class _TreeSites(NamedTuple):
     """Positions for trees in a block."""
 
-    xy: Floats  # (n, 2): meters
-    room: Floats  # (n,): distance to the nearest building, or the limit at streets
+    xy: Floats  # (n, 2) meters
+    room: Floats  # (n,) distance to the nearest building, or the limit at streets
     at_street: Bools  # (n,)
 
 
 def _tree_sites(
     block: Floats, boxes: Floats, lamps: Floats, min_room: float, rng: np.random.Generator
 ) -> _TreeSites:
-    """Return the positions in a block, (2, 2) middle and size, with room for the smallest tree.
+    """Return the positions in a block that have space for the smallest tree.
 
-    `boxes` (n, 2, 2) are corners of its buildings, `lamps` (m, 2) positions.
+    `block` (2, 2) contains the center and the size of the block, `boxes` (n, 2, 2) the corners of
+    its buildings, and `lamps` (m, 2) the positions of its street lamps.
     """
     middle, size = block
-    street, _ = _street_positions(size, _TREE_APART_M, _TREE_INWARDS_M, _TREE_CORNER_M)
+    street, _ = _street_positions(size, _TREE_APART_M, _TREE_INWARD_M, _TREE_CORNER_M)
     yard = _yard_positions(size, rng)
     xy = middle + np.concatenate([street, yard])
     at_street = np.arange(len(xy)) < len(street)
@@ -102,18 +108,18 @@ def _tree_sites(
 
 
 def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
-    """Return cars at the kerbs of blocks (b, 2, 2), middles and sizes, along the streets.
+    """Place cars along the curbs of blocks (b, 2, 2), which are given by their centers and sizes.
 
     Raises
     ------
     LidarError
-        If the cars do not fit.
+        If there is not enough space for the cars.
     """
     rng = np.random.default_rng([seed, count])
     positions = []
     directions = []
     for middle, size in blocks:
-        xy, yaw = _street_positions(size, _CAR_APART_M, _CAR_INWARDS_M, _CAR_CORNER_M)
+        xy, yaw = _street_positions(size, _CAR_APART_M, _CAR_INWARD_M, _CAR_CORNER_M)
         positions.append(middle + xy)
         directions.append(yaw)
     xy = np.concatenate(positions)
@@ -122,7 +128,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
     direction = direction[chosen]
     ahead = np.column_stack([np.cos(direction), np.sin(direction)])
     xy = xy[chosen] + ahead * rng.uniform(-_CAR_SHIFT_M, _CAR_SHIFT_M, (count, 1))
-    yaw = direction + np.pi * (rng.random(count) > _KERB_AT_RIGHT)
+    yaw = direction + np.pi * (rng.random(count) > _CURB_ON_RIGHT)
     meshes = all_cars()
     kind = rng.integers(len(meshes), size=count)
     return place_instances(
@@ -131,9 +137,9 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
 
 def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) -> Ints:
-    """Return the rows (count,) of chosen positions, by weights (n,).
+    """Choose `count` distinct rows at random, with probabilities proportional to weights (n,).
 
-    Raises LidarError if n is less.
+    Raises LidarError if there are fewer rows.
     """
     if len(weights) < count:
         raise LidarError(
@@ -145,22 +151,22 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
 
 
 def _street_positions(
-    size: Floats, spacing: float, inwards: float, corner: float
+    size: Floats, spacing: float, inward: float, corner: float
 ) -> tuple[Floats, Floats]:
-    """Return positions (n, 2) along the edges of a block around zero, and yaws (n,).
+    """Return positions (n, 2) along the edges of a block centered at the origin, and yaws (n,).
 
-    Facing the direction of its yaw, a car has the block at its right.
+    A car that faces the direction of its yaw has the block on its right.
     """
     positions = []
     yaws = []
     for quarter in range(4):
         length = size[quarter % 2]
-        distance = size[1 - quarter % 2] / 2 - inwards
+        distance = size[1 - quarter % 2] / 2 - inward
         n = int((length - 2 * corner) / spacing) + 1
         shift = (np.arange(n) - (n - 1) / 2) * spacing
         cos = np.cos(quarter * np.pi / 2)
         sin = np.sin(quarter * np.pi / 2)
-        # The edge at the block's lower side, turned.
+        # Rotate the positions along the lower edge of the block.
         positions.append(
             np.column_stack([cos * shift + sin * distance, sin * shift - cos * distance])
         )
@@ -169,8 +175,8 @@ def _street_positions(
 
 
 def _yard_positions(size: Floats, rng: np.random.Generator) -> Floats:
-    """Return positions (n, 2) spread over a block around zero, behind its street trees."""
-    inner = size - 2 * (_TREE_INWARDS_M + _YARD_M / 2)
+    """Return positions (n, 2) in a block centered at the origin, behind its street trees."""
+    inner = size - 2 * (_TREE_INWARD_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)
     cells = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij"), axis=-1)
     inside = 0.5 + _YARD_MIDDLE * rng.uniform(-0.5, 0.5, (n[0] * n[1], 2))

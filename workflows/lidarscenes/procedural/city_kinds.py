@@ -1,4 +1,4 @@
-"""The kinds of objects in a city, built from closed shapes."""
+"""Build the kinds of objects in a city from closed shapes."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from lidarsim.scene.shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles in local coordinates, meters, standing on z = 0.
+    """Triangles of an object that stands on z = 0, in local coordinates in meters.
 
-    `vertices` are float64 (v, 3), `faces` int64 (f, 3), counter-clockwise seen from outside.
+    `vertices` are float64 (v, 3), and `faces` int64 (f, 3), counterclockwise as seen from outside.
     """
 
     vertices: Floats
     faces: Ints
 
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """Return a copy, moved by x, y and z, meters."""
+    def translated(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
+        """Return a translated copy."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -33,7 +33,7 @@ TOWER_FLOORS = (6, 9, 13, 18, 25)
 
 
 def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
-    """Return all kinds of objects: {group: solids}."""
+    """Return the solids of all kinds of objects, by group."""
     return {
         "pavement": [box(1, 1, 0.15)],
         "tower": _towers(),
@@ -45,24 +45,26 @@ def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
 
 
 def _towers() -> list[Solid]:
-    """Return office blocks of `TOWER_FLOORS` floors: square, stepped, round and L-shaped."""
+    """Return office towers with `TOWER_FLOORS` floors: square, stepped, round, and L-shaped."""
     corner = np.array([[0, 0], [0, 8], [-9, 8], [-9, -8], [9, -8], [9, 0]], dtype=np.float64)
     return [
         tower
         for floors in TOWER_FLOORS
         for tower in (
-            _with_plant_room(loft(rectangle(18, 16), _storeys(floors)), floors),
+            _with_plant_room(loft(rectangle(18, 16), _facade_profile(floors)), floors),
             _stepped(floors),
-            _with_plant_room(loft(regular(14, 8.5), _storeys(floors)), floors),
-            loft(corner, _storeys(floors)),
+            _with_plant_room(loft(regular_polygon(14, 8.5), _facade_profile(floors)), floors),
+            loft(corner, _facade_profile(floors)),
         )
     ]
 
 
-def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[float, float]]:
-    """Return the profile of a front with a recessed band of windows in each storey, and a parapet.
+def _facade_profile(
+    floors: int, base: float = 0.0, inset: float = 0.0
+) -> list[tuple[float, float]]:
+    """Return the profile of a facade with recessed windows on each floor, and a parapet.
 
-    The profile has pairs of a height and an inset, meters.
+    The profile consists of (height, inset) pairs in meters.
     """
     line = [(base, inset)]
     for floor in range(floors):
@@ -74,68 +76,76 @@ def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[f
 
 
 def _with_plant_room(tower: Solid, floors: int) -> Solid:
-    """Return a tower with plant rooms and a mast on its roof."""
+    """Add plant rooms and a mast to the roof of a tower."""
     top = floors * FLOOR_M
-    return joined([
+    return join_solids([
         tower,
-        box(5, 4, 3).moved(1.5, -1, top),
-        box(2, 2, 1.4).moved(-3, 2.5, top),
-        loft(regular(6, 0.12), [(0, 0), (6, 0)]).moved(3, -1, top + 3),
+        box(5, 4, 3).translated(1.5, -1, top),
+        box(2, 2, 1.4).translated(-3, 2.5, top),
+        loft(regular_polygon(6, 0.12), [(0, 0), (6, 0)]).translated(3, -1, top + 3),
     ])  # fmt: skip
 
 
 def _stepped(floors: int) -> Solid:
-    """Return a tower of three parts, each narrower than the part below."""
+    """Return a tower in three parts, each narrower than the one below."""
     counts = [floors - 2 * (floors // 3), floors // 3, floors // 3]
     parts = []
     base = 0.0
     for step, count in enumerate(counts):
-        parts.append(loft(rectangle(18, 16), _storeys(count, base, 2.0 * step)))
+        parts.append(loft(rectangle(18, 16), _facade_profile(count, base, 2.0 * step)))
         base += count * FLOOR_M
-    return joined([*parts, box(4, 4, 3).moved(0, 0, base)])
+    return join_solids([*parts, box(4, 4, 3).translated(0, 0, base)])
 
 
 def _houses() -> list[Solid]:
-    """Return dwellings of 1 to 3 storeys, with gabled and hipped roofs, with and without a wing."""
+    """Return houses with one to three floors and gabled or hipped roofs.
+
+    Each house exists with and without a wing.
+    """
     houses = []
-    for storeys in (1, 2, 3):
+    for stories in (1, 2, 3):
         for hip in (0.0, 3.0):
-            body = _dwelling(11, 8.5, storeys, hip)
+            body = _dwelling(11, 8.5, stories, hip)
             houses.append(
-                joined([body, *_front(storeys), box(0.8, 0.8, 2.6).moved(2.6, 1, _eaves(storeys))])
+                join_solids(
+                    [body, *_front(stories), box(0.8, 0.8, 2.6).translated(2.6, 1, _eaves(stories))]
+                )
             )
-            wing = _dwelling(6, 5, max(1, storeys - 1), 0.0)
+            wing = _dwelling(6, 5, max(1, stories - 1), 0.0)
             turned = Solid(wing.vertices[:, [1, 0, 2]] * [-1, 1, 1], wing.faces)
-            houses.append(joined([body, *_front(storeys), turned.moved(2.4, -6, 0)]))
+            houses.append(join_solids([body, *_front(stories), turned.translated(2.4, -6, 0)]))
     return houses
 
 
-def _eaves(storeys: int) -> float:
-    """Return the height of the eaves of a dwelling, meters."""
-    return 0.4 + 2.8 * storeys
+def _eaves(stories: int) -> float:
+    """Return the height of the eaves of a house in meters."""
+    return 0.4 + 2.8 * stories
 
 
-def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
-    """Return the walls and the roof of a dwelling.
+def _dwelling(width: float, depth: float, stories: int, hip: float) -> Solid:
+    """Return the walls and the roof of a house.
 
-    `hip` is the inset of the ridge's ends.
+    `hip` is the inset of both ends of the ridge.
     """
-    eaves = _eaves(storeys)
+    eaves = _eaves(stories)
     walls = loft(rectangle(width, depth), [(0, -0.15), (0.4, -0.15), (0.4, 0), (eaves, 0)])
     roof = gable(width + 1, depth + 1, eaves - 0.05, 0.42 * depth, hip)
-    return joined([walls, roof])
+    return join_solids([walls, roof])
 
 
-def _front(storeys: int) -> list[Solid]:
-    """Return windows that stand out a little on the long sides, and a door with a step."""
-    door = [box(1.1, 0.3, 2.1).moved(-1.2, -4.3, 0.3), box(1.8, 1.2, 0.3).moved(-1.2, -4.8, 0)]
+def _front(stories: int) -> list[Solid]:
+    """Return slightly protruding windows on the long sides, and a door with a step."""
+    door = [
+        box(1.1, 0.3, 2.1).translated(-1.2, -4.3, 0.3),
+        box(1.8, 1.2, 0.3).translated(-1.2, -4.8, 0),
+    ]
     window = box(1.3, 0.25, 1.4)
-    positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(storeys))
-    return [*door, *(window.moved(x, y, 1.3 + 2.8 * storey) for x, y, storey in positions)]
+    positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(stories))
+    return [*door, *(window.translated(x, y, 1.3 + 2.8 * story) for x, y, story in positions)]
 
 
 def _trees(seed: int) -> list[Solid]:
-    """Return broad-leaved trees of several outlines, and conifers."""
+    """Return deciduous trees with several outlines, and conifers."""
     rng = np.random.default_rng(seed)
     return [_broadleaf(rng, height_ratio) for height_ratio in (0.9, 1.1, 1.35, 1.6)] + [
         _conifer(3),
@@ -144,8 +154,8 @@ def _trees(seed: int) -> list[Solid]:
 
 
 def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
-    """Return a broad-leaved tree whose crown is `height_ratio` times as high as wide."""
-    trunk = loft(regular(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
+    """Return a deciduous tree whose crown has a given ratio of height to width."""
+    trunk = loft(regular_polygon(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
     crown = revolve(
         np.stack([2.2 * np.cos(angle), 2.2 * height_ratio * (1 + np.sin(angle))], axis=1), 10
@@ -153,21 +163,21 @@ def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
     bumps = 1 + rng.uniform(-0.22, 0.22, (len(crown.vertices), 1))
     middle = np.array([0, 0, 2.2 * height_ratio])
     leaves = Solid((crown.vertices - middle) * bumps + middle, crown.faces)
-    return joined([trunk, leaves.moved(0, 0, 2)])
+    return join_solids([trunk, leaves.translated(0, 0, 2)])
 
 
 def _conifer(tiers: int) -> Solid:
-    """Return a conifer of several tiers of branches."""
-    parts = [loft(regular(6, 0.2), [(0, 0), (1.4, 0)])]
+    """Return a conifer with several tiers of branches."""
+    parts = [loft(regular_polygon(6, 0.2), [(0, 0), (1.4, 0)])]
     for tier in range(tiers):
         radius = 2.0 - 1.3 * tier / tiers
         base = 1.1 + 1.7 * tier
-        parts.append(loft(regular(9, radius), [(base, 0), (base + 2.6, radius * 0.93)]))
-    return joined(parts)
+        parts.append(loft(regular_polygon(9, radius), [(base, 0), (base + 2.6, radius * 0.93)]))
+    return join_solids(parts)
 
 
 def _cars() -> list[Solid]:
-    """Return a saloon, a hatchback and a van."""
+    """Return a sedan, a hatchback, and a van."""
     saloon = [(0, 0.3), (2.2, 0.3), (2.25, 0.8), (1.1, 0.95), (0.55, 1.45), (-0.9, 1.45)]
     hatchback = [(0, 0.3), (2.0, 0.3), (2.0, 0.8), (1.0, 1.0), (0.4, 1.5), (-1.6, 1.5)]
     van = [(0, 0.35), (2.4, 0.35), (2.4, 1.0), (1.9, 1.2), (1.5, 2.1), (-2.3, 2.1)]
@@ -178,23 +188,27 @@ def _cars() -> list[Solid]:
 
 
 def _car(side: list[tuple[float, float]]) -> Solid:
-    """Return a car by the outline of its side: points x, z, meters."""
-    body = lying(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
-    wheel = lying(loft(regular(8, 0.33), [(-0.12, 0), (0.12, 0)]))
-    wheels = [wheel.moved(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
-    return joined([body, *wheels])
+    """Return a car with the side outline given as (x, z) points in meters."""
+    body = lay_down(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
+    wheel = lay_down(loft(regular_polygon(8, 0.33), [(-0.12, 0), (0.12, 0)]))
+    wheels = [wheel.translated(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
+    return join_solids([body, *wheels])
 
 
 def _lamp() -> Solid:
     """Return a street lamp whose arm points along x."""
-    pole = loft(regular(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
-    return joined(
-        [pole, box(1.6, 0.1, 0.1).moved(0.8, 0, 6.1), box(0.7, 0.3, 0.15).moved(1.6, 0, 6)]
+    pole = loft(regular_polygon(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
+    return join_solids(
+        [
+            pole,
+            box(1.6, 0.1, 0.1).translated(0.8, 0, 6.1),
+            box(0.7, 0.3, 0.15).translated(1.6, 0, 6),
+        ]
     )
 
 
-def joined(solids: Iterable[Solid]) -> Solid:
-    """Return a solid of several solids.
+def join_solids(solids: Iterable[Solid]) -> Solid:
+    """Join several solids into one.
 
     Touching or overlapping parts keep their surfaces.
     """
@@ -202,10 +216,10 @@ def joined(solids: Iterable[Solid]) -> Solid:
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
-    """Return an outline extruded along z, with insets, and closed at both ends.
+    """Extrude an outline along z with varying insets, and close both ends.
 
-    `outline` (n, 2) is a polygon, counter-clockwise, completely visible from its first point;
-    `profile` has pairs of a height and an inset of the outline's sides at that height, meters. The
+    `outline` (n, 2) is a counterclockwise polygon that is completely visible from its first point.
+    `profile` consists of heights and the insets of the outline at these heights, in meters. The
     solid has ``2 * n * len(profile) - 4`` triangles.
     """
     points = np.asarray(outline, dtype=np.float64)
@@ -215,7 +229,7 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     inward = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     previous_inward = np.roll(inward, 1, axis=0)
-    # A corner moves so that both its sides move by the inset.
+    # Each corner moves so that both adjacent sides move by the inset.
     miter = (inward + previous_inward) / (1 + (inward * previous_inward).sum(axis=1, keepdims=True))
     rings = np.empty((len(height), n, 3))
     rings[..., :2] = points + inset[:, None, None] * miter
@@ -234,34 +248,34 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """Return the outline of a rectangle around zero: (4, 2)."""
+    """Return the outline (4, 2) of a rectangle centered at the origin."""
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
 
 
-def regular(sides: int, radius: float) -> Floats:
-    """Return the outline of a regular polygon around zero: (sides, 2)."""
+def regular_polygon(sides: int, radius: float) -> Floats:
+    """Return the outline (sides, 2) of a regular polygon centered at the origin."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def box(width: float, depth: float, height: float) -> Solid:
-    """Return a box whose bottom face lies in the plane z = 0."""
+    """Return a box whose bottom face is in the plane z = 0."""
     return loft(rectangle(width, depth), [(0, 0), (height, 0)])
 
 
 def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.0) -> Solid:
-    """Return a pitched roof of eight triangles on a rectangle at height `eaves`.
+    """Return a pitched roof with eight triangles over a rectangle at the height `eaves`.
 
-    The ridge is along x, `rise` above the eaves and shorter by `hip` at both ends.
+    The ridge runs along x, `rise` above the eaves, and is shorter by `hip` at both ends.
     """
     x = width / 2
     y = depth / 2
     ridge = [[hip - x, 0, rise], [x - hip, 0, rise]]
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], *ridge]
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
-    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).moved(z=eaves)
+    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).translated(z=eaves)
 
 
-def lying(solid: Solid) -> Solid:
-    """Return a solid laid down: z becomes y, and y becomes z."""
+def lay_down(solid: Solid) -> Solid:
+    """Return a solid with the y and z axes swapped."""
     return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])

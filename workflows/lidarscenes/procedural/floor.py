@@ -1,4 +1,4 @@
-"""The floor under a position, where a sensor stands, and the ceiling over it."""
+"""Find the floor below a position, where a sensor stands, and the ceiling above it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from numpy.typing import ArrayLike
 from lidarsim.base.arrays import Bools, Floats, Indices
 from lidarsim.scene.scene import Scene
 
-# More than the thickness of floors: a sensor stands inside thicker objects, such as a box hall.
+# Maximum thickness of a floor slab. Sensors stand inside thicker objects, such as a hall.
 SLAB_M = 0.5
 FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 
 
-def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Return the heights of the floor and the ceiling at a position, world coordinates, meters.
+def floor_and_ceiling(scene: Scene, x: float, y: float) -> tuple[float, float]:
+    """Return the heights of the floor and the ceiling at a position, in world coordinates.
 
-    The floor is the lowest triangle at the position if it faces up, like ground, or the top of the
-    lowest slab; else the lowest point of the scene. The ceiling is the lowest triangle that is
-    higher than furniture; infinite without such a triangle.
+    The floor is the lowest triangle at the position if it faces up, as ground does, or the top of
+    the lowest slab. Otherwise, it is the lowest point of the scene. The ceiling is the lowest
+    triangle above the height of furniture, or infinite if there is none.
     """
     heights, up = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     floor = scene.bounds[0, 2]
@@ -28,16 +28,16 @@ def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
     return float(floor + scene.origin[2]), float(ceiling + scene.origin[2])
 
 
-def heights_at(scene: Scene, x: float, y: float) -> Floats:
-    """Return the heights (k,), world meters, at which a vertical line at x, y crosses triangles."""
+def surface_heights(scene: Scene, x: float, y: float) -> Floats:
+    """Return the world heights (k,) at which a vertical line at x, y crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
-def triangles_reaching(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
-    """Return the triangles that may reach into a box: (k,).
+def triangles_in_box(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
+    """Return the indices (k,) of the triangles whose bounding boxes overlap a box.
 
-    The box is from `lower` to `upper`, local coordinates (3,), or (2,) for any height.
+    The corners of the box are local coordinates of shape (3,), or (2,) for any height.
     """
     candidates = np.arange(len(scene.faces))
     for axis, (axis_lower, axis_upper) in enumerate(
@@ -51,14 +51,15 @@ def triangles_reaching(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indi
 
 
 def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
-    """Return the heights (k,) at which a vertical line crosses triangles, and whether they face up.
+    """Return the heights (k,) at which a vertical line crosses triangles.
 
-    The line is at a local position (2,); the mask (k,) is true for triangles that face up.
+    The line is at a local position (2,). The second result is a mask (k,) of the triangles that
+    face up.
     """
     a, b, c = np.moveaxis(
-        scene.vertices[scene.faces[triangles_reaching(scene, position, position)]], 1, 0
+        scene.vertices[scene.faces[triangles_in_box(scene, position, position)]], 1, 0
     )
-    # Twice the areas of the triangles of the position with each side, seen from above.
+    # Twice the areas of the triangles between the position and each side, in plan view.
     parts = np.stack([_areas(p, q, position) for p, q in ((b, c), (c, a), (a, b))], axis=1)
     area = parts.sum(axis=1)
     crossed = ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1)) & (area != 0)
@@ -67,9 +68,9 @@ def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
 
 
 def _areas(p: Floats, q: Floats, position: Floats) -> Floats:
-    """Return twice the areas of triangles p, q, position from above: (f,).
+    """Return twice the signed areas (f,) of the triangles p, q, position in plan view.
 
-    Areas are positive for triangles that are counter-clockwise.
+    Counterclockwise triangles have positive areas.
     """
     to_p = p[:, :2] - position
     to_q = q[:, :2] - position

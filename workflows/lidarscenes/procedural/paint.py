@@ -1,4 +1,4 @@
-"""Plain colors of generated scenes, by the classes of objects."""
+"""Color generated scenes by the classes of their objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidarsim.base.arrays import Bools, Floats32, Ints32
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.scene import Scene
 
-# {class of objects: sRGB colors, used in turn}
+# {object class: sRGB colors, used in turn}
 _PAINTS = {
     "ground": ["46464a"],
     "pavement": ["a5a097"],
@@ -29,15 +29,15 @@ _PALETTE = tuple(
     for colors in _PAINTS.values()
     for color in colors
 )
-_TRUNK_M = 0.6  # crowns begin higher
-# z of normals
-_UP = 0.2  # minimum of roofs
-_FLAT = 0.98  # minimum of level roofs
-_STEEP = 0.65  # maximum of rock
+_TRUNK_M = 0.6  # faces of a tree below this height belong to its trunk
+# Limits for the z component of normals.
+_UP = 0.2  # minimum for roofs
+_FLAT = 0.98  # minimum for flat roofs
+_STEEP = 0.65  # maximum for rock
 
 
-def painted(scene: Scene) -> Scene:
-    """Return a scene of `city` or `terrain` with plain colors, by the names of its objects."""
+def paint_scene(scene: Scene) -> Scene:
+    """Color a `city` or `terrain` scene according to the names of its objects."""
     numbered = [name.rpartition("-") for name in scene.names]
     kinds = [kind or name for kind, _, name in numbered]
     numbers = [int(number) if kind else 0 for kind, _, number in numbered]
@@ -51,7 +51,7 @@ def painted(scene: Scene) -> Scene:
     faces = _face_geometry(scene)
 
     def paint(kind: str, mask: Bools, color: str) -> None:
-        """Paint the faces of a kind in a mask (f,)."""
+        """Paint the faces of a kind that are selected by a mask (f,)."""
         image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[color]
 
     paint("building", faces.up > _UP, "tiles")
@@ -69,14 +69,14 @@ def painted(scene: Scene) -> Scene:
 
 
 class _FaceGeometry(NamedTuple):
-    """Slopes and heights of the faces of a scene."""
+    """Slopes and heights of the faces in a scene."""
 
-    up: Floats32  # (f,): z of the unit normal
-    height: Floats32  # (f,): of the lowest corner above the lowest point of the object, meters
+    up: Floats32  # (f,) z of the unit normal
+    height: Floats32  # (f,) height of the lowest corner above the base of the object, in meters
 
 
 def _face_geometry(scene: Scene) -> _FaceGeometry:
-    """Return the slopes and heights of faces, computed in single precision."""
+    """Compute the slopes and heights of faces in single precision."""
     x, y, z = (axis[scene.faces].T for axis in scene.vertices.T.astype(np.float32))
     (ax, bx), (ay, by), (az, bz) = ((axis[1] - axis[0], axis[2] - axis[0]) for axis in (x, y, z))
     normal = ax * by - ay * bx
@@ -88,8 +88,8 @@ def _face_geometry(scene: Scene) -> _FaceGeometry:
 
 
 def _part_paint(faces: Ints32, number: int) -> Ints32:
-    """Return the paints (f,) of a part of instances by its number: a tree with leaves, or a car."""
-    # A leaf shares no corner with other triangles; cars have no leaves.
+    """Return the paints (f,) of an instanced mesh, which is a tree with leaves or a car."""
+    # Leaves do not share vertices with other triangles. Cars have no leaves.
     leaf = np.bincount(faces.ravel())[faces].max(axis=1) == 1
     if leaf.any():
         leaf_paint = _FIRST["tree"] + number % len(_PAINTS["tree"])

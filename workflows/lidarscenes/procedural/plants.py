@@ -1,7 +1,8 @@
-"""Trees as a lidar sees them: trunk, branches, twigs, and leaves as single triangles.
+"""Generate trees with trunk, branches, twigs, and leaves as single triangles.
 
-A stem carries branches, branches carry twigs and twigs leaves, by the proportions of a species, as
-of Weber and Penn (1995). A triangle is larger than a leaf, so that a few stand for all leaves.
+Following Weber and Penn (1995), a stem carries branches, branches carry twigs, and twigs carry
+leaves, in the proportions of a species. A triangle is larger than a real leaf, so that a few of
+them represent all leaves.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
 SCALES = (0.7, 1.3)  # smallest and largest scale of trees in a scene
-MAX_TREES = 100_000  # readers of mesh files take 200,000 nodes
+MAX_TREES = 100_000  # mesh files are limited to 200,000 nodes
 _STEM_SIDES = 7
 _BRANCH_SIDES = 4
 _TWIG_SIDES = 3
@@ -27,23 +28,23 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 @dataclass(frozen=True)
 class Species:
-    """Proportions of a tree.
+    """The proportions of a tree.
 
-    Heights of the crown are shares, from its lowest branch to the top.
+    Heights within the crown are fractions from its lowest branch to its top.
     """
 
     name: str
     height_m: float
     trunk_m: float  # radius above the roots
-    bare: float  # share of the height without branches
-    crown: tuple[float, ...]  # lengths of branches, meters, at equal steps up the crown
-    angle_deg: tuple[float, float]  # angles of the lowest and the highest branch with the vertical
-    rise_deg: float  # angle between the foot of a branch and its end, upwards
+    bare: float  # fraction of the height without branches
+    crown: tuple[float, ...]  # branch lengths in meters at equal steps up the crown
+    angle_deg: tuple[float, float]  # angles between the vertical and the lowest and highest branch
+    rise_deg: float  # upward turn of a branch between its base and its end
     branches: int
     twigs: int  # twigs per branch
     leaves: int  # leaves per twig
     leaf_m: tuple[float, float]  # length and width of a triangle
-    hang: float = 0.0  # downward part of the directions of twigs and leaves
+    hang: float = 0.0  # downward component of twig and leaf directions
     conifer: bool = False
 
 
@@ -72,16 +73,16 @@ SPECIES = (
 
 
 def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
-    """Return a tree that stands on (0, 0, 0).
+    """Return a tree that stands at the origin.
 
     Parameters
     ----------
     species
-        A species of `SPECIES`, or a user's.
+        One of `SPECIES`, or a user-defined species.
     seed
-        The same seed gives the same tree.
+        Seed of the random generator. The same seed always results in the same tree.
     root_m
-        Length of the trunk below the ground, meters, above 0; more for slopes.
+        Length of the trunk below the ground in meters. It must be positive, and larger on slopes.
 
     Examples
     --------
@@ -115,14 +116,16 @@ def place_instances(
 
     Parameters
     ----------
+    meshes
+        The meshes.
     kind
-        (n,): numbers of the meshes.
+        (n,) indices of the meshes.
     positions
-        (n, 3): meters.
+        (n, 3) positions in meters.
     yaw
-        (n,): rotations about z, radians.
+        (n,) rotations about z in radians.
     scale
-        (n,): factors of the size.
+        (n,) scale factors.
     """
     matrices = np.tile(np.eye(4), (len(kind), 1, 1))
     cos = scale * np.cos(yaw)
@@ -137,7 +140,7 @@ def place_instances(
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the points (k, 3) of a stem from the root to the top, and radii (k,), meters."""
+    """Return the points (k, 3) and radii (k,) of a stem from the root to the top, in meters."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -152,7 +155,7 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the points (n, k, 3) of the branches, and radii (n, k), meters."""
+    """Return the points (n, k, 3) and radii (n, k) of branches, in meters."""
     n = species.branches
     share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
@@ -171,13 +174,13 @@ def _branches(
             axis=1,
         )
         points.append(points[-1] + ahead * (length / _BRANCH_STEPS)[:, None])
-    # Half as thick as the stem at the foot, at most in proportion to the length.
+    # At its base, a branch is half as thick as the stem, limited in proportion to its length.
     radius = np.minimum(0.5 * np.interp(height, stem[:, 2], radii), 0.006 + 0.022 * length)
     return np.stack(points, axis=1), radius[:, None] * np.linspace(1, 0.25, _BRANCH_STEPS + 1)
 
 
 def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the heights (n,) of branches as shares of the crown, and their lengths (n,), meters.
+    """Return the heights (n,) of branches as fractions of the crown, and their lengths (n,).
 
     Branches are denser where they are long, so that they fill the crown evenly.
     """
@@ -190,7 +193,7 @@ def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, 
 
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
-    """Return the ends of the twigs, (n, 2, 3), which spread from the outer part of branches."""
+    """Return the ends (n, 2, 3) of twigs, which grow from the outer parts of branches."""
     n = len(branches)
     m = species.twigs
     share = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
@@ -208,7 +211,7 @@ def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floa
 
 
 def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Return vertices and faces of the leaves around the twigs (n, 2, 3), not connected."""
+    """Return the vertices and faces of separate leaves around twigs (n, 2, 3)."""
     n = len(twigs)
     m = species.leaves
     length, width = species.leaf_m
@@ -225,10 +228,10 @@ def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[
 
 
 def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
-    """Return vertices and faces of open tubes along paths (n, k, 3) with radii (n, k)."""
+    """Return the vertices and faces of open tubes along paths (n, k, 3) with radii (n, k)."""
     n, k = radii.shape
     tangents = _unit(np.gradient(paths, axis=1))
-    # The same axis along a tube, so that the tube is not twisted.
+    # Use the same reference axis along a tube, so that the tube is not twisted.
     upright = np.abs(tangents[:, :1, 2:]) > 0.8
     first = _unit(np.cross(tangents, np.where(upright, [1.0, 0, 0], [0, 0, 1.0])))
     second = np.cross(tangents, first)
@@ -249,5 +252,5 @@ def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
 
 
 def _unit(vectors: Floats) -> Floats:
-    """Return unit vectors in the directions of vectors (..., 3)."""
+    """Scale vectors (..., 3) to unit length."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

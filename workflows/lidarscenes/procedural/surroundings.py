@@ -1,4 +1,4 @@
-"""Surroundings of a position: a scene to stand in, or an object to look at from outside."""
+"""Check whether a position is inside a scene, inside an object, or outside."""
 
 from __future__ import annotations
 
@@ -12,51 +12,51 @@ from lidarsim.base.arrays import Bools, Floats
 from lidarsim.scene.scene import Scene
 from raybeam import RayCaster, available_backends
 
-from .floor import triangles_reaching
+from .floor import triangles_in_box
 
-RAYS = 1000  # rays of each position, and of the outside
-HAND_M = 0.1  # surfaces nearer than this are in the way
-CLEAR_M = 0.5  # around a sensor in a scene
+RAYS = 1000  # rays from each position, and from outside
+HAND_M = 0.1  # closer hits are ignored
+CLEAR_M = 0.5  # required clearance around a sensor
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
-# Shares of rays. Of the rays down from 1, 2 and 3 m above a patch of ground 5 m wide, 0.4 meet the
-# patch.
+# Shares of rays. Of the downward rays from 1, 2, and 3 m above a patch of ground 5 m wide, a share
+# of 0.4 hits the patch.
 _GROUND = 0.4
 _SKY = 0.3
 _ENCLOSED = 0.95
 _CLOSED = 0.8
 _UPRIGHT = 0.9
 _FLOOR = 0.3
-_OPEN = 0.1  # a surface of this openness or more is not closed
+_OPEN = 0.1  # surfaces with a larger openness are open
 _LEAVES = 0.4  # maximum openness of leaves
-# A closed body whose inside has a floor and upright walls is a room of these sizes.
+# Limits for a room, which is a closed body with a floor and upright walls inside.
 _MIN_ROOM_WIDTH_M = 2.0
 _MAX_ROOM_HEIGHT_M = 15.0
-_WHOLE = 0.9  # share of the scene's sides that a body spans which is the whole scene
-# The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
+_WHOLE = 0.9  # a body that spans this share of each side is the whole scene
+# A room spans at least this share of the scene along each axis. Smaller bodies are objects in it.
 _SPANS = 1 / 3
-# Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
-# within 30 degrees of straight down. Shares of such rays that meet the cover of a position.
+# Limits for the z of directions: more than 10 degrees above the horizon, within 60 degrees of
+# straight up, and within 30 degrees of straight down. The shares are of rays that hit a cover.
 _RAISED = 0.17
 _UPWARD = 0.5
 _DOWNWARD = -0.87
 _COVERED = 0.9
 _WIDELY_COVERED = 0.95
-# Share of directions with surfaces inside a body; a flat surface fills at most half.
+# Minimum share of directions with surfaces inside a body. A flat surface covers at most half.
 _AROUND = 0.6
-# Distances and number of directions in which free positions are searched.
+# Distances and number of directions in which free positions are searched for.
 _STEPS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 _DIRECTIONS = 16
 
 
-def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
-    """Return whether a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
+def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
+    """Return True if a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
     points = np.asarray(positions, np.float64).reshape(-1, 3)
-    nearby = triangles_reaching(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
+    nearby = triangles_in_box(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
     if not len(nearby):
         return False
     caster = RayCaster(scene.vertices, scene.faces[nearby], "numpy")
-    directions = np.tile(directions_around(RAYS), (len(points), 1))
+    directions = np.tile(sphere_directions(RAYS), (len(points), 1))
     return bool(caster.cast(np.repeat(points, RAYS, axis=0), directions, t_max=CLEAR_M).hit.any())
 
 
@@ -64,117 +64,116 @@ def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
 class Views:
     """Hits of rays in all directions from a list of positions."""
 
-    directions: Floats  # (n, 3), unit vectors
-    distance: Floats  # (n,), meters; infinite without a hit
-    back: Bools  # (n,), whether the back of a triangle was hit
-    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 without a hit
-    heights: Floats  # (n,), local z of the hits
+    directions: Floats  # (n, 3) unit vectors
+    distance: Floats  # (n,) in meters, infinite without a hit
+    back: Bools  # (n,) whether the back of a triangle was hit
+    normals: Floats  # (n, 3) unit normals of the triangles hit, 0 without a hit
+    heights: Floats  # (n,) local z of the hits
 
     @property
     def hit(self) -> Bools:
-        """Mask (n,) of rays that meet a surface farther than a hand's breadth."""
+        """Mask (n,) of the rays that hit a surface at a distance of more than `HAND_M`."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
-    def in_a_body(self) -> bool:
-        """Whether surfaces are around, with only their backs visible."""
+    def is_inside_body(self) -> bool:
+        """Whether the positions are surrounded by surfaces of which only the backs are visible."""
         enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
         return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """The object around a position."""
+class EnclosingBody:
+    """The object that surrounds a position."""
 
     name: str
-    bounds: Floats  # (2, 3): lower and upper corner, local coordinates in meters
-    is_whole_scene: bool  # whether the scene has hardly anything else
+    bounds: Floats  # (2, 3) lower and upper corner, local coordinates in meters
+    is_whole_scene: bool  # whether the scene contains hardly anything else
 
 
-class Surroundings:
-    """Caster of a few thousand rays around positions in a scene without actors."""
+class PlacementChecker:
+    """Checks positions in a scene without actors by casting a few thousand rays."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        # Never CUDA, whose context would stay in this process.
+        # CUDA is avoided, because its context would remain in this process.
         backend = "numpy" if available_backends()["tiles"] else "tiles"
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
-    def views(self, positions: ArrayLike) -> Views:
-        """Return the views in all directions from local positions (k, 3)."""
+    def cast_around(self, positions: ArrayLike) -> Views:
+        """Cast rays in all directions from local positions (k, 3)."""
         points = np.asarray(positions, np.float64).reshape(-1, 3)
-        directions = directions_around(RAYS)
+        directions = sphere_directions(RAYS)
         return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
 
-    def outside(self) -> Views:
-        """Return the views of the scene from outside, from all directions."""
+    def cast_from_outside(self) -> Views:
+        """Cast rays at the scene from all directions."""
         lower, upper = self._scene.bounds
         across = float(np.linalg.norm(upper - lower))
-        towards = -directions_around(RAYS)
-        # Parallel rays would meet thin objects seldom: aim at a grid of points in the box.
+        toward = -sphere_directions(RAYS)
+        # Aim at a grid of points in the box, because parallel rays would rarely hit thin objects.
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
-        return self.cast(lower + shares * (upper - lower) - 2 * across * towards, towards)
+        return self.cast(lower + shares * (upper - lower) - 2 * across * toward, toward)
 
     def is_object(self, views: Views) -> bool:
-        """Return whether a scene is an object, by the views from positions of a sensor inside.
+        """Return whether a scene is an object, given the views from sensor positions inside it.
 
-        The scene is an object if almost no ray meets a surface, or if all sides of the scene look
-        outward and the positions are within the scene: not on ground, and not in a room with a
-        floor.
+        A scene is an object if almost no ray hits a surface, or if all its sides face outward and
+        the positions are inside it, rather than on ground or in a room with a floor.
         """
         down = views.directions[:, 2] < 0
         below = np.mean(views.hit[down])
         above = np.mean(views.hit[~down])
         if below < _GROUND and above < _GROUND:
             return True
-        outside = self.outside()
+        outside = self.cast_from_outside()
         back = np.mean(outside.back[outside.hit])
         if back > 1 - _CLOSED:
-            # A terrain from below, or the walls of a room. Of leaves and surfels, half are seen
-            # from behind; ground of surfels is below the sensor only.
+            # This is a terrain seen from below, or the walls of a room. Half of all leaves and
+            # surfels are seen from behind, but ground made of surfels is only below the sensor.
             leaves = back < _CLOSED and _openness(self._scene) < _LEAVES and above >= _SKY
             return bool(leaves and not _has_floor(views))
         if np.mean(np.isfinite(views.distance)) < _ENCLOSED:
             ground = np.mean((views.hit & ~views.back)[down]) >= _GROUND
-            # A machine with openings has surfaces above the sensor, too.
+            # A machine with openings also has surfaces above the sensor.
             return not (ground and (above < _SKY or _has_floor(views)))
         return not self._is_room(views)
 
-    def in_a_body(self, position: ArrayLike) -> bool:
+    def is_inside_body(self, position: ArrayLike) -> bool:
         """Return whether a local position (3,) is inside a closed body that is not a room.
 
         A body that stands on the ground may lack a bottom.
         """
-        views = self.views(position)
+        views = self.cast_around(position)
         hit_points = views.distance[views.hit, None] * views.directions[views.hit]
         sides = np.ptp(hit_points, axis=0) if len(hit_points) else np.zeros(3)
         spans = bool((sides >= _SPANS * np.ptp(self._scene.bounds, axis=0)).all())
-        if views.in_a_body:
+        if views.is_inside_body:
             return not (spans and self._is_room(views))
         raised = views.directions[:, 2] > _RAISED
         closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
-    def body_around(self, position: ArrayLike) -> Body:
-        """Return the object whose surfaces the most directions from a local position (3,) meet.
+    def find_enclosing_body(self, position: ArrayLike) -> EnclosingBody:
+        """Return the object that is hit in most directions from a local position (3,).
 
-        The position must see a surface.
+        At least one surface must be visible from the position.
         """
         points = np.tile(np.asarray(position, np.float64).reshape(3), (RAYS, 1))
-        hits = self._caster.cast(points, directions_around(RAYS))
+        hits = self._caster.cast(points, sphere_directions(RAYS))
         owner = int(np.bincount(self._scene.face_object[hits.triangle[hits.hit]]).argmax())
         faces = self._scene.faces[self._scene.face_object == owner]
         corners = self._scene.vertices[faces].reshape(-1, 3)
         bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
         sides = np.ptp(bounds, axis=0)
         whole = bool((sides >= _WHOLE * np.ptp(self._scene.bounds, axis=0)).all())
-        return Body(self._scene.names[owner], bounds, is_whole_scene=whole)
+        return EnclosingBody(self._scene.names[owner], bounds, is_whole_scene=whole)
 
-    def free_position(self, position: ArrayLike) -> Floats | None:
-        """Return the nearest free position (3,) of a grid around a local position, or None.
+    def find_free_position(self, position: ArrayLike) -> Floats | None:
+        """Return the nearest free position (3,) around a local position, or None.
 
-        The grid is level and within the scene. At a free position, the ground or a floor is
-        visible below, and no surface is close.
+        Candidates are at the same height and within the scene. At a free position, the ground or a
+        floor is visible below, and no surface is close.
         """
         start = np.asarray(position, np.float64).reshape(3)
         lower, upper = self._scene.bounds
@@ -186,23 +185,27 @@ class Surroundings:
         return None
 
     def is_free(self, position: ArrayLike) -> bool:
-        """Return whether a local position (3,) has ground below and no surfaces around or close."""
-        views = self.views(position)
+        """Return whether a local position (3,) has ground below and is not enclosed.
+
+        No surface may be within `CLEAR_M`.
+        """
+        views = self.cast_around(position)
         below = np.mean((views.hit & ~views.back)[views.directions[:, 2] < 0])
         return bool(
             below >= _GROUND
             and views.distance.min() >= CLEAR_M
-            and not self.in_a_body(position)
+            and not self.is_inside_body(position)
             and not self.is_covered(position)
         )
 
     def is_covered(self, position: ArrayLike) -> bool:
-        """Return whether a local position (3,) is under the scene: ground above, and empty below.
+        """Return whether a local position (3,) is below the scene.
 
-        Under ground without thickness, backs are above. Under other objects, such as a bridge, the
-        position is lower than the scene, and objects are above in almost all directions.
+        This is the case if nothing is straight below, and the backs of surfaces such as ground
+        without thickness are above. It is also the case if the position is lower than the scene and
+        objects, such as a bridge, are above in almost all directions.
         """
-        views = self.views(position)
+        views = self.cast_around(position)
         up = views.directions[:, 2]
         hits = np.isfinite(views.distance)
         if hits[up < _DOWNWARD].any():
@@ -215,10 +218,10 @@ class Surroundings:
         return bool(lower and np.mean(hits[up > _RAISED]) >= _WIDELY_COVERED)
 
     def _is_room(self, views: Views) -> bool:
-        """Return whether the body around the positions is a room, though all sides look outward."""
+        """Return whether the positions are in a room, although all sides face outward."""
         if not _has_floor(views):
             return False
-        if np.mean(views.back) < 1 - _CLOSED:  # walls with a thickness
+        if np.mean(views.back) < 1 - _CLOSED:  # the walls have a thickness
             return True
         upright = np.abs(views.normals[:, 2]) < 0.01
         sides = np.ptp(self._scene.bounds, axis=0)
@@ -226,7 +229,7 @@ class Surroundings:
         return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:
-        """Return the hits of rays from local origins (n, 3) along unit directions (n, 3)."""
+        """Cast rays from local origins (n, 3) along unit directions (n, 3)."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -238,12 +241,12 @@ class Surroundings:
 
 
 def _is_level(views: Views) -> Bools:
-    """Return a mask (n,) of rays that hit level surfaces."""
+    """Return a mask (n,) of the rays that hit level surfaces."""
     return np.asarray(np.abs(views.normals[:, 2]) > 0.99)
 
 
 def _has_floor(views: Views) -> bool:
-    """Return whether steep rays down meet level surfaces of about the same height."""
+    """Return whether steep downward rays hit level surfaces at about the same height."""
     steep = (views.directions[:, 2] < -0.7) & np.isfinite(views.distance)
     heights = views.heights[steep & _is_level(views)]
     floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
@@ -251,14 +254,17 @@ def _has_floor(views: Views) -> bool:
 
 
 def is_open(scene: Scene) -> bool:
-    """Return whether a scene's surfaces are open, such as a terrain, without casting rays."""
+    """Return whether the surfaces of a scene are open, as those of a terrain are.
+
+    No rays are cast.
+    """
     return _openness(scene) > _OPEN
 
 
 def _openness(scene: Scene) -> float:
-    """Return the length of the sum of area vectors over the sum of areas: 0 to 1.
+    """Return the length of the sum of area vectors divided by the sum of areas, from 0 to 1.
 
-    Area vectors are along the normals; the area vectors of a closed surface add up to zero.
+    Area vectors point along the normals. For a closed surface, they add up to zero.
     """
     total = np.zeros(3)
     area = 0.0
@@ -270,8 +276,8 @@ def _openness(scene: Scene) -> float:
     return float(np.linalg.norm(total)) / max(area, 1e-300)
 
 
-def directions_around(count: int) -> Floats:
-    """Return unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
+def sphere_directions(count: int) -> Floats:
+    """Return unit vectors (count, 3), evenly distributed over a sphere along a Fibonacci spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count
     angle = np.pi * (1 + np.sqrt(5)) * numbers

@@ -1,16 +1,13 @@
-"""Generated hills and mountains."""
+"""Generate hills and mountains."""
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
-from pydantic import Field
 
 from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.checks import check_fits, check_number
 from lidarsim.base.declared import Seed
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -19,59 +16,62 @@ from .plants import MAX_TREES, SCALES, SPECIES, all_trees, place_instances
 
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
-_ROUGHNESS = 0.5  # height of each octave over the height of the octave before
-_RELIEF = 0.16  # greatest height over the side's length
+_ROUGHNESS = 0.5  # ratio between the heights of consecutive octaves
+_RELIEF = 0.16  # maximum height divided by the side length
 
-# A cell has at most a tree, at the flattest of a few positions in its middle part.
+# A cell has at most one tree, at the flattest of a few positions in its central part.
 _CELL_M = 5.0
 _MAX_CELLS = 1_000
-_TRIED = 4  # positions in a cell
-_MIDDLE = 0.4  # share of a cell's side
+_TRIED = 4  # positions that are tried in a cell
+_MIDDLE = 0.4  # size of the central part as a share of the cell
 _STEEPEST = np.tan(np.radians(40.0))
 _ROOT_M = 0.6
 _EDGE_M = 5.0  # margin of the terrain without trees
-_GLADE_M = 12.0  # radius without trees around the middle, where a sensor stands by default
+_GLADE_M = 12.0  # radius without trees around the center, where a sensor stands by default
 _WOODS_M = 120.0  # size of woods
-_WOOD_CELLS = 20  # minimum size of woods, in cells
-_DENSER = 5.0  # density of woods over the density in between, as an exponent
+_WOOD_CELLS = 20  # minimum size of woods in cells
+_DENSER = 5.0  # logarithm of the density ratio between woods and open land
 
 
-@checked
 def terrain(
-    triangles: Annotated[int, Field(ge=2, le=100_000_000)] = 2_000_000,
-    seed: Seed = 0,
-    # Files reject coordinates beyond 1e8 m.
-    side_m: Annotated[float, Field(gt=0, le=1e7)] = 1000.0,
-    trees: Annotated[int, Field(ge=0, le=MAX_TREES)] = 0,
+    triangles: int = 2_000_000,
+    seed: int = 0,
+    side_m: float = 1000.0,
+    trees: int = 0,
 ) -> Scene:
-    """Return a square of fractal terrain: ridges and valleys at every scale, flatter low down.
+    """Return a square of fractal terrain with ridges and valleys at every scale.
 
     The height is a sum of octaves of gradient noise (Perlin 1985), folded into ridges. Each octave
-    is damped where the octaves before are low: a multifractal (Musgrave, Kolb and Mace 1989).
+    is damped where the previous octaves are low, which makes low ground flatter. This is a
+    multifractal (Musgrave, Kolb and Mace 1989).
 
     Parameters
     ----------
     triangles
-        Number of triangles; the scene has a full grid, up to a row fewer.
+        Number of triangles. The terrain is a complete grid, so it has up to a row fewer.
     seed
-        The same numbers give the same terrain.
+        Seed of the random generator. The same arguments always result in the same terrain.
     side_m
-        Length of a side, meters; (0, 0) is in the middle, and z = 0 is the lowest point.
+        Side length in meters. The center is at (0, 0), and the lowest point is at z = 0.
     trees
-        Number of trees, in woods on ground of at most 40 degrees: instances of a mesh for each of
-        `SPECIES` in plants.py. Conifers are higher up. Triangles of trees are not counted in
+        Number of trees. They are instances of the `SPECIES` in plants.py, in woods on slopes of up
+        to 40 degrees, with conifers at higher altitudes. Their triangles are not counted in
         `triangles`.
 
     Raises
     ------
     LidarError
-        For a number that is out of range, or trees that do not fit.
+        If a number is out of range, or if there is not enough space for the trees.
 
     Examples
     --------
     >>> len(terrain(2_000).faces)
     1984
     """
+    check_number("triangles", triangles, whole=True, ge=2, le=100_000_000)
+    check_fits("seed", seed, Seed)
+    check_number("side_m", side_m, gt=0, le=1e7)  # files reject coordinates beyond 1e8 m
+    check_number("trees", trees, whole=True, ge=0, le=MAX_TREES)
     rows = int(np.sqrt(triangles / 2))
     columns = triangles // (2 * rows)
     x = np.linspace(0, 1, columns + 1)
@@ -87,7 +87,7 @@ def terrain(
 
 
 def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneInstance]:
-    """Return trees in woods on ground of the heights over a square grid."""
+    """Return trees in woods, given the heights on a square grid."""
     if not count:
         return []
     rng = np.random.default_rng([seed, count])
@@ -118,7 +118,7 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
 def _flattest_positions(
     heights: Floats, side_m: float, cells: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the flattest of random positions in each cell, (cells², 3), and slopes (cells²,)."""
+    """Return the flattest of several random positions (cells², 3) in each cell, and its slope."""
     number = np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), axis=-1)
     inside = 0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_TRIED, cells * cells, 2))
     shares = (number.reshape(-1, 2) + inside) / max(cells, 1)
@@ -129,7 +129,7 @@ def _flattest_positions(
 
 
 def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, Floats]:
-    """Return heights and slopes (rise over run) of triangles at shares (..., 2) of the sides."""
+    """Return the heights and slopes of the terrain at fractions (..., 2) of the sides."""
     size = np.array(heights.shape) - 1
     grid_position = share * size
     i, j = np.moveaxis(np.minimum(grid_position.astype(np.int64), size - 1), -1, 0)
@@ -145,7 +145,7 @@ def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, F
 
 
 def grid_faces(column_count: int, row_count: int) -> Ints:
-    """Return two triangles for each cell of a grid of points: (columns * rows, 2, 3).
+    """Return two triangles for each cell of a grid, shape (columns * rows, 2, 3).
 
     The grid has (columns + 1) x (rows + 1) points.
     """
@@ -157,7 +157,7 @@ def grid_faces(column_count: int, row_count: int) -> Ints:
 
 
 def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
-    """Return heights from 0 to `_RELIEF` on a grid of coordinates from 0 to 1: (len(x), len(y))."""
+    """Return heights (len(x), len(y)) from 0 to `_RELIEF` on a grid from 0 to 1."""
     total = np.zeros((len(x), len(y)))
     damping = np.ones_like(total)
     for octave in range(_OCTAVES):
@@ -167,7 +167,7 @@ def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
         ridge = 1 - np.abs(_noise(x * cells, y * cells, rng))
         ridge *= ridge * damping
         total += _ROUGHNESS**octave * ridge
-        # High ground is rough: the next octave counts fully there.
+        # High ground is rough, so the next octave is not damped there.
         np.clip(1.6 * ridge, 0, 1, out=damping)
     total -= total.min()
     highest = total.max()
@@ -175,9 +175,9 @@ def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _noise(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
-    """Return gradient noise of about -1 to 1 on a grid: (len(x), len(y)).
+    """Return gradient noise (len(x), len(y)) on a grid, with values of about -1 to 1.
 
-    Gradients are at whole numbers of x and y.
+    The gradients are at integer coordinates.
     """
     shape = (int(x.max()) + 2, int(y.max()) + 2)
     angle = rng.uniform(0, 2 * np.pi, shape)

@@ -1,1 +1,1 @@
-"""Roads of OpenDRIVE as meshes: reference lines, lanes, road marks, objects and signals."""
+"""Read OpenDRIVE roads: reference lines, lanes, road marks, objects, and signals."""

@@ -1,7 +1,7 @@
-"""Stations along roads: where cross sections stand so that triangles keep to a tolerance.
+"""Place cross sections along roads so that triangles between them stay within a tolerance.
 
-What changes along a road is given in pieces, and may step where a piece starts. A station there
-has values from before or from after the step, and a surface with a step has both stations.
+Everything that varies along a road is defined in pieces, and may step where a piece starts. At a
+step, a station has values from either before or after the step, and a surface has both stations.
 """
 
 from __future__ import annotations
@@ -15,79 +15,80 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 
-GAP_M = 1e-6  # starts of pieces that are nearer to each other are one
-HEIGHT_SHARE = 0.1  # tolerance of heights, as a share of the tolerance in plan
-SAMPLES = 5  # points of an interval that measure its curvatures
-_MAX_SAMPLED_M = 30.0  # length of an interval
-_MAX_CUTS = 64  # parts of an interval that is longer
-MAX_STEPS = 1e9  # limit for an interval; no memory holds as many
-_GROUP_SIZE = 1 << 17  # coordinates of surfaces that are measured together
+GAP_M = 1e-6  # starts of pieces that are closer together count as one
+HEIGHT_SHARE = 0.1  # height tolerance as a share of the tolerance in plan
+SAMPLES = 5  # points in an interval for measuring curvatures
+_MAX_SAMPLED_M = 30.0  # maximum length of a sampled interval
+_MAX_CUTS = 64  # maximum number of parts of a longer interval
+MAX_STEPS = 1e9  # maximum number of parts of an interval, more than fit into memory
+_GROUP_SIZE = 1 << 17  # number of coordinates that are measured together
 _STEP_SHARE = 0.01  # smallest step that gets two stations, as a share of the tolerance in plan
-_MARGIN = 0.94  # share of tolerances, since the second differences of samples do not show all
-_LEAST_WIDTH_M = 1e-4  # cells that are narrower show no slope across the road
-_MAX_STEEPENING = 10.0  # steepening in a cell, where a road turns about a point of its surface
-_FOLDED_SHARE = 0.3  # share of a cell; cells that are folded further keep no height
-# Weights of the values of a parabola that extrapolate it: by a sample, and by half a sample.
+_MARGIN = 0.94  # share of the tolerance to use, because samples underestimate the error
+_LEAST_WIDTH_M = 1e-4  # narrower cells have no reliable slope across the road
+_MAX_STEEPENING = 10.0  # limits slopes where a road turns about a point on its surface
+_FOLDED_SHARE = 0.3  # cells that are folded by a larger share have no unique height
+# Weights that extrapolate a parabola from three values by one sample and by half a sample.
 _FROM_MIDDLE = np.array([3.0, -3.0, 1.0])
 _FROM_PARTS = np.array([1.875, -1.25, 0.375])
-_TWIST_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # across a cell, where the error of its twist is judged
+_TWIST_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # positions across a cell for measuring its twist
 
 
 @dataclass(frozen=True, eq=False)
-class Stations:
+class RoadStations:
     """Stations on a road.
 
     Attributes
     ----------
     s
-        (k,): distances along the road, m.
+        (k,) distances along the road in meters.
     pieces
-        (k,): distances in whose pieces the values are, m: `s`, or just before.
+        (k,) distances that select the pieces from which values are taken, in meters: `s`, or
+        slightly less to select the piece before a step.
     """
 
     s: Floats
     pieces: Floats
 
     @classmethod
-    def at(cls, distances: Floats) -> Stations:
-        """Return stations at distances (k,), each after the steps there."""
+    def at(cls, distances: Floats) -> RoadStations:
+        """Return stations at distances (k,), with values from after any steps."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
         return len(self.s)
 
-    def take(self, station_selection: AnyArray | slice) -> Stations:
+    def select(self, station_selection: AnyArray | slice) -> RoadStations:
         """Return selected stations."""
-        return Stations(self.s[station_selection], self.pieces[station_selection])
+        return RoadStations(self.s[station_selection], self.pieces[station_selection])
 
 
-class Samples(NamedTuple):
-    """Stations at which a surface is measured, and the intervals that these belong to."""
+class SurfaceSamples(NamedTuple):
+    """The stations at which a surface is measured, and their intervals."""
 
     intervals: Intervals
-    stations: Stations
+    stations: RoadStations
 
 
 class PlacedStations(NamedTuple):
-    """The stations of a surface."""
+    """The stations at which a surface gets its vertices."""
 
-    stations: Stations
-    steps: Ints  # (j,): stations that the next follows at the same distance, after a step
+    stations: RoadStations
+    steps: Ints  # (j,) stations before a step, where the next station has the same distance
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals of a road, each with a single piece of every polynomial.
+    """Intervals of a road in which every polynomial has a single piece.
 
     Attributes
     ----------
     ends
-        (n, 2): starts and stops, m.
+        (n, 2) starts and stops in meters.
     pieces
-        (n, 2): distances in whose pieces the values at starts and stops are, m.
+        (n, 2) distances that select the pieces for starts and stops, in meters.
     has_lead
-        Whether the first interval has no length. It is the end of what is before the surface: if
-        the road steps where the surface starts, the surface starts with that step.
+        Whether the first interval has zero length. It then represents the end of the road before
+        the surface, so that a surface can start with a step.
     """
 
     ends: Floats
@@ -98,7 +99,7 @@ class Intervals:
     def between(cls, start: float, stop: float, breaks: Floats) -> Intervals:
         """Return the intervals between two distances.
 
-        Pieces start at the breaks (b,).
+        `breaks` (b,) are the distances at which pieces start.
         """
         inside = np.sort(breaks[(breaks > start + GAP_M) & (breaks < stop - GAP_M)])
         is_far = inside[1:] - inside[:-1] > GAP_M
@@ -110,7 +111,7 @@ class Intervals:
         pieces[0, 0] = breaks[np.abs(breaks - start) <= GAP_M].max(initial=start)
         pieces[-1, 1] = breaks[np.abs(breaks - stop) <= GAP_M].min(initial=stop) - GAP_M / 2
         if count:
-            # The first and the last of the breaks that are one.
+            # The first and the last of the breaks that count as one.
             first = np.concatenate([inside[:1], inside[1:][is_far]])
             ends[1:, 0] = first
             ends[:-1, 1] = first
@@ -119,7 +120,7 @@ class Intervals:
         return cls(ends, pieces)
 
     def with_lead(self, breaks: Floats) -> Intervals:
-        """Return the intervals after a lead, if pieces of the road start where they start."""
+        """Add a lead interval if pieces of the road start where the intervals start."""
         start = self.ends[0, 0]
         at_start = breaks[np.abs(breaks - start) <= GAP_M]
         if not len(at_start) or start <= GAP_M:
@@ -131,18 +132,18 @@ class Intervals:
             has_lead=True,
         )
 
-    def sampled(self, *, are_planes: bool) -> Samples:
-        """Return stations that measure the surface, in intervals that may be shorter.
+    def surface_samples(self, *, are_planes: bool) -> SurfaceSamples:
+        """Return the stations at which to measure the surface, possibly in shorter intervals.
 
-        Of planes two samples in an interval show their steps.
+        In planes, two samples per interval are enough to detect steps.
         """
         if are_planes:
-            return Samples(self, self.samples(2))
+            return SurfaceSamples(self, self.samples(2))
         intervals = self._cut()
-        return Samples(intervals, intervals.samples(SAMPLES))
+        return SurfaceSamples(intervals, intervals.samples(SAMPLES))
 
     def _cut(self) -> Intervals:
-        """Return shorter intervals, whose samples show curvatures that change along the road."""
+        """Divide long intervals, so that samples capture curvatures that vary along the road."""
         spans = self.ends[:, 1] - self.ends[:, 0]
         if spans.max() <= _MAX_SAMPLED_M:
             return self
@@ -163,20 +164,23 @@ class Intervals:
     def __len__(self) -> int:
         return len(self.ends)
 
-    def samples(self, count: int) -> Stations:
-        """Return stations of each interval, (n * count,), from its start to its stop."""
+    def samples(self, count: int) -> RoadStations:
+        """Return `count` evenly spaced stations in each interval, shape (n * count,).
+
+        They include the start and the stop of the interval.
+        """
         starts = self.ends[:, :1]
         s = starts + (self.ends[:, 1:] - starts) * np.linspace(0, 1, count)
         s[:, -1] = self.ends[:, 1]
         pieces = s.copy()
         pieces[:, 0] = self.pieces[:, 0]
         pieces[:, -1] = self.pieces[:, 1]
-        return Stations(s.ravel(), pieces.ravel())
+        return RoadStations(s.ravel(), pieces.ravel())
 
-    def placed(self, counts: Ints, steps: Bools) -> PlacedStations:
+    def place(self, counts: Ints, steps: Bools) -> PlacedStations:
         """Return stations that divide each interval into a number of parts.
 
-        `steps` are True for intervals (n,) at whose stop the surface steps.
+        `steps` (n,) marks intervals with a step of the surface at their stop.
         """
         has_stop = steps.copy()
         has_stop[-1] = True
@@ -196,19 +200,19 @@ class Intervals:
         s[is_stop] = self.ends[interval_indices[is_stop], 1]
         pieces = np.where(within == 0, self.pieces[interval_indices, 0], s)
         pieces[is_stop] = self.pieces[interval_indices[is_stop], 1]
-        return PlacedStations(Stations(s, pieces), np.flatnonzero(is_stop)[:-1])
+        return PlacedStations(RoadStations(s, pieces), np.flatnonzero(is_stop)[:-1])
 
 
 class SampledSurface(NamedTuple):
-    """A surface along a road at samples of intervals, which place its stations."""
+    """A surface along a road, measured at samples."""
 
     intervals: Intervals
-    points: Floats  # (c, n * m, 3): columns of points, from right to left, at m samples each, m
-    is_cell: Bools  # (c - 1,): whether there is a surface between a column and the next
-    height_m: float  # tolerance of heights, m
+    points: Floats  # (c, n * m, 3) columns of points from right to left, at m samples each, meters
+    is_cell: Bools  # (c - 1,) whether there is a surface between a column and the next one
+    height_m: float  # height tolerance in meters
 
     def is_step(self, sag_m: float) -> Bools:
-        """Return True for the intervals (n,) at whose stop the surface steps."""
+        """Return a mask (n,) of the intervals with a step of the surface at their stop."""
         count = len(self.intervals)
         if count < 2:
             return np.zeros(count, np.bool_)
@@ -219,11 +223,11 @@ class SampledSurface(NamedTuple):
 
     @property
     def is_measured(self) -> bool:
-        """Whether the samples show curvatures: a plane has two samples in an interval."""
+        """Whether there are enough samples to measure curvatures; planes have two per interval."""
         return len(self.points) > 0 and self.points.shape[1] == SAMPLES * len(self.intervals)
 
     def parts(self) -> Iterator[SampledSurface]:
-        """Yield the surface in parts of some intervals each, which take less memory."""
+        """Yield the surface in parts with a few intervals each, which need less memory."""
         count = len(self.points)
         points = self.points.reshape(count, len(self.intervals), -1, 3)
         step = max(1, _GROUP_SIZE // points[:, 0].size)
@@ -237,17 +241,21 @@ class SampledSurface(NamedTuple):
             )
 
 
-def placed_stations(
+def place_stations(
     surfaces: Sequence[SampledSurface], sag_m: float, allowance: Allowance, bytes_per_point: int
 ) -> list[PlacedStations]:
-    """Return the stations of surfaces whose triangles are within a tolerance.
+    """Place the stations of surfaces so that their triangles are within a tolerance.
 
     Parameters
     ----------
+    surfaces
+        The surfaces.
     sag_m
-        Tolerance in plan, m.
+        Tolerance in plan in meters.
+    allowance
+        Memory that the points of the surfaces may occupy.
     bytes_per_point
-        Memory that a point of the surfaces takes of the allowance, bytes.
+        Memory per point in bytes.
     """
     surface_counts = _part_counts_in_groups(surfaces, sag_m)
     placed = []
@@ -258,13 +266,13 @@ def placed_stations(
             columns = len(surface.points) + 2
             allowance.take((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
         placed.append(
-            surface.intervals.placed(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
+            surface.intervals.place(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
         )
     return placed
 
 
 def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> Iterator[Floats]:
-    """Yield the part counts of the surfaces that are measured, with the memory of few of them."""
+    """Yield the part counts of the measured surfaces, processing a few surfaces at a time."""
     group: list[SampledSurface] = []
     size = 0
     for surface in surfaces:
@@ -284,22 +292,23 @@ def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> 
 
 
 def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats]:
-    """Return the numbers of parts (n,), not rounded, that the intervals of each surface need.
+    """Return the numbers of parts (n,) into which to divide the intervals of each surface.
 
-    Triangles between two cross sections differ from the surface by its bend along the road, which
-    shrinks with the square of the distance, and by the twist between two columns, which shrinks
-    with the distance. Both are measured in heights where the plan is the same: a curve whose chord
-    is beside it by centimeters is also too high, by this times the slope across the road.
+    The numbers are not rounded. Triangles between two cross sections deviate from the surface for
+    two reasons: the bend along the road, which decreases with the square of the distance, and the
+    twist between two columns, which decreases with the distance. Both are measured as height
+    differences at the same position in plan: a chord that is beside a curve is also too high or too
+    low on a road that slopes sideways.
     """
     if not surfaces:
         return []
     points = np.concatenate([surface.points.reshape(-1, SAMPLES, 3) for surface in surfaces])
     x, y, z = np.moveaxis(points, -1, 0)
-    columns = _Columns.of(surfaces)
+    columns = _Columns.from_surfaces(surfaces)
     beside, heights = _bend_errors(x, y, z, columns)
     twist = _twist_errors(x, y, z, columns)
     in_plan = np.sqrt(beside / (_MARGIN * sag_m))
-    # Parts p for which heights / p² + twist / p is the tolerance.
+    # Solve heights / p² + twist / p = tolerance for the number of parts p.
     sizes = [len(surface.intervals) for surface in surfaces]
     tolerance = _MARGIN * np.repeat([surface.height_m for surface in surfaces], sizes)
     in_height = (twist + np.sqrt(twist * twist + 4 * heights * tolerance)) / (2 * tolerance)
@@ -308,15 +317,15 @@ def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats
 
 
 class _Columns(NamedTuple):
-    """Columns of points of surfaces in intervals, one after another, and the cells between them."""
+    """The columns of points of several surfaces in intervals, and the cells between them."""
 
     size: int  # number of intervals
-    intervals: Ints  # (r,): interval of each column
-    right: Ints  # (q,): columns on the right of cells
-    left: Ints  # (q,): columns on the left of cells
+    intervals: Ints  # (r,) interval of each column
+    right: Ints  # (q,) columns on the right of cells
+    left: Ints  # (q,) columns on the left of cells
 
     @classmethod
-    def of(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
+    def from_surfaces(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
         """Return the columns of surfaces."""
         intervals = []
         right = []
@@ -337,19 +346,19 @@ class _Columns(NamedTuple):
         return cls(count, *(np.concatenate(arrays) for arrays in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (r, k) of columns in each interval (n,), as `_largest`."""
+        """Return the largest column value (r, k) in each interval (n,), as `_largest` does."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (q, k) of cells in each interval (n,), as `_largest`."""
+        """Return the largest cell value (q, k) in each interval (n,), as `_largest` does."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:
-        """Return the largest magnitude of the values in each of the n = `size` intervals: (n,).
+        """Return the largest magnitude (n,) of the values in each interval.
 
-        Row j of the values (m, k) has k samples along the interval `intervals[j]`, of (m,). `ends`
-        (3,) are the weights of the first three values, which extrapolate to the start of the
-        interval, and in reverse order of the last three, which extrapolate to its stop.
+        Row j of the values (m, k) contains k samples along the interval `intervals[j]`. The weights
+        `ends` (3,) extrapolate the first three values to the start of the interval and, in reverse
+        order, the last three values to its stop.
         """
         a, b, c = ends
         first = np.abs(a * values[:, 0] + b * values[:, 1] + c * values[:, 2])
@@ -361,7 +370,7 @@ class _Columns(NamedTuple):
 
 
 def has_extent(points: Floats, faces: Ints) -> Bools:
-    """Return False for triangles (f, 3) that are thinner than what the smallest step shows."""
+    """Return a mask of the triangles (f, 3) that are not degenerate."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     edges = np.stack([b - a, c - a, c - b])
@@ -370,8 +379,8 @@ def has_extent(points: Floats, faces: Ints) -> Bools:
 
 
 def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Floats, Floats]:
-    """Return the errors in plan and in height (n,) of triangles of whole intervals by bends."""
-    # Half of the second differences, a quarter of the error of a whole interval: (r, 3).
+    """Return the errors (n,) that bends cause in plan and in height, for undivided intervals."""
+    # Half of the second differences (r, 3), a quarter of the error of an undivided interval.
     bends = [(v[:, 2:] + v[:, :-2]) / 2 - v[:, 1:-1] for v in (x, y, z)]
     along = [v[:, 2:] - v[:, :-2] for v in (x, y, z)]
     beside = columns.largest_of_columns(_beside(bends, along), _FROM_MIDDLE)
@@ -391,7 +400,7 @@ def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Fl
 
 
 def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
-    """Return the errors in height (n,) of triangles by the twist of their cells."""
+    """Return the height errors (n,) that the twist of cells causes."""
     along = [v[:, 1:] - v[:, :-1] for v in (x, y, z)]
     across = [(v[:, 1:] + v[:, :-1]) / 2 for v in (x, y, z)]
     across = [v[columns.left] - v[columns.right] for v in across]
@@ -401,7 +410,7 @@ def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
     volumes = _determinant(right, across, left)
     areas = [_cross(right, across), _cross(left, across)]
     largest = np.maximum(np.abs(areas[0]), np.abs(areas[1]))
-    # A cell that is folded where the road turns inside it has several heights at a position.
+    # Where a road turns inside a cell, the cell is folded and has several heights at a position.
     folded = np.minimum(areas[0] * areas[1], 0) < -_FOLDED_SHARE * largest * largest
     floor = np.where(folded, largest, largest / _MAX_STEEPENING)
     errors = np.zeros_like(volumes)
@@ -413,21 +422,21 @@ def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
 
 
 def _beside(bends: list[Floats], along: list[Floats]) -> Floats:
-    """Return the parts of vectors in plan that are across their lines."""
+    """Return the components of vectors perpendicular to lines in plan."""
     length = np.sqrt(along[0] * along[0] + along[1] * along[1])
     turned = np.abs(_cross(bends, along)) / np.maximum(length, 1e-30)
-    # Lines that stand still in plan, where a road turns about them, have no direction.
+    # A line that does not move in plan, because the road turns about it, has no direction.
     whole = np.sqrt(bends[0] * bends[0] + bends[1] * bends[1])
     return np.asarray(np.where(length > GAP_M, turned, whole))
 
 
 def _cross(a: list[Floats], b: list[Floats]) -> Floats:
-    """Return the upright components of vector products."""
+    """Return the vertical components of cross products."""
     return np.asarray(a[0] * b[1] - a[1] * b[0])
 
 
 def _determinant(a: list[Floats], b: list[Floats], c: list[Floats]) -> Floats:
-    """Return the triple products of vectors."""
+    """Return the scalar triple products of vectors."""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1])
         + a[1] * (b[2] * c[0] - b[0] * c[2])
@@ -436,5 +445,5 @@ def _determinant(a: list[Floats], b: list[Floats], c: list[Floats]) -> Floats:
 
 
 def _is_wide(across: list[Floats]) -> Bools:
-    """Return True for cells that are wide enough in plan to have a slope."""
+    """Return a mask of the cells that are wide enough in plan to have a slope."""
     return np.asarray(across[0] * across[0] + across[1] * across[1] > _LEAST_WIDTH_M**2)

@@ -1,4 +1,4 @@
-"""Cubic polynomials of a distance, in pieces: elevations, widths and offsets of OpenDRIVE."""
+"""Evaluate piecewise cubic polynomials of a distance, such as OpenDRIVE elevations and widths."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
 
-from .cross_sections import Stations
-from .elements import number
+from .cross_sections import RoadStations
+from .elements import read_number
 
 
 class Cubics:
     """Cubic polynomials, each valid from its start to the start of the next.
 
-    Without any polynomial, the value is 0.
-
-    Before the first start, the value of the first start holds.
+    Before the first start, the value at the first start applies. Without any polynomial, the value
+    is 0.
 
     Parameters
     ----------
@@ -33,21 +32,21 @@ class Cubics:
         self.starts: Floats = table[:, 0].copy()  # (n,)
         self._coefficients = table[:, 1:].T.copy()  # (4, n)
         self.is_constant = not table[:, 2:].any()  # between starts
-        self.bent = bool(table[:, 3:].any())  # whether second derivatives are not all zero
+        self.bent = bool(table[:, 3:].any())  # whether any second derivative is nonzero
 
     @classmethod
     def read(cls, elements: Iterable[Element], start: str = "s", origin: float = 0.0) -> Cubics:
-        """Return the polynomials of elements, whose starts are relative to an origin."""
+        """Read the polynomials in elements, whose starts are relative to an origin."""
         rows = [
-            (origin + number(e, start, 0.0), *(number(e, name, 0.0) for name in "abcd"))
+            (origin + read_number(e, start, 0.0), *(read_number(e, name, 0.0) for name in "abcd"))
             for e in elements
         ]
-        return cls(rows) if rows else NOTHING
+        return cls(rows) if rows else NO_CUBICS
 
     def __len__(self) -> int:
         return len(self.starts)
 
-    def values(self, stations: Stations) -> Floats:
+    def values(self, stations: RoadStations) -> Floats:
         """Return the values at stations (k,)."""
         if not len(self):
             return np.zeros_like(stations.s)
@@ -58,7 +57,7 @@ class Cubics:
         x = np.maximum(stations.s - self.starts[row_indices], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
-    def slopes(self, stations: Stations) -> Floats:
+    def slopes(self, stations: RoadStations) -> Floats:
         """Return the first derivatives at stations (k,)."""
         if self.is_constant:
             return np.zeros_like(stations.s)
@@ -68,8 +67,8 @@ class Cubics:
         return np.asarray((3 * d * x + 2 * c) * x + b)
 
     def _row_indices(self, distances: Floats) -> Ints:
-        """Return the polynomials (k,) that are valid at distances."""
+        """Return the indices of the polynomials that are valid at distances (k,)."""
         return np.maximum(np.searchsorted(self.starts, distances, "right") - 1, 0)
 
 
-NOTHING = Cubics()
+NO_CUBICS = Cubics()

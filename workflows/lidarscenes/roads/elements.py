@@ -1,4 +1,4 @@
-"""Elements of OpenDRIVE files: checked numbers, and a count of the elements that are not read."""
+"""Read validated numbers from OpenDRIVE elements, and count elements that are not read."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from xml.etree.ElementTree import Element
 from lidarsim.base.words import plural
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-MAX_SHOWN = 40  # letters of a value that an error shows
-# Elements that carry no geometry, in any element.
+MAX_SHOWN = 40  # maximum number of characters of a value in an error message
+# Elements without geometry, which may occur anywhere.
 _WITHOUT_GEOMETRY = {"userData", "dataQuality", "link", "validity", "vectorScene", "vectorRoad"}
 
 
-def number(element: Element, name: str, default: float | None = None) -> float:
-    """Return a number of an element.
+def read_number(element: Element, name: str, default: float | None = None) -> float:
+    """Return an attribute as a number.
 
-    Raises MeshFileError if it is missing without a default, or broken.
-
-    An empty text is missing.
+    An empty attribute counts as missing. Raises MeshFileError if the attribute is missing and there
+    is no default, or if it is invalid.
     """
     text = element.get(name)
     if not text:
@@ -41,12 +40,12 @@ def number(element: Element, name: str, default: float | None = None) -> float:
     return value
 
 
-def positive(element: Element, name: str, default: float | None = None) -> float:
-    """Return a number of 0 or more of an element.
+def read_non_negative(element: Element, name: str, default: float | None = None) -> float:
+    """Return an attribute as a number.
 
-    Raises MeshFileError if it is negative.
+    Raises MeshFileError if it is negative, or as `read_number` does.
     """
-    value = number(element, name, default)
+    value = read_number(element, name, default)
     if value < 0:
         raise MeshFileError(
             f"contains <{element.tag}> with {name} {value:g}, which must not be negative. "
@@ -56,13 +55,13 @@ def positive(element: Element, name: str, default: float | None = None) -> float
 
 
 class UnreadElements:
-    """Count of the elements that are not read, by their tags."""
+    """Counts elements that are not read, by their tags."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
 
     def add(self, tag: str, count: int = 1) -> None:
-        """Count elements of a tag, or other content that is described by words."""
+        """Count elements with a tag, or other content that is described in words."""
         self._counts[tag[:MAX_SHOWN]] += count
 
     def check(self, element: Element, known: Collection[str]) -> None:
@@ -72,14 +71,14 @@ class UnreadElements:
                 self.add(child.tag)
 
     def __str__(self) -> str:
-        """Return counts and tags, or words: «2 bridge, 3 objects without a size».
+        """Return the counts and tags, for example "2 bridge, 3 objects without a size".
 
-        The text may be empty.
+        The text is empty if everything was read.
         """
         return ", ".join(_counted(count, tag) for tag, count in self._counts.items())
 
 
 def _counted(count: int, tag: str) -> str:
-    """Return a count and a tag, or words whose first is in the plural for several."""
+    """Return a count with a tag, or with words of which the first is pluralized."""
     noun, space, rest = tag.partition(" ")
     return f"{plural(count, noun)} {rest}" if space else f"{count} {tag}"

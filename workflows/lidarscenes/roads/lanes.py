@@ -1,7 +1,7 @@
-"""Lanes of roads as strips of triangles: sections, borders, heights and kerbs.
+"""Convert lanes to strips of triangles: lane sections, borders, heights, and curbs.
 
-`section_surfaces` measures the surface of each section at samples, and makes its triangles at
-stations that follow from the samples.
+`section_surfaces` measures the surface of each lane section at samples, and then places the
+stations of its triangles according to the measured curvatures.
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ from .cross_sections import (
     SAMPLES,
     Intervals,
     PlacedStations,
+    RoadStations,
     SampledSurface,
-    Samples,
-    Stations,
+    SurfaceSamples,
     has_extent,
-    placed_stations,
+    place_stations,
 )
-from .cubics import NOTHING, Cubics
-from .elements import MAX_SHOWN, UnreadElements, number
-from .road import Frames, Network, Road
+from .cubics import NO_CUBICS, Cubics
+from .elements import MAX_SHOWN, UnreadElements, read_number
+from .road import Road, RoadFrames, RoadNetwork
 
-_ACROSS_SHARE = 0.3  # share of the tolerance of heights, for cross sections that are curved
-_KERB_M = 1e-3  # least height of a kerb
-_MIN_COLUMNS = 2  # columns of points of a section with lanes
-_BYTES_PER_POINT = 400  # peak memory of a point of a lane
-_HALVINGS = 30  # halvings of an interval to find a crossing of two borders
+_ACROSS_SHARE = 0.3  # share of the height tolerance that is used for curved cross sections
+_CURB_M = 1e-3  # minimum height of a curb
+_MIN_COLUMNS = 2  # minimum number of point columns in a section with lanes
+_BYTES_PER_POINT = 400  # peak memory per point of a lane
+_HALVINGS = 30  # bisection steps for finding where two borders cross
 _KNOWN = (
     "width", "border", "height", "roadMark", "material", "speed", "access", "rule", "visibility",
 )  # fmt: skip
 
 
 class Lane:
-    """A lane of a lane section.
+    """A lane in a lane section.
 
     Parameters
     ----------
     element
-        The <lane>.
+        The <lane> element.
     start
-        Start of the lane section on the road, m.
+        Start of the lane section on the road in meters.
     """
 
     def __init__(self, element: Element, start: float) -> None:
         self.element = element
-        self.number = int(number(element, "id"))
+        self.number = int(read_number(element, "id"))
         self.type = (element.get("type") or "none")[:MAX_SHOWN]
         self.level = element.get("level") in ("true", "1")
         self.widths = Cubics.read(element.iterfind("width"), "sOffset", start)
-        self.borders = NOTHING
+        self.borders = NO_CUBICS
         if not len(self.widths):
             self.borders = Cubics.read(element.iterfind("border"), "sOffset", start)
         heights = element.findall("height")
@@ -71,23 +71,24 @@ class Lane:
 
     @property
     def side(self) -> int:
-        """1 to the left of the reference line, -1 to the right, 0 for the lane in the middle."""
+        """1 to the left of the reference line, -1 to the right, and 0 for the center lane."""
         return (self.number > 0) - (self.number < 0)
 
     @property
     def cubics(self) -> tuple[Cubics, ...]:
-        """Polynomials of the lane."""
+        """All polynomials of the lane."""
         return self.widths, self.borders, self.inner_heights, self.outer_heights
 
     @property
     def has_heights(self) -> bool:
-        """Whether the lane is above or below the road."""
+        """Whether the lane has heights above or below the road."""
         return len(self.inner_heights) > 0
 
-    def width(self, stations: Stations, inner_t: Floats, middle_t: Floats) -> Floats:
-        """Return the width (k,), negative as the file has it, m.
+    def width(self, stations: RoadStations, inner_t: Floats, middle_t: Floats) -> Floats:
+        """Return the width (k,) in meters, which may be negative if the file says so.
 
-        `inner_t` and `middle_t` are t (k,) of the inner border and of the middle of the road, m.
+        `inner_t` and `middle_t` (k,) are the t coordinates of the inner border and of the center
+        lane.
         """
         if len(self.borders):
             return np.asarray(np.abs(self.borders.values(stations)) - np.abs(inner_t - middle_t))
@@ -95,14 +96,14 @@ class Lane:
 
 
 def _steps(elements: Sequence[Element], start: float, *names: str) -> Cubics:
-    """Return constants, each valid to the start of the next, by the first name that exists."""
+    """Return piecewise constant values of the first attribute that exists in each element."""
     if not elements:
-        return NOTHING
+        return NO_CUBICS
     rows = []
     for element in elements:
         name = next((name for name in names if element.get(name)), names[0])
-        s = start + number(element, "sOffset", 0.0)
-        rows.append((s, number(element, name, 0.0), 0.0, 0.0, 0.0))
+        s = start + read_number(element, "sOffset", 0.0)
+        rows.append((s, read_number(element, name, 0.0), 0.0, 0.0, 0.0))
     return Cubics(rows)
 
 
@@ -112,9 +113,9 @@ class LaneSection:
     Attributes
     ----------
     lanes
-        Lanes of each side, {1: left, -1: right}, from the reference line outwards.
+        Lanes on the left (1) and on the right (-1), from the reference line outward.
     middle
-        The lane in the middle, or None.
+        The center lane, or None.
     """
 
     def __init__(self, element: Element, start: float, stop: float, unread: UnreadElements) -> None:
@@ -138,18 +139,21 @@ class LaneSection:
 
     @property
     def all_lanes(self) -> list[Lane]:
-        """Lanes of both sides."""
+        """Lanes on both sides."""
         return [*self.lanes[1], *self.lanes[-1]]
 
-    def borders(self, road: Road, stations: Stations) -> dict[int, Floats]:
-        """Return t (k,) of the outer borders of lanes, and of the middle, {number of lane: t}."""
+    def borders(self, road: Road, stations: RoadStations) -> dict[int, Floats]:
+        """Return the t coordinates (k,) of the outer lane borders by lane number.
+
+        Number 0 is the center lane.
+        """
         return self._borders_and_widths(road, stations)[0]
 
     def intervals(self, road: Road, start: float, stop: float) -> Intervals:
-        """Return the intervals between two distances where all polynomials are single.
+        """Return the intervals between two distances in which every polynomial has a single piece.
 
-        Borders of lanes that cross each other, or a kink of the road's cross section, end intervals
-        as well.
+        Intervals also end where lane borders cross each other or a kink in the road's cross
+        section.
         """
         cubics = [cubics for lane in self.all_lanes for cubics in lane.cubics]
         breaks = np.concatenate([road.breaks, *(c.starts for c in cubics if len(c))])
@@ -159,11 +163,11 @@ class LaneSection:
             intervals = Intervals.between(start, stop, np.concatenate([breaks, crossings]))
         return intervals
 
-    def samples(self, network: Network, road: Road) -> Samples:
-        """Return the stations at which the surface of the section is measured."""
+    def samples(self, network: RoadNetwork, road: Road) -> SurfaceSamples:
+        """Return the stations at which to measure the surface of the section."""
         intervals = self.intervals(road, self.start, self.stop).with_lead(road.breaks)
         are_planes = self.is_plain and road.is_plain and network.is_straight(road, intervals)
-        return intervals.sampled(are_planes=are_planes)
+        return intervals.surface_samples(are_planes=are_planes)
 
     @cached_property
     def is_plain(self) -> bool:
@@ -175,11 +179,14 @@ class LaneSection:
         )
 
     def _borders_and_widths(
-        self, road: Road, stations: Stations
+        self, road: Road, stations: RoadStations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
-        """Return t (k,) of borders, and widths as the file has them, both by numbers of lanes."""
-        # Where the section starts with a step of the road, the lanes of the section count.
-        stations = Stations(stations.s, np.maximum(stations.pieces, self.start))
+        """Return the t coordinates of borders, and the widths in the file, by lane number.
+
+        All arrays have shape (k,).
+        """
+        # If the road steps where the section starts, use the lanes of this section.
+        stations = RoadStations(stations.s, np.maximum(stations.pieces, self.start))
         middle = road.lane_offset.values(stations)
         borders = {0: middle}
         widths = {}
@@ -193,19 +200,19 @@ class LaneSection:
         return borders, widths
 
     def _crossings(self, road: Road, intervals: Intervals) -> Floats:
-        """Return the distances (x,) at which widths turn negative and borders cross kinks."""
+        """Return the distances (x,) at which widths become negative or borders cross kinks."""
         kinks = road.kinks(self.start, self.stop) if road.curved_across else np.zeros(0)
         if not len(kinks) and all(
             lane.widths.is_constant and not len(lane.borders) for lane in self.all_lanes
         ):
             return kinks
 
-        def values(stations: Stations) -> Floats:
+        def values(stations: RoadStations) -> Floats:
             """Return widths and borders (v, k)."""
             borders, widths = self._borders_and_widths(road, stations)
             return np.stack([*widths.values(), *borders.values()])
 
-        # Pairs of a width or border and of a level that it may cross.
+        # Pairs of a width or border and a level that it may cross
         lanes = len(self.all_lanes)
         levels = np.concatenate([np.zeros(lanes), np.tile(kinks, lanes + 1)])
         crossing = np.concatenate(
@@ -225,13 +232,13 @@ class LaneSection:
         def is_above_at(distances: Floats) -> Bools:
             """Return whether each width or border is above its level at a distance."""
             pair_indices = np.arange(len(pairs))
-            return values(Stations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
+            return values(RoadStations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
 
         return _changes(is_above_at, s[:, :-1][tuple(cells)], s[:, 1:][tuple(cells)])
 
 
 def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) -> Floats:
-    """Return where between distances (x,) a function is above its level on one side only."""
+    """Return the distances (x,) between bounds at which a predicate changes, by bisection."""
     is_first = is_above(lower)
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
@@ -244,7 +251,7 @@ def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) 
 def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
     """Return the lane sections of a road that have a length."""
     elements = road.element.findall("lanes/laneSection")
-    starts = [number(element, "s", 0.0) for element in elements]
+    starts = [read_number(element, "s", 0.0) for element in elements]
     order = sorted(range(len(starts)), key=starts.__getitem__)
     stops = [*(min(starts[k], road.length) for k in order), road.length][1:]
     return [
@@ -255,14 +262,14 @@ def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
 
 
 def section_surfaces(
-    network: Network,
+    network: RoadNetwork,
     sections: Sequence[tuple[Road, LaneSection]],
     sag_m: float,
     allowance: Allowance,
 ) -> list[SectionSurface]:
     """Return the surfaces of lane sections, whose triangles are within a tolerance.
 
-    The tolerance is `sag_m` in plan, and a tenth of this in height.
+    The tolerance is `sag_m` in plan, and a tenth of that in height.
     """
 
     def surfaces_at(
@@ -274,7 +281,11 @@ def section_surfaces(
         stops = np.cumsum([len(entry.stations) for entry in placed]).tolist()
         return [
             SectionSurface(
-                *pair, entry, frames.take(slice(stop - len(entry.stations), stop)), sag_m, allowance
+                *pair,
+                entry,
+                frames.select(slice(stop - len(entry.stations), stop)),
+                sag_m,
+                allowance,
             )
             for pair, entry, stop in zip(pairs, placed, stops, strict=True)
         ]
@@ -287,9 +298,9 @@ def section_surfaces(
     surfaces = surfaces_at(
         range(len(sections)), [PlacedStations(entry.stations, no_steps) for entry in samples]
     )
-    placed = placed_stations(
+    placed = place_stations(
         [
-            surface.sampled(entry.intervals)
+            surface.to_sampled(entry.intervals)
             for surface, entry in zip(surfaces, samples, strict=True)
         ],
         sag_m,
@@ -298,7 +309,7 @@ def section_surfaces(
     )
     recomputed_indices = []  # sections with stations that are not among the samples
     for k, (surface, entry) in enumerate(zip(surfaces, placed, strict=True)):
-        part = surface.part_at(entry)
+        part = surface.select_stations(entry)
         if part is None:
             recomputed_indices.append(k)
         else:
@@ -310,20 +321,20 @@ def section_surfaces(
 
 
 class Strip(NamedTuple):
-    """The surface of a lane at the stations of its section, or a kerb beside it."""
+    """The surface of a lane at the stations of its section, or a curb beside it."""
 
     lane: Lane
-    t: Floats  # (c, k): of columns of points, m
-    points: Floats  # (c, k, 3), m
-    steps: Ints  # (j,): stations that the next follows at the same distance
-    is_kerb: bool = False
+    t: Floats  # (c, k) t coordinates of the point columns in meters
+    points: Floats  # (c, k, 3) in meters
+    steps: Ints  # (j,) stations before a step, where the next station has the same distance
+    is_curb: bool = False
 
     @property
     def faces(self) -> Ints:
-        """Triangles (f, 3) of the points in order, with normals up, or off the road of a kerb."""
+        """Triangles (f, 3), with normals that point up or, for a curb, away from the road."""
         faces = grid_faces(*self.t.shape)
         if len(self.steps):
-            # Where heights step there is a wall, and where only widths step there is none.
+            # There is a wall where heights step, but not where only widths step.
             columns, stations = self.t.shape
             is_step = np.zeros((columns - 1, stations - 1, 2), np.bool_)
             is_step[:, self.steps] = True
@@ -335,7 +346,7 @@ class Strip(NamedTuple):
 
 @lru_cache(maxsize=256)
 def grid_faces(columns: int, stations: int) -> Ints:
-    """Return triangles (f, 3) of a grid of points (columns, stations), two for each cell."""
+    """Return two triangles for each cell of a grid with columns * stations points, shape (f, 3)."""
     corners = np.arange(columns * stations).reshape(columns, stations)
     a = corners[:-1, :-1]
     b = corners[:-1, 1:]
@@ -350,19 +361,21 @@ class SectionSurface:
 
     Parameters
     ----------
+    road, section
+        The road and the lane section.
     placed
         The stations.
     frames
         Frames of the road at the stations.
     sag_m
-        Tolerance in plan, m. The tolerance in height is a tenth of this.
+        Tolerance in plan in meters. The tolerance in height is a tenth of it.
     allowance
-        Memory that points across lanes take.
+        Memory that additional points across lanes may occupy.
 
     Attributes
     ----------
     strips
-        Surfaces of lanes, from right to left.
+        Surfaces of the lanes, from right to left.
     """
 
     def __init__(
@@ -370,7 +383,7 @@ class SectionSurface:
         road: Road,
         section: LaneSection,
         placed: PlacedStations,
-        frames: Frames,
+        frames: RoadFrames,
         sag_m: float,
         allowance: Allowance,
     ) -> None:
@@ -382,7 +395,7 @@ class SectionSurface:
         self._allowance = allowance
         self.borders = section.borders(road, self.stations)
         self._lines = self._lines_across()
-        # Points (c, k, 3) of all borders, from right to left, where lanes are straight across.
+        # Points (c, k, 3) of all borders, from right to left, if cross sections are straight
         self._border_points: Floats | None = None
         if not road.curved_across:
             right = [self.borders[lane.number] for lane in section.lanes[-1][::-1]]
@@ -391,12 +404,15 @@ class SectionSurface:
         self.strips = [*[*self._strips(-1)][::-1], *self._strips(1)]
 
     @cached_property
-    def kerbs(self) -> list[Strip]:
-        """Upright surfaces between lanes of different heights."""
-        return [*self._kerbs()]
+    def curbs(self) -> list[Strip]:
+        """Vertical surfaces between lanes with different heights."""
+        return [*self._curbs()]
 
-    def sampled(self, intervals: Intervals) -> SampledSurface:
-        """Return the surface for placing stations, if the stations here are samples."""
+    def to_sampled(self, intervals: Intervals) -> SampledSurface:
+        """Return the sampled surface from which stations are placed.
+
+        The stations of this surface must be the samples of `intervals`.
+        """
         height_m = HEIGHT_SHARE * self._sag_m
         if self._road.shapes is not None:
             height_m *= 1 - _ACROSS_SHARE
@@ -410,15 +426,15 @@ class SectionSurface:
         is_cell[ends[:-1] - 1] = False
         return SampledSurface(intervals, self._points, is_cell, height_m)
 
-    def part_at(self, placed: PlacedStations) -> SectionSurface | None:
-        """Return the surface at stations that are all among the stations here, else None."""
+    def select_stations(self, placed: PlacedStations) -> SectionSurface | None:
+        """Return the surface at a subset of the stations, or None if a station is missing."""
         station_indices = np.searchsorted(self.stations.pieces, placed.stations.pieces)
         station_indices = np.minimum(station_indices, len(self.stations) - 1)
         if (self.stations.pieces[station_indices] != placed.stations.pieces).any():
             return None
         surface = copy(self)
         surface.stations, surface.steps = placed
-        surface.frames = self.frames.take(station_indices)
+        surface.frames = self.frames.select(station_indices)
         surface.borders = {key: t[station_indices] for key, t in self.borders.items()}
         surface.strips = [
             Strip(
@@ -435,7 +451,7 @@ class SectionSurface:
         return surface
 
     def points(self, stations: Ints, t: Floats) -> Floats:
-        """Return points (q, 3) on the triangles' edges across the road, at stations and t (q,)."""
+        """Return points (q, 3) on cross sections, given stations and t coordinates (q,)."""
         frames = self.frames
         count = len(self._points)
         if count < _MIN_COLUMNS:
@@ -453,24 +469,24 @@ class SectionSurface:
 
     @cached_property
     def _t(self) -> Floats:
-        """Positions (c, k) across the road of the points of all strips, from right to left, m."""
+        """The t coordinates (c, k) of the points of all strips, from right to left."""
         ordered = [strip.t if strip.lane.side > 0 else strip.t[::-1] for strip in self.strips]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations)))])
 
     @cached_property
     def _points(self) -> Floats:
-        """Points (c, k, 3) of all strips, from right to left, m."""
+        """The points (c, k, 3) of all strips, from right to left."""
         ordered = [
             strip.points if strip.lane.side > 0 else strip.points[::-1] for strip in self.strips
         ]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations), 3))])
 
     def _lines_across(self) -> Floats:
-        """Return ascending t (j,) at which strips need points inside, m."""
+        """Return the ascending t coordinates (j,) at which strips need additional points."""
         if not self._road.curved_across:
             return np.zeros(0)
         borders = np.stack([*self.borders.values()])
-        lines = self._road.lines(
+        lines = self._road.points_across(
             self.section.start,
             self.section.stop,
             np.array([borders.min(), borders.max()]),
@@ -480,11 +496,11 @@ class SectionSurface:
         return lines
 
     def _strips(self, side: int) -> Iterator[Strip]:
-        """Yield the strips of the lanes of a side, from the middle outwards."""
+        """Yield the strips of the lanes on a side, from the center outward."""
         frames = self.frames
         inner_t = self.borders[0]
         middle = len(self.section.lanes[-1])
-        level_points: Floats | None = None  # (k, 3): inner border of level lanes
+        level_points: Floats | None = None  # (k, 3) inner border of level lanes
         for k, lane in enumerate(self.section.lanes[side]):
             t = np.stack([inner_t, self.borders[lane.number]])
             inner_t = t[1]
@@ -509,7 +525,7 @@ class SectionSurface:
             yield Strip(lane, t, base, self.steps)
 
     def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:
-        """Return t (c, k) of the columns of points of a lane, from the inside out, m."""
+        """Return the t coordinates (c, k) of the points of a lane, from the inside outward."""
         lower = np.minimum(inner_t, outer_t)
         upper = np.maximum(inner_t, outer_t)
         lines = self._lines
@@ -520,28 +536,34 @@ class SectionSurface:
         return np.stack([inner_t, *(np.clip(line, lower, upper) for line in lines), outer_t])
 
     def _base(self, t: Floats) -> Floats:
-        """Return points (c, k, 3) of a lane without its heights, at t (c, k) from edge to edge."""
+        """Return the points (c, k, 3) of a lane at t coordinates (c, k).
+
+        The heights of the lane itself are not included.
+        """
         frames = self.frames
         base = frames.origins + t[..., None] * frames.side
         if self._road.curved_across:
-            # Heights that step at a border belong to the lane on their side of the border.
+            # If heights step at a border, use those on this lane's side of the border.
             lower = np.minimum(t[0], t[-1])
             upper = np.maximum(t[0], t[-1])
             inside = np.clip(t, np.minimum(lower + GAP_M / 2, upper), upper - GAP_M / 2)
             base += self._road.heights(self.stations, t, inside)[..., None] * frames.up
         return np.asarray(base)
 
-    def _kerbs(self) -> Iterator[Strip]:
-        """Yield upright strips between lanes of different heights, as parts of the higher lanes."""
+    def _curbs(self) -> Iterator[Strip]:
+        """Yield vertical strips between lanes with different heights.
+
+        They are parts of the higher lanes.
+        """
         for right, left in pairwise(self.strips):
             right_row = -1 if right.lane.side > 0 else 0
             left_row = 0 if left.lane.side > 0 else -1
             right_points = right.points[right_row]
             left_points = left.points[left_row]
             heights = ((left_points - right_points) * self.frames.up).sum(axis=1)
-            if np.abs(heights).max() < _KERB_M:
+            if np.abs(heights).max() < _CURB_M:
                 continue
             is_left_higher = heights.sum() > 0
             lane = left.lane if is_left_higher else right.lane
             points = np.stack([right_points, left_points])
-            yield Strip(lane, np.zeros(points.shape[:2]), points, self.steps, is_kerb=True)
+            yield Strip(lane, np.zeros(points.shape[:2]), points, self.steps, is_curb=True)

@@ -1,6 +1,6 @@
-"""OpenDRIVE files, .xodr, after ASAM OpenDRIVE 1.4 to 1.8.
+"""Read OpenDRIVE files (.xodr), following ASAM OpenDRIVE 1.4 to 1.8.
 
-This is not libOpenDRIVE, which reads neither borders of lanes nor lateral shapes.
+libOpenDRIVE is not used, because it reads neither lane borders nor lateral shapes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import about
-from lidarsim.base.validation import checked_fields
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
@@ -32,16 +31,16 @@ from lidarsim.scene.files.scene_graph import (
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from .elements import UnreadElements, number
+from .elements import UnreadElements, read_number
 from .lanes import Lane, SectionSurface, lane_sections, section_surfaces
-from .road import Network, Road
+from .road import Road, RoadNetwork
 from .road_marks import painted_quads
-from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, color_of, material_of_lane
+from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, lane_material, material_color
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
-# Roads of a junction lie on each other. These lanes are lower by meters, so that lanes on which
-# vehicles drive are hit.
+# Roads in a junction overlap. Other lanes are lowered by these distances, so that rays hit the
+# lanes on which vehicles drive.
 _SINK_OF_NONE_M = 0.005
 _SINK_M = 0.002
 _SMALLER = "use a larger sag_m, or divide the file"
@@ -54,9 +53,8 @@ Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
 
 
 @dataclass(frozen=True)
-@checked_fields
 class RoadOptions:
-    """Options of roads."""
+    """Options for reading roads."""
 
     sag_m: Annotated[
         float,
@@ -67,8 +65,8 @@ class RoadOptions:
 
 
 def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the roads of a file: lanes, marks, objects and signals."""
-    # A comment before the declaration is not XML, and common.
+    """Read the roads in a file with their lanes, marks, objects, and signals."""
+    # Comments before the XML declaration are common, although they are invalid.
     root = xml_root(data[max(data.find(b"<?xml"), 0) :])
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -77,7 +75,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
             f"is an XML file, but not an OpenDRIVE file. Its root element is <{root.tag[:40]}>"
         )
     header = root.find("header")
-    if header is not None and number(header, "revMajor", 1.0) > 1:
+    if header is not None and read_number(header, "revMajor", 1.0) > 1:
         raise MeshFileError(
             f"uses OpenDRIVE {header.get('revMajor')}, but only versions 1.4 to 1.8 are supported"
         )
@@ -87,7 +85,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
         unread.check(junction, _KNOWN_OF_JUNCTIONS)
     allowance = Allowance(len(data), _SMALLER)
     reader = _RoadReader(options, allowance, unread)
-    network = Network(root.findall("road"), allowance, unread)
+    network = RoadNetwork(root.findall("road"), allowance, unread)
     content = Content(reader.meshes(network))
     content.unit_m = 1.0
     content.up_axis = "z"
@@ -98,7 +96,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _RoadReader:
-    """Makes meshes of the roads of a file."""
+    """Converts the roads in a file to meshes."""
 
     def __init__(self, options: ReadOptions, allowance: Allowance, unread: UnreadElements) -> None:
         self._options = options
@@ -108,7 +106,7 @@ class _RoadReader:
         own: RoadOptions = options.own
         self._sag_m = own.sag_m
 
-    def meshes(self, network: Network) -> list[SceneMesh]:
+    def meshes(self, network: RoadNetwork) -> list[SceneMesh]:
         """Return the meshes of all objects."""
         sections_of_roads = [lane_sections(road, self._unread) for road in network.roads]
         sections = [
@@ -135,11 +133,11 @@ class _RoadReader:
 
     def _add_section(self, road: Road, surface: SectionSurface) -> None:
         """Add the lanes and marks of a lane section."""
-        for strip in (*surface.strips, *surface.kerbs):
+        for strip in (*surface.strips, *surface.curbs):
             lane = strip.lane
-            material = CONCRETE if strip.is_kerb else _material(lane)
+            material = CONCRETE if strip.is_curb else _material(lane)
             points = strip.points.reshape(-1, 3)
-            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_kerb:
+            if road.in_junction and lane.type not in CARRIAGEWAY and not strip.is_curb:
                 sink_m = _SINK_OF_NONE_M if lane.type == "none" else _SINK_M
                 points = points - np.array([0, 0, sink_m])
             piece = Piece(points, strip.faces, material=material)
@@ -149,17 +147,17 @@ class _RoadReader:
             self._add(f"road mark {road.name}", piece)
 
     def _add(self, name: str, piece: Piece) -> None:
-        """Add triangles to an object, with colors and materials if asked for."""
+        """Add triangles to an object, with colors and materials if requested."""
         if not len(piece.faces):
             return
         colors = None
         if self._options.colors:
-            colors = Colors.plain(color_of(piece.material), len(piece.faces))
+            colors = Colors.plain(material_color(piece.material), len(piece.faces))
         material = piece.material if self._options.materials else ""
         self._pieces[name].append(piece._replace(colors=colors, material=material))
 
     def _drop_degenerate(self) -> None:
-        """Drop triangles without an area, such as of lanes whose width shrinks to zero."""
+        """Remove triangles without an area, for example where a lane narrows to zero width."""
         pieces = [piece for pieces in self._pieces.values() for piece in pieces]
         corners = [piece.vertices[piece.faces[:, k]] for k in range(3) for piece in pieces]
         if not corners:
@@ -188,7 +186,7 @@ class _RoadReader:
 def _material(lane: Lane) -> str:
     """Return the material of a lane."""
     stated = lane.element.find("material")
-    return material_of_lane(lane.type, None if stated is None else stated.get("surface"))
+    return lane_material(lane.type, None if stated is None else stated.get("surface"))
 
 
 def _notes(
@@ -196,7 +194,7 @@ def _notes(
     meshes: Sequence[SceneMesh | SceneInstance],
     unread: UnreadElements,
 ) -> list[str]:
-    """Return notes on the coordinate system of a file, and on the elements that are not read."""
+    """Return notes on the coordinate system of a file, and on elements that are not read."""
     notes = []
     if header is not None:
         notes = _reference_notes(header, middle_of(meshes))
@@ -207,18 +205,18 @@ def _notes(
 
 
 def _reference_notes(header: Element, middle: Floats) -> list[str]:
-    """Return notes on the coordinate system and the offset that a header states.
+    """Return notes on the coordinate system and the offset in a header.
 
-    `middle` (2,) are x and y in the middle of the roads.
+    `middle` (2,) is the center of the roads.
     """
     text = " ".join((header.findtext("geoReference") or "").split())
     epsg = _epsg(text)
     offset = header.find("offset")
     shift = [0.0] * 4
     if offset is not None:
-        shift = [number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
+        shift = [read_number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
-    place = middle + shift[:2]  # a heading turns roads about their zero, which is near
+    place = middle + shift[:2]  # approximate if a heading rotates the roads about their origin
     problem = scale_problem(f"EPSG:{epsg}" if epsg else text, *place.tolist()) if text else ""
     if problem:
         system += f", {problem}"
@@ -243,7 +241,10 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
 
 
 def _epsg(text: str) -> int | None:
-    """Return the EPSG code of a definition of PROJ, or None: codes, and UTM zones of WGS 84."""
+    """Return the EPSG code in a PROJ definition, or None.
+
+    Explicit codes and UTM zones with WGS 84 are recognized.
+    """
     code = _EPSG.search(text)
     if code:
         return int(code[1])

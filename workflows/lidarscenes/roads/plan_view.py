@@ -1,8 +1,9 @@
-"""Reference lines of roads in plan: lines, arcs, spirals and cubics, all roads in one table.
+"""Evaluate road reference lines in plan: lines, arcs, spirals, and cubics, in a common table.
 
-Lines, arcs and spirals are curves whose curvature changes linearly (clothoids). They are integrated
-by Gauss and Legendre's quadrature with five points over pieces that turn by half a radian or less:
-the error is below 1e-12 of a piece. Cubics are sampled, and their parameter is found by arc length.
+Lines, arcs, and spirals are curves whose curvature varies linearly (clothoids). They are
+integrated by five-point Gauss-Legendre quadrature over pieces that turn by at most half a radian,
+with an error below 1e-12 of the length of a piece. Cubics are sampled, and their parameter is
+looked up by arc length.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from lidarsim.base.elementary import sin_cos
 from lidarsim.base.vectors import hypot
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-from .elements import number, positive
+from .elements import read_non_negative, read_number
 
-_MAX_TURN = 0.5  # rad of a piece of a clothoid
-_CUBIC_PIECES = 16  # pieces of a cubic geometry, each with separate stations
-_CUBIC_SAMPLES = 64  # samples of each of these pieces, for arc lengths
-_MIN_SPEED = 1e-3  # least ratio of speeds along a cubic's parameter; slower cubics turn back
-_LEAST_M = 1e-9  # geometries that are shorter are left out
-# Gauss and Legendre's quadrature with five points on 0 to 1.
+_MAX_TURN = 0.5  # maximum turn of a piece of a clothoid in radians
+_CUBIC_PIECES = 16  # number of pieces of a cubic geometry, each with separate stations
+_CUBIC_SAMPLES = 64  # samples per piece for computing arc lengths
+_MIN_SPEED = 1e-3  # minimum ratio of the speeds along a cubic; slower cubics reverse
+_LEAST_M = 1e-9  # shorter geometries are skipped
+# Nodes and weights of five-point Gauss-Legendre quadrature from 0 to 1.
 _NODES = np.array([-0.9061798459386640, -0.5384693101056831, 0.0]) / 2 + 0.5
 _NODES = np.append(_NODES, 1 - _NODES[1::-1])
 _WEIGHTS = np.array([0.2369268850561891, 0.4786286704993665, 0.5688888888888889]) / 2
@@ -36,43 +37,43 @@ _WEIGHTS = np.append(_WEIGHTS, _WEIGHTS[1::-1])
 
 
 class PlanPoints(NamedTuple):
-    """Points of reference lines in plan."""
+    """Points on reference lines in plan."""
 
-    x: Floats  # (k,), m
-    y: Floats  # (k,), m
-    cosines: Floats  # (k,): of headings
-    sines: Floats  # (k,): of headings
+    x: Floats  # (k,) in meters
+    y: Floats  # (k,) in meters
+    cosines: Floats  # (k,) cosines of the headings
+    sines: Floats  # (k,) sines of the headings
 
 
 class _Clothoid(NamedTuple):
-    """A piece of a line, an arc or a spiral."""
+    """A piece of a line, an arc, or a spiral."""
 
-    start: float  # distance of the table, m
+    start: float  # distance in the table, in meters
     x: float
     y: float
     heading: float  # rad
-    curvature: float  # at the start, 1/m
-    growth: float  # growth of the curvature, 1/m²
+    curvature: float  # curvature at the start in 1/m
+    growth: float  # change of the curvature per meter, in 1/m²
 
 
 class _Cubic(NamedTuple):
-    """A geometry of the kinds poly3 and paramPoly3, sampled by arc length."""
+    """A poly3 or paramPoly3 geometry, sampled by arc length."""
 
-    start: float  # distance of the table, m
+    start: float  # distance in the table, in meters
     x: float
     y: float
     cosine: float  # cosine of the heading at the start
     sine: float
-    distances: Floats  # (m,): of the samples from the start, m
-    parameters: Floats  # (m,): of the samples
-    u: Floats  # (4,): coefficients along the heading
-    v: Floats  # (4,): coefficients to the left
+    distances: Floats  # (m,) distances of the samples from the start, in meters
+    parameters: Floats  # (m,) parameters of the samples
+    u: Floats  # (4,) coefficients along the heading
+    v: Floats  # (4,) coefficients to the left
 
 
 class PlanTable:
-    """Reference lines of all roads of a file, one after another along a common distance.
+    """The reference lines of all roads in a file, one after another along a common distance.
 
-    Roads are added with `add`, and evaluated together after `finish`.
+    Roads are added with `add_road`. After `finish`, they can be evaluated together.
     """
 
     def __init__(self, allowance: Allowance) -> None:
@@ -81,18 +82,17 @@ class PlanTable:
         self._cubics: list[_Cubic] = []
         self._bends: list[tuple[float, float]] = []  # start and largest curvature of each piece
         self._table = np.zeros((0, 6))
-        self._starts = np.zeros(0)  # (p,): of all pieces
-        self._kinds = np.zeros(0, np.int64)  # (p,): row of `_cubics`; -1 for a clothoid
+        self._starts = np.zeros(0)  # (p,) starts of all pieces
+        self._kinds = np.zeros(0, np.int64)  # (p,) row of `_cubics`; -1 for a clothoid
         self._bend_table = np.zeros((0, 2))
 
-    def add(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
-        """Add the geometries of a road that starts at a distance.
+    def add_road(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
+        """Add the geometries of a road that starts at `offset` in the table.
 
-        Returns their starts on the road.
-
-        The last geometry ends with the road, of `length` meters.
+        Returns the starts of the geometries on the road. The last geometry ends with the road,
+        which has a length of `length` meters.
         """
-        starts = [positive(geometry, "s") for geometry in geometries]
+        starts = [read_non_negative(geometry, "s") for geometry in geometries]
         first = len(self._bends)
         for geometry, start, stop in zip(geometries, starts, [*starts[1:], length], strict=True):
             if stop - start > _LEAST_M:
@@ -100,7 +100,7 @@ class PlanTable:
         return np.array([start for start, _ in self._bends[first:]]) - offset
 
     def finish(self) -> None:
-        """Make the tables for evaluation."""
+        """Prepare the table for evaluation."""
         clothoid_starts = [piece.start for piece in self._clothoids]
         starts = np.array(clothoid_starts + [piece.start for piece in self._cubics])
         order = np.argsort(starts, kind="stable")
@@ -116,12 +116,15 @@ class PlanTable:
         self._bend_table = bends[np.argsort(bends[:, 0], kind="stable")]
 
     def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
-        """Return the largest curvatures in intervals (k,), each within a piece, 1/m."""
+        """Return the largest curvatures in 1/m in intervals (k,) that are each within a piece."""
         row_indices = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
         return np.asarray(self._bend_table[np.maximum(row_indices, 0), 1])
 
     def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
-        """Return points at distances (k,) of the table, on the pieces at other distances (k,)."""
+        """Return points at distances (k,) in the table.
+
+        `pieces` (k,) are the distances that select the pieces on which the points are evaluated.
+        """
         row_indices = np.maximum(np.searchsorted(self._starts, pieces, "right") - 1, 0)
         points = self._clothoid_points(distances, row_indices)
         kinds = self._kinds[row_indices]
@@ -135,7 +138,7 @@ class PlanTable:
     def _clothoid_points(self, distances: Floats, row_indices: Ints) -> PlanPoints:
         """Return points on clothoids.
 
-        Points in rows of cubics have no meaning.
+        The results are meaningless for rows that refer to cubics.
         """
         start, x, y, heading, curvature, growth = self._table[row_indices].T
         along = distances - start
@@ -146,7 +149,7 @@ class PlanTable:
         steps = along[curved, None] * _NODES
         turned = curvature[curved, None] + growth[curved, None] / 2 * steps
         node_sines, node_cosines = sin_cos(heading[curved, None] + turned * steps)
-        # Sums of five products in a fixed order have the same bits on every processor.
+        # Adding five products in a fixed order gives identical results on every processor.
         for array, origin, terms in (
             (x, self._table[row_indices[curved], 1], node_cosines * _WEIGHTS),
             (y, self._table[row_indices[curved], 2], node_sines * _WEIGHTS),
@@ -156,7 +159,7 @@ class PlanTable:
         return PlanPoints(x, y, cosines, sines)
 
     def _add_geometry(self, geometry: Element, start: float, length: float) -> None:
-        """Add a geometry of a length, which may differ from the length that the geometry states."""
+        """Add a geometry with a length that may differ from the length that the geometry states."""
         shape = next((child for child in geometry if child.tag in _SHAPES), None)
         if shape is None:
             tags = ", ".join(child.tag for child in geometry) or "nothing"
@@ -164,23 +167,23 @@ class PlanTable:
                 f"contains <geometry> with {tags[:40]}; expected line, arc, spiral, poly3 or "
                 "paramPoly3"
             )
-        stated_length = positive(geometry, "length")
+        stated_length = read_non_negative(geometry, "length")
         if shape.tag in ("poly3", "paramPoly3"):
             self._add_cubic(geometry, shape, start, stated_length)
             return
         curvature = 0.0
         growth = 0.0
         if shape.tag == "arc":
-            curvature = number(shape, "curvature")
+            curvature = read_number(shape, "curvature")
         elif shape.tag == "spiral":
-            curvature = number(shape, "curvStart", 0.0)
-            growth = (number(shape, "curvEnd", 0.0) - curvature) / max(stated_length, _LEAST_M)
+            curvature = read_number(shape, "curvStart", 0.0)
+            growth = (read_number(shape, "curvEnd", 0.0) - curvature) / max(stated_length, _LEAST_M)
         self._add_clothoid(
             _Clothoid(start, *_origin(geometry), curvature=curvature, growth=growth), length
         )
 
     def _add_clothoid(self, clothoid: _Clothoid, length: float) -> None:
-        """Add a clothoid in pieces that turn by `_MAX_TURN` or less."""
+        """Add a clothoid in pieces that turn by at most `_MAX_TURN`."""
         last = clothoid.curvature + clothoid.growth * length
         turn = max(abs(clothoid.curvature), abs(last)) * length
         self._allowance.take(int(min(turn / _MAX_TURN, 1e15)) * 500)
@@ -194,7 +197,7 @@ class PlanTable:
                 piece = _next_piece(piece, length / count, following)
 
     def _add_cubic(self, geometry: Element, shape: Element, start: float, length: float) -> None:
-        """Add a geometry of a cubic."""
+        """Add a poly3 or paramPoly3 geometry."""
         u, v = _coefficients(shape)
         # Without pRange, parameters are normalized (ASAM OpenDRIVE 1.4 to 1.8).
         is_normalized = shape.tag == "paramPoly3" and shape.get("pRange") != "arcLength"
@@ -208,7 +211,7 @@ class PlanTable:
                 f"contains a <{shape.tag}> that has zero length or a point where its derivative "
                 "is zero. Correct its parameters"
             )
-        if is_normalized:  # the end of the parameters is the end of the length
+        if is_normalized:  # scale so that the last parameter is at the end of the geometry
             distances = distances * (length / distances[-1])
         x, y, heading = _origin(geometry)
         sine, cosine = (float(value) for value in sin_cos(heading))
@@ -236,12 +239,12 @@ _SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
 
 
 def _origin(geometry: Element) -> tuple[float, float, float]:
-    """Return x, y and heading of the start of a geometry."""
-    return number(geometry, "x"), number(geometry, "y"), number(geometry, "hdg")
+    """Return the x, y, and heading of the start of a geometry."""
+    return read_number(geometry, "x"), read_number(geometry, "y"), read_number(geometry, "hdg")
 
 
 def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
-    """Return the piece that follows a piece of a clothoid after a step, with its curvature."""
+    """Return the piece of a clothoid that starts `step` meters later, given its curvature there."""
     table = np.array([piece])
     heading = piece.heading + (piece.curvature + piece.growth / 2 * step) * step
     steps = step * _NODES
@@ -252,7 +255,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
 
 
 def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
-    """Return points of a cubic at distances (k,) of the table."""
+    """Return points on a cubic at distances (k,) in the table."""
     along = distances - cubic.start
     parameters = _parameters(cubic, along)
     u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
@@ -260,7 +263,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
     speed = hypot(du, dv)
     cosines = (du * cubic.cosine - dv * cubic.sine) / speed
     sines = (du * cubic.sine + dv * cubic.cosine) / speed
-    beyond = np.maximum(along - cubic.distances[-1], 0)  # straight on after the end
+    beyond = np.maximum(along - cubic.distances[-1], 0)  # continue straight after the end
     x = cubic.x + u * cubic.cosine - v * cubic.sine + beyond * cosines
     y = cubic.y + u * cubic.sine + v * cubic.cosine + beyond * sines
     return PlanPoints(x, y, cosines, sines)
@@ -269,7 +272,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
 def _parameters(cubic: _Cubic, along: Floats) -> Floats:
     """Return the parameters of a cubic at distances (k,) from its start.
 
-    Beyond its end, the parameters stay at the end.
+    Beyond the end of the cubic, the parameters remain at the end.
     """
     sample_indices = np.searchsorted(cubic.distances, along, "right") - 1
     sample_indices = np.clip(sample_indices, 0, len(cubic.distances) - 2)
@@ -280,18 +283,18 @@ def _parameters(cubic: _Cubic, along: Floats) -> Floats:
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:
-    """Return the coefficients (4,) of a cubic along the heading, and to the left."""
+    """Return the coefficients (4,) of a cubic along the heading and to the left."""
     if shape.tag == "poly3":
         u = [0.0, 1.0, 0.0, 0.0]
-        v = [number(shape, name, 0.0) for name in "abcd"]
+        v = [read_number(shape, name, 0.0) for name in "abcd"]
     else:
-        u = [number(shape, f"{name}U", 0.0) for name in "abcd"]
-        v = [number(shape, f"{name}V", 0.0) for name in "abcd"]
+        u = [read_number(shape, f"{name}U", 0.0) for name in "abcd"]
+        v = [read_number(shape, f"{name}V", 0.0) for name in "abcd"]
     return np.array(u), np.array(v)
 
 
 def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
-    """Return the curvatures of a cubic at parameters, without sign, 1/m."""
+    """Return the unsigned curvatures of a cubic at parameters, in 1/m."""
     du = _slope(u, p)
     dv = _slope(v, p)
     speeds = hypot(du, dv)

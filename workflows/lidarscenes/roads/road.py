@@ -1,6 +1,7 @@
-"""Roads of OpenDRIVE: reference lines in space, cross sections, and coordinates along roads.
+"""Evaluate OpenDRIVE roads: reference lines, cross sections, and coordinates along roads.
 
-Sources: ASAM OpenDRIVE 1.8.1 (2024), sections 7 to 11; crossfall and poly3: VIRES OpenDRIVE 1.4H.
+Sources: ASAM OpenDRIVE 1.8.1 (2024), sections 7 to 11. Crossfall and poly3 follow VIRES OpenDRIVE
+1.4H.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.scene.files.scene_graph import MeshFileError
 
-from .cross_sections import GAP_M, Intervals, Stations
+from .cross_sections import GAP_M, Intervals, RoadStations
 from .cubics import Cubics
-from .elements import MAX_SHOWN, UnreadElements, number, positive
+from .elements import MAX_SHOWN, UnreadElements, read_non_negative, read_number
 from .plan_view import PlanTable
 
 _STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
-MAX_ROAD_M = 1e7  # longest road
-MAX_LINES = 1e5  # across a road, between two kinks of its cross section
-_GAP_M = 1.0  # between roads in the table of reference lines
-_MAX_MISSING = 0.01  # share of the length of a road that its geometry may lack
+MAX_ROAD_M = 1e7  # maximum length of a road
+MAX_LINES = 1e5  # maximum number of points between two kinks of a cross section
+_GAP_M = 1.0  # gap between roads in the table of reference lines
+_MAX_MISSING = 0.01  # share of a road's length by which its geometry may be too short
 _CROSSFALL_SIDES = {"left": (1,), "right": (-1,), "both": (1, -1)}
 _KNOWN = (
     "type", "planView", "elevationProfile", "lateralProfile", "lanes", "objects", "signals",
@@ -36,43 +37,43 @@ _KNOWN = (
 )  # fmt: skip
 
 
-class Frames(NamedTuple):
-    """Frames of roads at stations: a point is origin + t * side + h * up."""
+class RoadFrames(NamedTuple):
+    """Coordinate frames of roads at stations; a point is origin + t * side + h * up."""
 
-    origins: Floats  # (k, 3), m
-    along: Floats  # (k, 3): unit vectors along the reference line
-    side: Floats  # (k, 3): unit vectors to the left, of the banked road
-    up: Floats  # (k, 3): unit vectors, upright on both
-    level_side: Floats  # (k, 3): horizontal unit vectors to the left
+    origins: Floats  # (k, 3) in meters
+    along: Floats  # (k, 3) unit vectors along the reference line
+    side: Floats  # (k, 3) unit vectors to the left, in the banked plane
+    up: Floats  # (k, 3) unit vectors perpendicular to both
+    level_side: Floats  # (k, 3) horizontal unit vectors to the left
 
-    def take(self, station_selection: slice | Ints) -> Frames:
-        """Return the frames of selected stations."""
-        return Frames(*(array[station_selection] for array in self))
+    def select(self, station_selection: slice | Ints) -> RoadFrames:
+        """Return the frames at selected stations."""
+        return RoadFrames(*(array[station_selection] for array in self))
 
 
 class Road:
-    """A road: its profiles along the reference line, and its elements.
+    """A road with its elements and its profiles along the reference line.
 
     Parameters
     ----------
     element
-        The <road>.
+        The <road> element.
     unread
-        Count of elements that are not read.
+        Counts the elements that are not read.
     """
 
     def __init__(self, element: Element, unread: UnreadElements) -> None:
         self.element = element
         self.name = (element.get("id") or "")[:MAX_SHOWN]
-        self.length = positive(element, "length")
+        self.length = read_non_negative(element, "length")
         if self.length > MAX_ROAD_M:
             raise MeshFileError(
                 f"contains the road {self.name!r} with a length of {self.length:g} m, which "
                 f"exceeds {MAX_ROAD_M:,.0f} m. Correct its length"
             )
         self.in_junction = (element.get("junction") or "-1") != "-1"
-        self.offset = 0.0  # offset of the road in the table of reference lines, m
-        self.geometry_starts = np.zeros(0)  # (g,), of pieces of geometry, m
+        self.offset = 0.0  # offset of the road in the table of reference lines, in meters
+        self.geometry_starts = np.zeros(0)  # (g,) starts of the geometry pieces in meters
         self.elevation = Cubics.read(element.iterfind("elevationProfile/elevation"))
         self.superelevation = Cubics.read(element.iterfind("lateralProfile/superelevation"))
         self.lane_offset = Cubics.read(element.iterfind("lanes/laneOffset"))
@@ -90,39 +91,37 @@ class Road:
         for profile in element.iterfind("lateralProfile"):
             unread.check(profile, ("superelevation", "crossfall", "shape"))
 
-    def place(self, table: PlanTable, offset: float) -> float:
-        """Add the reference line to a table at an offset.
+    def add_to_table(self, table: PlanTable, offset: float) -> float:
+        """Add the reference line to a table at an offset, and return the offset of the next road.
 
-        Returns the offset of the next road.
-
-        MeshFileError if the geometry does not reach the length of the road.
+        Raises MeshFileError if the geometry is shorter than the road.
         """
         geometries = self.element.findall("planView/geometry")
         if not geometries:
             raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
-        geometries.sort(key=lambda geometry: number(geometry, "s"))
+        geometries.sort(key=lambda geometry: read_number(geometry, "s"))
         last = geometries[-1]
-        end = positive(last, "s") + positive(last, "length")
+        end = read_non_negative(last, "s") + read_non_negative(last, "length")
         if self.length - end > _MAX_MISSING * self.length:
             raise MeshFileError(
                 f"contains the road {self.name!r} with a length of {self.length:,.9g} m, but its "
                 f"geometry ends at {end:,.9g} m. Correct its length or add geometry"
             )
         self.offset = offset
-        self.geometry_starts = table.add(geometries, offset, self.length)
+        self.geometry_starts = table.add_road(geometries, offset, self.length)
         if not len(self.geometry_starts) and self.length > 0:
             raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
         return offset + self.length + _GAP_M
 
     @cached_property
     def shapes(self) -> LateralShapes | None:
-        """Lateral shapes of the road, or None without any."""
+        """Lateral shapes of the road, or None."""
         elements = self.element.findall("lateralProfile/shape")
         return LateralShapes(elements) if elements else None
 
     @property
     def curved_across(self) -> bool:
-        """Whether cross sections of lanes are curved or broken."""
+        """Whether the cross sections of lanes are curved or have kinks."""
         return self.shapes is not None or any(map(len, self.crossfalls.values()))
 
     @property
@@ -134,7 +133,7 @@ class Road:
 
     @cached_property
     def breaks(self) -> Floats:
-        """Distances (b,) at which polynomials of the road change, m."""
+        """Distances (b,) in meters at which polynomials of the road change."""
         profiles = (
             self.elevation, self.superelevation, self.lane_offset, *self.crossfalls.values()
         )  # fmt: skip
@@ -143,10 +142,11 @@ class Road:
             starts.append(self.shapes.stations)
         return np.concatenate(starts)
 
-    def heights(self, stations: Stations, t: Floats, pieces: Floats | None = None) -> Floats:
-        """Return heights above the banked plane of crossfall and shapes, for t (..., k), m.
+    def heights(self, stations: RoadStations, t: Floats, pieces: Floats | None = None) -> Floats:
+        """Return the heights of crossfall and shapes at t coordinates (..., k).
 
-        `pieces` are t (..., k) in whose cubics of shapes the heights are; `t` itself if None.
+        They are relative to the banked plane. `pieces` (..., k) are the t coordinates that select
+        the pieces of the shapes, by default `t`.
         """
         heights = np.zeros_like(t)
         for side, crossfall in self.crossfalls.items():
@@ -158,17 +158,17 @@ class Road:
         return heights
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return t (j,) at which cross sections between distances change their slope, m."""
+        """Return the t coordinates (j,) of kinks in cross sections between two distances."""
         kinks = [np.zeros(1 if any(map(len, self.crossfalls.values())) else 0)]
         if self.shapes is not None:
             kinks.append(self.shapes.kinks(start, stop))
         return np.unique(np.concatenate(kinks))
 
-    def lines(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
-        """Return ascending t (j,) at which cross sections between t (2,) need points, m.
+    def points_across(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
+        """Return the ascending t coordinates (j,) at which cross sections need points.
 
-        Straight lines between the points are within `height_m` of the cross sections between the
-        distances `start` and `stop`.
+        `t` (2,) are the lower and the upper limit. Straight lines between the points are within
+        `height_m` of the cross sections between the distances `start` and `stop`.
         """
         kinks = self.kinks(start, stop)
         if self.shapes is None:
@@ -188,25 +188,28 @@ class Road:
 
 
 class LateralShapes:
-    """Heights across a road: cubics of t at stations, between which heights are interpolated."""
+    """Heights across a road: cubics of t at stations, interpolated linearly between stations."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         groups: dict[float, list[list[float]]] = {}
         for element in elements:
-            row = [number(element, name, 0.0) for name in ("t", *"abcd")]
-            groups.setdefault(number(element, "s"), []).append(row)
+            row = [read_number(element, name, 0.0) for name in ("t", *"abcd")]
+            groups.setdefault(read_number(element, "s"), []).append(row)
         self.stations: Floats = np.array(sorted(groups))  # (m,)
-        # Cubics of each station in ascending order; those that lack are never reached.
+        # The cubics at each station in ascending order, padded with starts that are never reached
         count = max(map(len, groups.values()))
         table = np.zeros((len(groups), count, 5))
         table[..., 0] = np.inf
         for profile, s in zip(table, self.stations.tolist(), strict=True):
             profile[: len(groups[s])] = sorted(groups[s], key=itemgetter(0))
-        self._starts: Floats = table[..., 0]  # (m, r), m
+        self._starts: Floats = table[..., 0]  # (m, r) in meters
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
-        """Return heights at distances (k,) and t (..., k), in the cubics at `pieces`, m."""
+        """Return the heights at distances (k,) and t coordinates (..., k).
+
+        `pieces` (..., k) are the t coordinates that select the cubics.
+        """
         last = len(self.stations) - 1
         station_indices = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
         following = np.minimum(station_indices + 1, last)
@@ -216,23 +219,29 @@ class LateralShapes:
         return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return t (j,) at which cubics start, of all stations that matter between distances."""
+        """Return the t coordinates (j,) at which cubics start.
+
+        Stations that determine the heights between the two distances are considered.
+        """
         starts = self._starts[self._row_range(start, stop)]
         return np.unique(starts[np.isfinite(starts)])
 
     def steps(self, start: float, stop: float) -> Floats:
-        """Return t (j,) at which heights step, of all stations that matter between distances."""
+        """Return the t coordinates (j,) at which heights step.
+
+        Stations that determine the heights between the two distances are considered.
+        """
         row_range = self._row_range(start, stop)
         starts = self._starts[row_range]
         a, b, c, d = self._coefficients[:, row_range]
-        with np.errstate(invalid="ignore"):  # infinite starts of cubics that lack
+        with np.errstate(invalid="ignore"):  # padding has infinite starts
             x = np.diff(starts, axis=1)
             ends = ((d[:, :-1] * x + c[:, :-1]) * x + b[:, :-1]) * x + a[:, :-1]
             is_step = np.abs(ends - a[:, 1:]) > _STEP_M
         return np.unique(starts[:, 1:][is_step & np.isfinite(starts[:, 1:])])
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
-        """Return the largest second derivatives between ascending t (j + 1,), 1/m."""
+        """Return the largest second derivatives in 1/m between ascending t coordinates (j + 1,)."""
         row_range = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
         pieces = np.maximum((self._starts[row_range, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
@@ -244,14 +253,14 @@ class LateralShapes:
         return np.where(is_before, 0.0, np.maximum(*ends)).max(axis=0)
 
     def _row_range(self, start: float, stop: float) -> slice:
-        """Return the stations between which the heights between two distances are."""
+        """Return the range of stations that determine the heights between two distances."""
         first = int(np.searchsorted(self.stations, start, "right")) - 1
         last = int(np.searchsorted(self.stations, stop, "left")) + 1
         count = len(self.stations)
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
     def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights of stations, by their indices (k,), at t (..., k), m."""
+        """Return the heights at t coordinates (..., k) for stations with given indices (k,)."""
         cubics = np.maximum(
             (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
         )
@@ -260,13 +269,17 @@ class LateralShapes:
         return np.asarray(((d * x + c) * x + b) * x + a)
 
 
-class Network:
-    """The roads of a file, and their reference lines in one table.
+class RoadNetwork:
+    """The roads in a file, with their reference lines in a common table.
 
     Parameters
     ----------
     elements
-        The <road> of a file.
+        The <road> elements.
+    allowance
+        Memory that the reference lines may occupy.
+    unread
+        Counts the elements that are not read.
     """
 
     def __init__(
@@ -276,7 +289,7 @@ class Network:
         self.roads = [Road(element, unread) for element in elements]
         offset = 0.0
         for road in self.roads:
-            offset = road.place(self._table, offset)
+            offset = road.add_to_table(self._table, offset)
         self._table.finish()
 
     def is_straight(self, road: Road, intervals: Intervals) -> bool:
@@ -286,11 +299,11 @@ class Network:
         ends = road.offset + intervals.ends
         return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
-    def frames(self, roads: Sequence[Road], stations: Sequence[Stations]) -> Frames:
-        """Return the frames of roads at stations (k,) of each, one after another."""
+    def frames(self, roads: Sequence[Road], stations: Sequence[RoadStations]) -> RoadFrames:
+        """Return the frames of roads at stations (k,) on each road, concatenated."""
         pairs = [*zip(roads, stations, strict=True)]
         if not pairs:
-            return Frames(*np.zeros((5, 0, 3)))
+            return RoadFrames(*np.zeros((5, 0, 3)))
         points = self._table.points(
             np.concatenate([road.offset + at.s for road, at in pairs]),
             np.concatenate([road.offset + at.pieces for road, at in pairs]),
@@ -301,16 +314,16 @@ class Network:
         zero = np.zeros_like(heights)
         origins = np.stack([points.x, points.y, heights], axis=1)
         along = np.stack([points.cosines, points.sines, slopes], axis=1)
-        along /= length(along)[:, None]
+        along /= norm(along)[:, None]
         level_side = np.stack([-points.sines, points.cosines, zero], axis=1)
         upright = np.cross(along, level_side)
         if not roll.any():
-            return Frames(origins, along, level_side, upright, level_side)
+            return RoadFrames(origins, along, level_side, upright, level_side)
         sines, cosines = (values[:, None] for values in sin_cos(roll))
         side = level_side * cosines + upright * sines
-        return Frames(origins, along, side, upright * cosines - level_side * sines, level_side)
+        return RoadFrames(origins, along, side, upright * cosines - level_side * sines, level_side)
 
     def point(self, road: Road, s: float, t: float, h: float = 0.0) -> Floats:
-        """Return the point (3,) of a road at a distance, at t and a height above its plane."""
-        frames = self.frames([road], [Stations.at(np.array([s]))])
+        """Return the point (3,) at road coordinates s, t, and h."""
+        frames = self.frames([road], [RoadStations.at(np.array([s]))])
         return np.asarray(frames.origins[0] + t * frames.side[0] + h * frames.up[0])

@@ -1,4 +1,4 @@
-"""Road marks on the borders of lanes, as quadrangles just above the lanes' triangles."""
+"""Convert road marks to quadrilaterals slightly above the triangles of the lanes."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 
 from .cross_sections import GAP_M
-from .elements import UnreadElements, number, positive
+from .elements import UnreadElements, read_non_negative, read_number
 from .lanes import Lane, SectionSurface
 
-LIFT_M = 0.003  # height of marks above the road: thickness of thermoplastic marks
-DASH_M = 3.0  # dashes of broken marks that state no lengths
-SPACE_M = 6.0  # gaps between these dashes
+LIFT_M = 0.003  # height above the road, which is the thickness of thermoplastic marks
+DASH_M = 3.0  # default length of dashes
+SPACE_M = 6.0  # default length of gaps
 WIDTH_M = 0.12  # default width of marks
 _DOT_M = 0.1  # length of Botts' dots
 _DOT_SPACE_M = 1.2
-# Lines of marks from right to left; True for a broken line.
+# The lines of a mark from right to left; True for a broken line.
 _LINES = {
     "solid": (False,),
     "broken": (True,),
@@ -36,27 +36,27 @@ _KNOWN = ("type", "explicit")
 
 
 class _Line(NamedTuple):
-    """A painted line of a mark, from `starts` to `stops` along the road."""
+    """A painted line of a road mark, as dashes along the road."""
 
-    starts: Floats  # (d,): of dashes, ascending, m
-    stops: Floats  # (d,), m
-    shift: float  # distance to the left of the border, m
-    width: float  # m
+    starts: Floats  # (d,) starts of the dashes in meters, ascending
+    stops: Floats  # (d,) stops of the dashes in meters
+    shift: float  # distance to the left of the border in meters
+    width: float  # in meters
     color: str
 
 
 class PaintedQuads(NamedTuple):
-    """Road marks of a color."""
+    """The road marks with a certain color."""
 
     color: str
-    points: Floats  # (v, 3), m
+    points: Floats  # (v, 3) in meters
     faces: Ints  # (f, 3)
 
 
 def painted_quads(
     surface: SectionSurface, allowance: Allowance, unread: UnreadElements
 ) -> list[PaintedQuads]:
-    """Return the road marks of a lane section, by colors."""
+    """Return the road marks of a lane section by color."""
     section = surface.section
     lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
     knots = [
@@ -68,7 +68,7 @@ def painted_quads(
     if not knots:
         return []
     points = _points_of(surface, knots)
-    quads_of_colors: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
+    quads_of_colors: dict[str, list[Ints]] = {}  # first cross sections of quadrilaterals
     offset = 0
     for entry in knots:
         quads_of_colors.setdefault(entry.color, []).append(offset + entry.quads)
@@ -80,9 +80,9 @@ def painted_quads(
 
 
 def _quads(right: Ints, count: int) -> Ints:
-    """Return triangles (f, 3) between cross sections and the following.
+    """Return triangles (f, 3) between cross sections and the following ones.
 
-    `right` are the cross sections' right points; their left points follow after `count`.
+    `right` contains the indices of the right points. The left points are `count` indices later.
     """
     left = right + count
     return np.concatenate(
@@ -94,21 +94,21 @@ def _quads(right: Ints, count: int) -> Ints:
 
 
 class _Knots(NamedTuple):
-    """Cross sections of a painted line."""
+    """The cross sections of a painted line."""
 
-    stations: Ints  # (q,): ascending, of the section, each the last before a cross section
-    shares: Floats  # (q,): of the way to the following station
-    first_t: Floats  # (q,): of the middle of the line at `stations`, m
-    second_t: Floats  # (q,): at the following stations, m
-    width: float  # m
-    quads: Ints  # (p,): cross sections at which quadrangles start
+    stations: Ints  # (q,) last station before each cross section, ascending
+    shares: Floats  # (q,) fraction of the distance to the next station
+    first_t: Floats  # (q,) t coordinate of the line's center at `stations`
+    second_t: Floats  # (q,) the same at the following stations
+    width: float  # in meters
+    quads: Ints  # (p,) cross sections at which quadrilaterals start
     color: str
 
 
 def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
-    """Return the cross sections of a line: ends of dashes, and stations within them.
+    """Return the cross sections of a line, at the ends of dashes and at stations within dashes.
 
-    Where the road steps, lines end before the step and start again after it.
+    Where the road steps, a line ends before the step and continues after it.
     """
     s = surface.stations.s
     last = len(s) - 1
@@ -131,10 +131,10 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
 
 
 def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return the stations, shares and quadrangles of the cross sections of a line of dashes.
+    """Return the stations, shares, and quadrilaterals of the cross sections of a dashed line.
 
-    `s` are the distances of the section's stations (k,), m, and `steps` (j,) the stations that the
-    next follows at the same distance.
+    `s` (k,) are the distances of the section's stations in meters, and `steps` (j,) the stations
+    before a step, where the next station has the same distance.
     """
     last = len(s) - 1
     # At a step, a dash starts at the station after it, and stops at the station before it.
@@ -152,7 +152,7 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
 
 
 def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
-    """Return distances (d,) in numbers of stations, with the share of the way to the following."""
+    """Express distances (d,) as fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
     shares = (distances - s[stations]) / lengths
@@ -160,7 +160,7 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
-    """Return the right edges of lines, then the left edges, on the lanes' triangles, (2q, 3)."""
+    """Return the right and then the left edges of lines on the lanes, shape (2q, 3)."""
     station_indices = np.concatenate([entry.stations for entry in knots])
     shares = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
@@ -182,11 +182,11 @@ def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
 def _lines_of(
     lane: Lane, start: float, stop: float, allowance: Allowance, unread: UnreadElements
 ) -> Iterator[_Line]:
-    """Yield the painted lines of a lane between distances on its road."""
+    """Yield the painted lines of a lane between two distances on its road."""
     marks = lane.element.findall("roadMark")
     if all(mark.get("type", "none") in _UNPAINTED for mark in marks):
         return
-    starts = [start + number(mark, "sOffset", 0.0) for mark in marks]
+    starts = [start + read_number(mark, "sOffset", 0.0) for mark in marks]
     order = sorted(range(len(marks)), key=starts.__getitem__)
     stops = [*(min(starts[k], stop) for k in order), stop][1:]
     for k, mark_stop in zip(order, stops, strict=True):
@@ -200,15 +200,18 @@ def _lines_of(
 def _lines_of_mark(
     mark: Element, start: float, stop: float, side: int, allowance: Allowance
 ) -> list[_Line]:
-    """Return the lines of a mark: explicit lines, the lines of its type, or lines by its name."""
+    """Return the lines of a road mark.
+
+    The lines are stated explicitly, by the type of the mark, or by the name of the mark.
+    """
     color = _color(mark, "white")
-    width = positive(mark, "width", 0.0) or WIDTH_M
+    width = read_non_negative(mark, "width", 0.0) or WIDTH_M
     explicit = mark.findall("explicit/line")
     if explicit:
         return [_explicit_line(line, start, stop, width, color) for line in explicit]
     typed = mark.find("type")
     if typed is not None and typed.find("line") is not None:
-        width = positive(typed, "width", 0.0) or width
+        width = read_non_negative(typed, "width", 0.0) or width
         return [
             _typed_line(line, start, stop, width, color, allowance)
             for line in typed.iterfind("line")
@@ -217,7 +220,8 @@ def _lines_of_mark(
     if name == "botts dots":
         dots = _dashes(start, stop, _DOT_M, _DOT_SPACE_M, allowance)
         return [_Line(*dots, 0.0, _DOT_M, color)]
-    # Of lanes, the lines of a name run from the inside out; of the middle, from left to right.
+    # The names list lines from the inside out for lanes, and from left to right for the center
+    # lane.
     broken = _LINES.get(name, (False,))
     shifts = [2 * width * (k - (len(broken) - 1) / 2) for k in range(len(broken))]
     direction = 1 if side > 0 else -1
@@ -233,15 +237,15 @@ def _lines_of_mark(
 
 
 def _explicit_line(line: Element, start: float, stop: float, width: float, color: str) -> _Line:
-    """Return a single line of a mark."""
-    first = start + number(line, "sOffset", 0.0)
-    last = min(first + positive(line, "length", 0.0), stop)
+    """Return a line that a road mark states explicitly."""
+    first = start + read_number(line, "sOffset", 0.0)
+    last = min(first + read_non_negative(line, "length", 0.0), stop)
     starts = np.array([first] if last > first else [])
     return _Line(
         starts,
         np.array([last] if last > first else []),
-        number(line, "tOffset", 0.0),
-        positive(line, "width", 0.0) or width,
+        read_number(line, "tOffset", 0.0),
+        read_non_negative(line, "width", 0.0) or width,
         color,
     )
 
@@ -249,15 +253,19 @@ def _explicit_line(line: Element, start: float, stop: float, width: float, color
 def _typed_line(
     line: Element, start: float, stop: float, width: float, color: str, allowance: Allowance
 ) -> _Line:
-    """Return a line of the type of a mark, which repeats its length and space."""
-    first = start + max(0.0, number(line, "sOffset", 0.0))
+    """Return a line in the type of a road mark, which repeats a dash and a gap."""
+    first = start + max(0.0, read_number(line, "sOffset", 0.0))
     dashes = _dashes(
-        first, stop, positive(line, "length", 0.0), positive(line, "space", 0.0), allowance
+        first,
+        stop,
+        read_non_negative(line, "length", 0.0),
+        read_non_negative(line, "space", 0.0),
+        allowance,
     )
     return _Line(
         *dashes,
-        number(line, "tOffset", 0.0),
-        positive(line, "width", 0.0) or width,
+        read_number(line, "tOffset", 0.0),
+        read_non_negative(line, "width", 0.0) or width,
         _color(line, color),
     )
 
@@ -265,7 +273,7 @@ def _typed_line(
 def _dashes(
     start: float, stop: float, length: float, space: float, allowance: Allowance
 ) -> tuple[Floats, Floats]:
-    """Return starts and stops (d,) of dashes, or of a single dash without space or length."""
+    """Return the starts and stops (d,) of dashes, or of a single dash without gaps."""
     if not start < stop:
         return np.zeros(0), np.zeros(0)
     if space <= 0 or length <= 0:
@@ -278,6 +286,6 @@ def _dashes(
 
 
 def _color(element: Element, default: str) -> str:
-    """Return the color of a mark or line, by default the standard color white."""
+    """Return the color of a mark or line; the standard color is white."""
     color = element.get("color") or default
     return "white" if color == "standard" else color[:20]

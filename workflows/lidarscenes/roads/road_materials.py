@@ -1,4 +1,4 @@
-"""Materials of roads, their colors, and classes of objects."""
+"""Define the materials of roads, their colors, and the object classes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _LINEAR = {
 }
 _OTHER = (0.5, 0.5, 0.5)
 
-# {type of a lane: material}; others are of asphalt.
+# {lane type: material}; all others are asphalt.
 _LANES = {
     "sidewalk": CONCRETE,
     "walking": CONCRETE,
@@ -52,7 +52,7 @@ _LANES = {
     "median": GRASS,
     "none": EARTH,
 }
-# {type of an object: material}; others are of concrete.
+# {object type: material}; all others are concrete.
 _OBJECTS = {
     "building": WALL,
     "tree": LEAVES,
@@ -70,7 +70,7 @@ _OBJECTS = {
     "bike": METAL,
     "motorbike": METAL,
 }
-# Words of the attribute `surface` of lanes, and their materials.
+# Words in the attribute `surface` of lanes, and their materials.
 _SURFACES = {
     "asphalt": ASPHALT,
     "concrete": CONCRETE,
@@ -87,7 +87,7 @@ CARRIAGEWAY = (
     "onRamp", "offRamp", "connectingRamp", "slipLane", "shared", "stop",
 )  # fmt: skip
 
-# Class 1 is for types that have no class in ASPRS LAS; 64 and above are free for users.
+# Class 1 is for types without a class in ASPRS LAS. Classes from 64 on are user-defined.
 CLASSES = {
     1: ObjectClass("unclassified", ("obstacle *", "object *", "patch *", "wind *")),
     2: ObjectClass("ground", ("none lane *", "median lane *")),
@@ -118,19 +118,19 @@ CLASSES = {
 
 
 @cache
-def color_of(material: str) -> Bytes:
+def material_color(material: str) -> Bytes:
     """Return the sRGB color (1, 1, 3) of a material."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 
-def material_of_lane(lane_type: str, surface: str | None) -> str:
-    """Return the material of a lane by its type, or by the surface that it states."""
+def lane_material(lane_type: str, surface: str | None) -> str:
+    """Return the material of a lane, given its type and the surface that it states."""
     for word, material in _SURFACES.items():
         if surface and word in surface.lower():
             return material
     return _LANES.get(lane_type, ASPHALT)
 
 
-def material_of_object(object_type: str) -> str:
-    """Return the material of an object by its type."""
+def object_material(object_type: str) -> str:
+    """Return the material of an object, given its type."""
     return _OBJECTS.get(object_type, CONCRETE)

@@ -1,4 +1,4 @@
-"""Objects beside and on roads: boxes, cylinders, outlines, rows of copies, markings and tunnels."""
+"""Convert road objects: boxes, cylinders, outlines, repeated copies, markings, and tunnels."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import arctan2
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.scene.files.scene_graph import Piece
 
 from .cross_sections import (
     HEIGHT_SHARE,
     Intervals,
+    RoadStations,
     SampledSurface,
-    Samples,
-    Stations,
+    SurfaceSamples,
     has_extent,
-    placed_stations,
+    place_stations,
 )
-from .elements import MAX_SHOWN, UnreadElements, number, positive
+from .elements import MAX_SHOWN, UnreadElements, read_non_negative, read_number
 from .lanes import LaneSection
-from .road import Frames, Network, Road
+from .road import Road, RoadFrames, RoadNetwork
 from .road_marks import LIFT_M
-from .road_materials import CONCRETE, PAINT, material_of_object
+from .road_materials import CONCRETE, PAINT, object_material
 from .solids import (
     box,
     cylinder,
-    extruded,
-    joined,
+    extrude_sections,
+    merge_pieces,
     painted_strips,
-    placed,
     prism,
-    rotation,
-    zebra,
+    rotation_matrix,
+    transform_points,
+    zebra_stripes,
 )
 
 TUNNEL_HEIGHT_M = 5.0
 TUNNEL_MARGIN_M = 0.5  # distance between the outermost lanes and the walls
-STRIPE_M = 0.5  # stripes and gaps of crosswalks that state no markings
+STRIPE_M = 0.5  # width of stripes and gaps in crosswalks without markings
 UNTYPED = "object"  # name of objects without a type, whose flat outlines may be lines or decals
 _FLAT = ("crosswalk", "roadMark", "parkingSpace")  # types that are paint if they have no height
 _BYTES_PER_COPY = 4000
-_BYTES_PER_POINT = 400  # peak memory of a point of a rail or tunnel
-_TOP = [3, 2]  # corners of a rail between which it is measured, from the right to the left
-_CEILING = [2, 1]  # ceiling of a tunnel, right to left
+_BYTES_PER_POINT = 400  # peak memory per point of a rail or tunnel
+_TOP = [3, 2]  # corners at the top of a rail, from right to left
+_CEILING = [2, 1]  # corners at the ceiling of a tunnel, from right to left
 _KNOWN_OBJECTS = ("object", "objectReference", "tunnel")
 _KNOWN = ("repeat", "outline", "outlines", "material", "parkingSpace", "markings")
 
 
 class ObjectBuilder:
-    """Builder of the objects of a file."""
+    """Builds the objects in a file."""
 
     def __init__(
-        self, network: Network, sag_m: float, allowance: Allowance, unread: UnreadElements
+        self, network: RoadNetwork, sag_m: float, allowance: Allowance, unread: UnreadElements
     ) -> None:
         self._network = network
         self._sag_m = sag_m
@@ -67,7 +67,7 @@ class ObjectBuilder:
         self._rails = _rail_pieces(network, sag_m, allowance)
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the objects of a road."""
+        """Yield the names and triangles of the objects on a road."""
         for group in road.element.iterfind("objects"):
             self._unread.check(group, _KNOWN_OBJECTS)
             for element in group.iterfind("object"):
@@ -79,12 +79,12 @@ class ObjectBuilder:
                     yield name, piece
 
     def _object(self, road: Road, element: Element) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of an object and of its copies."""
+        """Yield the names and triangles of an object and its copies."""
         kind = _kind(element)
         name = f"{kind[:MAX_SHOWN]} {road.name}/{(element.get('id') or '')[:MAX_SHOWN]}"
         repeats = element.findall("repeat")
         if not repeats:
-            base = _Placement.of(element)
+            base = _Placement.from_element(element)
             for piece in self._pieces_at(road, element, kind, base):
                 yield name, piece
         count = 0
@@ -104,18 +104,19 @@ class ObjectBuilder:
         self, road: Road, element: Element, kind: str, placement: _Placement
     ) -> Iterator[Piece]:
         """Yield the triangles of an object at a placement."""
-        material = material_of_object(kind)
-        frame = _ObjectFrame.of(self._network, road, element, placement)
+        material = object_material(kind)
+        frame = _ObjectFrame.from_element(self._network, road, element, placement)
         outlines = [
-            _Outline.of(self._network, road, outline, frame) for outline in _outlines(element)
+            _Outline.from_element(self._network, road, outline, frame)
+            for outline in _outlines(element)
         ]
         painted = [*self._markings(element, frame, placement, outlines)]
         yield from painted
         size = placement.size
         has_walls = any(outline.heights.any() for outline in outlines)
         if kind in _FLAT and not has_walls:
-            # A marking on the road: its stripes, else its area. A type for markings that states a
-            # height and has no outline is a box, except a parking space.
+            # A marking on the road is drawn as its stripes or, without stripes, as its area. If it
+            # states a height and has no outline, it is a box, except for parking spaces.
             if not painted and (outlines or (min(size[:2]) > 0 and size[2] <= 0)):
                 yield from _flat_pieces(element, kind, frame, placement, outlines)
             elif not outlines and size[2] > 0 and kind != "parkingSpace":
@@ -134,14 +135,14 @@ class ObjectBuilder:
 
     def _copies(self, element: Element, repeat: Element) -> Iterator[_Placement]:
         """Yield the placements of the copies of an object along a road."""
-        base = _Placement.of(element)
-        span = positive(repeat, "length", 0.0)
-        distance = positive(repeat, "distance", 0.0)
+        base = _Placement.from_element(element)
+        span = read_non_negative(repeat, "length", 0.0)
+        distance = read_non_negative(repeat, "distance", 0.0)
         count = span / distance + 1e-6 if distance > 0 else 0
         self._allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
         for k in range(int(count) + 1):
             share = min(1.0, k * distance / span) if span > 0 else 0.0
-            yield base.repeated(repeat, share, number(repeat, "s") + k * distance)
+            yield base.repeated(repeat, share, read_number(repeat, "s") + k * distance)
 
     def _markings(
         self,
@@ -152,7 +153,7 @@ class ObjectBuilder:
     ) -> Iterator[Piece]:
         """Yield the painted edges of an object."""
         corners = {key: point for outline in outlines for key, point in outline.ids.items()}
-        rectangle = placed(_rectangle(placement.size), frame.origin, frame.turn)
+        rectangle = transform_points(_rectangle(placement.size), frame.origin, frame.turn)
         sides = {
             "right": rectangle[[0, 1]],
             "front": rectangle[[1, 2]],
@@ -165,26 +166,26 @@ class ObjectBuilder:
                 line = [corners[key] for key in references if key in corners]
             else:
                 line = [*sides.get(marking.get("side", ""), ())]
-            width = positive(marking, "width", 0.0)
+            width = read_non_negative(marking, "width", 0.0)
             if len(line) < 2 or not width:
                 self._unread.add("marking without a line")
                 continue
             starts, stops = self._dashed(np.array(line), marking)
             if len(starts):
-                lift = np.array([0, 0, max(number(marking, "zOffset", LIFT_M), LIFT_M)])
+                lift = np.array([0, 0, max(read_number(marking, "zOffset", LIFT_M), LIFT_M)])
                 paint = f"{PAINT} {_paint_color(marking.get('color'))}"
                 yield painted_strips(starts + lift, stops + lift, width, paint)
 
     def _dashed(self, line: Floats, marking: Element) -> tuple[Floats, Floats]:
-        """Return starts and stops (d, 3) of the dashes of a marking along a line (n, 3)."""
-        dash = positive(marking, "lineLength", 0.0)
-        space = positive(marking, "spaceLength", 0.0)
+        """Return the starts and stops (d, 3) of the dashes of a marking along a line (n, 3)."""
+        dash = read_non_negative(marking, "lineLength", 0.0)
+        space = read_non_negative(marking, "spaceLength", 0.0)
         starts = []
         stops = []
         for begin, end in pairwise(line):
-            size = float(length(end - begin))
-            first = positive(marking, "startOffset", 0.0)
-            last = size - positive(marking, "stopOffset", 0.0)
+            size = float(norm(end - begin))
+            first = read_non_negative(marking, "startOffset", 0.0)
+            last = size - read_non_negative(marking, "stopOffset", 0.0)
             if last <= first or size <= 0:
                 continue
             count = (last - first) / (dash + space) if dash > 0 and space > 0 else 0.0
@@ -203,8 +204,8 @@ class ObjectBuilder:
         self, road: Road, sections: Sequence[LaneSection], element: Element
     ) -> Iterator[Piece]:
         """Yield the walls and the ceiling of a tunnel around all lanes of a road."""
-        start = max(0.0, number(element, "s"))
-        stop = min(road.length, start + positive(element, "length", 0.0))
+        start = max(0.0, read_number(element, "s"))
+        stop = min(road.length, start + read_non_negative(element, "length", 0.0))
         for section in sections:
             first = max(start, section.start)
             last = min(stop, section.stop)
@@ -215,21 +216,21 @@ class ObjectBuilder:
     def _tunnel_part(
         self, road: Road, section: LaneSection, start: float, stop: float
     ) -> Iterator[Piece]:
-        """Yield the walls and the ceiling of a tunnel between two distances of a lane section."""
+        """Yield the walls and the ceiling of a tunnel in a part of a lane section."""
         intervals = section.intervals(road, start, stop)
         is_plain = section.is_plain and road.is_plain
-        samples = intervals.sampled(
+        samples = intervals.surface_samples(
             are_planes=is_plain and self._network.is_straight(road, intervals)
         )
         rings = self._tunnel_rings(road, section, samples.stations)
         surface = _sampled(samples, rings[:, _CEILING], self._sag_m)
-        [placed] = placed_stations([surface], self._sag_m, self._allowance, _BYTES_PER_POINT)
+        [placed] = place_stations([surface], self._sag_m, self._allowance, _BYTES_PER_POINT)
         rings = self._tunnel_rings(road, section, placed.stations)
         for a, b in pairwise(range(4)):  # open below
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
-    def _tunnel_rings(self, road: Road, section: LaneSection, stations: Stations) -> Floats:
-        """Return corners (k, 4, 3) of a tunnel, from lower left to lower right over the ceiling."""
+    def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
+        """Return the corners (k, 4, 3) of a tunnel, clockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -242,7 +243,7 @@ class ObjectBuilder:
 
 
 class _Rail(NamedTuple):
-    """An object that is drawn along a road, such as a guard rail."""
+    """An object that extends along a road, such as a guard rail."""
 
     road: Road
     start: float  # m
@@ -253,17 +254,17 @@ class _Rail(NamedTuple):
     material: str
 
     @classmethod
-    def of(cls, road: Road, element: Element, repeat: Element) -> _Rail | None:
+    def from_element(cls, road: Road, element: Element, repeat: Element) -> _Rail | None:
         """Return the rail of a <repeat>, or None without a size."""
-        start = number(repeat, "s")
-        stop = min(start + positive(repeat, "length", 0.0), road.length)
-        base = _Placement.of(element)
+        start = read_number(repeat, "s")
+        stop = min(start + read_non_negative(repeat, "length", 0.0), road.length)
+        base = _Placement.from_element(element)
         first = base.repeated(repeat, 0.0, start)
         last = base.repeated(repeat, 1.0, stop)
         if stop <= start or max(first.height, last.height) <= 0:
             return None
         intervals = Intervals.between(start, stop, road.breaks)
-        material = material_of_object(_kind(element))
+        material = object_material(_kind(element))
         return cls(
             road=road,
             start=start,
@@ -274,8 +275,8 @@ class _Rail(NamedTuple):
             material=material,
         )
 
-    def rings(self, stations: Stations, frames: Frames) -> Floats:
-        """Return cross sections (k, 4, 3), from the lower right corner to the upper left."""
+    def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
+        """Return the cross sections (k, 4, 3), clockwise from the lower right."""
         share = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
@@ -296,17 +297,19 @@ class _Rail(NamedTuple):
         return np.stack([frames.origins + corner for corner in corners], axis=1)
 
 
-def _rail_pieces(network: Network, sag_m: float, allowance: Allowance) -> dict[Element, Piece]:
-    """Return the rails of a file by their <repeat>."""
+def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> dict[Element, Piece]:
+    """Return the rails in a file by their <repeat> elements."""
     rails: dict[Element, _Rail] = {}
     for road in network.roads:
         for element in road.element.iterfind("objects/object"):
             for repeat in element.iterfind("repeat"):
-                rail = _Rail.of(road, element, repeat) if _is_rail(element, repeat) else None
+                rail = (
+                    _Rail.from_element(road, element, repeat) if _is_rail(element, repeat) else None
+                )
                 if rail is not None:
                     rails[repeat] = rail
     samples = [
-        rail.intervals.sampled(
+        rail.intervals.surface_samples(
             are_planes=rail.road.is_plain and network.is_straight(rail.road, rail.intervals)
         )
         for rail in rails.values()
@@ -317,18 +320,18 @@ def _rail_pieces(network: Network, sag_m: float, allowance: Allowance) -> dict[E
         _sampled(entry, sections[:, _TOP], sag_m)
         for entry, sections in zip(samples, rings, strict=True)
     ]
-    placed = placed_stations(surfaces, sag_m, allowance, _BYTES_PER_POINT)
+    placed = place_stations(surfaces, sag_m, allowance, _BYTES_PER_POINT)
     rings = _rings(network, rails.values(), [entry.stations for entry in placed])
-    # Where the road steps, one solid ends and another starts.
+    # Where the road steps, a solid ends and another one starts.
     return {
-        repeat: joined(
-            [extruded(part, rail.material) for part in np.split(sections, entry.steps + 1)]
+        repeat: merge_pieces(
+            [extrude_sections(part, rail.material) for part in np.split(sections, entry.steps + 1)]
         )
         for (repeat, rail), sections, entry in zip(rails.items(), rings, placed, strict=True)
     }
 
 
-def _sampled(samples: Samples, points: Floats, sag_m: float) -> SampledSurface:
+def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSurface:
     """Return the surface between two lines of points (k, 2, 3) at samples."""
     columns = np.moveaxis(points, 1, 0)
     is_cell = np.ones(1, np.bool_)
@@ -336,7 +339,7 @@ def _sampled(samples: Samples, points: Floats, sag_m: float) -> SampledSurface:
 
 
 def _rings(
-    network: Network, rails: Collection[_Rail], stations: Sequence[Stations]
+    network: RoadNetwork, rails: Collection[_Rail], stations: Sequence[RoadStations]
 ) -> Iterator[Floats]:
     """Yield the cross sections (k, 4, 3) of each rail at stations."""
     frames = network.frames([rail.road for rail in rails], stations)
@@ -344,75 +347,79 @@ def _rings(
     for rail, at in zip(rails, stations, strict=True):
         start = stop
         stop += len(at)
-        yield rail.rings(at, frames.take(slice(start, stop)))
+        yield rail.rings(at, frames.select(slice(start, stop)))
 
 
 class _Placement(NamedTuple):
-    """Place and size of an object or of a copy."""
+    """The position and the size of an object or a copy."""
 
-    s: float  # m
-    t: float  # m
-    z: float  # above the plane of the road, m
-    length: float  # m
-    width: float  # m
-    height: float  # m
-    radius: float  # m; 0 for a box
-    shift: float = 0.0  # distance of a copy along the road from the object, m
+    # All values are in meters.
+    s: float
+    t: float
+    z: float  # height above the plane of the road
+    length: float
+    width: float
+    height: float
+    radius: float  # 0 for a box
+    shift: float = 0.0  # distance along the road from the object to its copy
 
     @classmethod
-    def of(cls, element: Element) -> _Placement:
+    def from_element(cls, element: Element) -> _Placement:
         """Return the placement of an <object>."""
-        # A broken size of one object does not make a file unusable: it counts as no size.
+        # A negative size counts as zero, so that a single object does not make a file unusable.
         names = ("length", "width", "height", "radius")
-        sizes = [max(0.0, number(element, name, 0.0)) for name in names]
+        sizes = [max(0.0, read_number(element, name, 0.0)) for name in names]
         return cls(
-            number(element, "s"), number(element, "t"), number(element, "zOffset", 0.0), *sizes
+            read_number(element, "s"),
+            read_number(element, "t"),
+            read_number(element, "zOffset", 0.0),
+            *sizes,
         )
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Length, width and height, m."""
+        """Length, width, and height in meters."""
         return self.length, self.width, self.height
 
     @property
     def wide(self) -> float:
-        """Width, or diameter of a round object, m."""
+        """Width in meters, which is the diameter of a round object."""
         return 2 * self.radius if self.radius > 0 else self.width
 
     def repeated(self, repeat: Element, share: float, s: float) -> _Placement:
-        """Return the placement of a copy at a share of the way along a <repeat>."""
+        """Return the placement of a copy at a fraction of the length of a <repeat>."""
         values = {}
         for name, field in (
             ("t", "t"), ("zOffset", "z"), ("length", "length"), ("width", "width"),
             ("height", "height"), ("radius", "radius"),
         ):  # fmt: skip
             default = getattr(self, field)
-            first = number(repeat, f"{name}Start", default)
-            last = number(repeat, f"{name}End", first)
+            first = read_number(repeat, f"{name}Start", default)
+            last = read_number(repeat, f"{name}End", first)
             value = first + share * (last - first)
             values[field] = value if field in ("t", "z") else max(0.0, value)
         return self._replace(s=s, shift=s - self.s, **values)
 
 
 class _ObjectFrame(NamedTuple):
-    """Frame of an object: its origin, and the directions of its axes."""
+    """The coordinate frame of an object."""
 
-    origin: Floats  # (3,), m
+    origin: Floats  # (3,) in meters
     turn: Floats  # (3, 3)
-    shift: float  # distance of a copy along the road, m
+    shift: float  # distance of a copy along the road, in meters
 
     @classmethod
-    def of(
-        cls, network: Network, road: Road, element: Element, placement: _Placement
+    def from_element(
+        cls, network: RoadNetwork, road: Road, element: Element, placement: _Placement
     ) -> _ObjectFrame:
-        """Return the frame of an object, which is upright whatever the slope of the road."""
-        frames = network.frames([road], [Stations.at(np.array([placement.s]))])
+        """Return the frame of an object, which is upright regardless of the slope of the road."""
+        frames = network.frames([road], [RoadStations.at(np.array([placement.s]))])
         origin = frames.origins + placement.t * frames.side + placement.z * frames.up
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
-        turn = rotation(
-            heading + number(element, "hdg", 0.0),
-            number(element, "pitch", 0.0),
-            number(element, "roll", 0.0),
+        turn = rotation_matrix(
+            heading + read_number(element, "hdg", 0.0),
+            read_number(element, "pitch", 0.0),
+            read_number(element, "roll", 0.0),
         )
         return cls(origin[0], turn, placement.shift)
 
@@ -420,29 +427,33 @@ class _ObjectFrame(NamedTuple):
 class _Outline(NamedTuple):
     """An outline of an object."""
 
-    corners: Floats  # (n, 3), m
-    heights: Floats  # (n,), m
+    corners: Floats  # (n, 3) in meters
+    heights: Floats  # (n,) in meters
     ids: dict[str, Floats]  # {id of a corner: its point}
     closed: bool
     outer: bool
 
     @classmethod
-    def of(cls, network: Network, road: Road, element: Element, frame: _ObjectFrame) -> _Outline:
-        """Return the outline of an <outline>."""
+    def from_element(
+        cls, network: RoadNetwork, road: Road, element: Element, frame: _ObjectFrame
+    ) -> _Outline:
+        """Read an <outline>."""
         points = []
         heights = []
         ids = {}
         for corner in element:
             if corner.tag == "cornerRoad":
-                s = number(corner, "s") + frame.shift
-                point = network.point(road, s, number(corner, "t"), number(corner, "dz", 0.0))
+                s = read_number(corner, "s") + frame.shift
+                point = network.point(
+                    road, s, read_number(corner, "t"), read_number(corner, "dz", 0.0)
+                )
             elif corner.tag == "cornerLocal":
-                uvz = [number(corner, name, 0.0) for name in "uvz"]
-                point = placed(np.array([uvz]), frame.origin, frame.turn)[0]
+                uvz = [read_number(corner, name, 0.0) for name in "uvz"]
+                point = transform_points(np.array([uvz]), frame.origin, frame.turn)[0]
             else:
                 continue
             points.append(point)
-            heights.append(positive(corner, "height", 0.0))
+            heights.append(read_non_negative(corner, "height", 0.0))
             ids[corner.get("id", "")] = point
         return cls(
             np.array(points).reshape(-1, 3),
@@ -460,12 +471,12 @@ def _kind(element: Element) -> str:
 
 
 def _is_rail(element: Element, repeat: Element) -> bool:
-    """Return True if a <repeat> draws an object along a road, in place of copies."""
-    return positive(repeat, "distance", 0.0) == 0 and not _outlines(element)
+    """Return True if a <repeat> extends an object along the road instead of copying it."""
+    return read_non_negative(repeat, "distance", 0.0) == 0 and not _outlines(element)
 
 
 def _outlines(element: Element) -> list[Element]:
-    """Return the outlines of an object that have two corners or more."""
+    """Return the outlines of an object that have at least two corners."""
     outlines = [*element.iterfind("outline"), *element.iterfind("outlines/outline")]
     return [
         outline
@@ -477,7 +488,7 @@ def _outlines(element: Element) -> list[Element]:
 def _walls_and_roofs(outlines: Sequence[_Outline], material: str) -> Piece:
     """Return walls and roofs over outlines.
 
-    Inner outlines are holes of the first outer outline.
+    Inner outlines are holes in the first outer outline.
     """
     outer = [outline for outline in outlines if outline.outer]
     holes = [outline for outline in outlines if not outline.outer and outline.closed]
@@ -492,7 +503,7 @@ def _walls_and_roofs(outlines: Sequence[_Outline], material: str) -> Piece:
                 material,
             )
         )
-    return joined(pieces)
+    return merge_pieces(pieces)
 
 
 def _flat_pieces(
@@ -505,16 +516,16 @@ def _flat_pieces(
     """Yield the paint of an object without height: stripes, or the whole area of a mark."""
     lift = np.array([0, 0, LIFT_M])
     rings = [outline.corners for outline in outlines]
-    rings = rings or [placed(_rectangle(placement.size), frame.origin, frame.turn)]
+    rings = rings or [transform_points(_rectangle(placement.size), frame.origin, frame.turn)]
     for ring in rings:
         if kind == "crosswalk":
-            yield zebra(ring + lift, STRIPE_M, f"{PAINT} white")
+            yield zebra_stripes(ring + lift, STRIPE_M, f"{PAINT} white")
         elif kind == "roadMark":
             yield prism([ring + lift], [np.zeros(len(ring))], True, _paint_of(element))
 
 
 def _rectangle(size: Sequence[float]) -> Floats:
-    """Return the corners (4, 3) of a length and a width, from the rear right corner to the left."""
+    """Return the counterclockwise corners (4, 3) of a rectangle, starting at the rear right."""
     half_length = size[0] / 2
     half_width = size[1] / 2
     return np.array(
@@ -544,11 +555,11 @@ def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
 
 
 def _paint_of(element: Element) -> str:
-    """Return the paint of an object that is a mark."""
+    """Return the paint of an object that is a road mark."""
     stated = element.find("material")
     return f"{PAINT} {_paint_color(None if stated is None else stated.get('roadMarkColor'))}"
 
 
 def _paint_color(color: str | None) -> str:
-    """Return the color of paint, by default the standard color white."""
+    """Return the color of paint; the standard color is white."""
     return "white" if color in (None, "", "standard") else color[:MAX_SHOWN]

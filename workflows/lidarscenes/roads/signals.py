@@ -1,4 +1,4 @@
-"""Signals of roads: plates of traffic signs and boxes of traffic lights, on poles."""
+"""Convert road signals: plates of traffic signs and boxes of traffic lights, on poles."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import arctan2
 from lidarsim.scene.files.scene_graph import Piece
 
-from .cross_sections import Stations
-from .elements import MAX_SHOWN, UnreadElements, number, positive
+from .cross_sections import RoadStations
+from .elements import MAX_SHOWN, UnreadElements, read_non_negative, read_number
 from .lanes import LaneSection
-from .road import Network, Road
+from .road import Road, RoadNetwork
 from .road_materials import CARRIAGEWAY, LAMP, METAL, SIGN
-from .solids import FRONT_FACES, box, cylinder, rotation
+from .solids import FRONT_FACES, box, cylinder, rotation_matrix
 
-SIZE_M = 0.6  # width and height of signs that state no size
-LIGHT_M = (0.3, 0.9)  # width and height of traffic lights that state no size
-BOTTOM_M = 2.2  # height of the lower edge of signs that state no height
+SIZE_M = 0.6  # default width and height of signs
+LIGHT_M = (0.3, 0.9)  # default width and height of traffic lights
+BOTTOM_M = 2.2  # default height of the lower edge of signs
 PLATE_M = 0.02  # thickness of signs
 LAMP_M = 0.25  # thickness of traffic lights
 POLE_M = 0.038  # radius of poles
-_MIN_POLE_M = 0.3  # a lower edge below this stands without a pole
+_MIN_POLE_M = 0.3  # signals with a lower bottom edge have no pole
 _POLE_SAG_M = 0.003
 # German signs that are paint on the road: lines, arrows and hatched areas.
 _PAINTED = ("293", "294", "295", "296", "297", "298", "299", "340", "341")
@@ -38,13 +38,13 @@ _KNOWN = (
 
 
 class SignalBuilder(NamedTuple):
-    """Builder of the signals of a file."""
+    """Builds the signals in a file."""
 
-    network: Network
+    network: RoadNetwork
     unread: UnreadElements
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the signals of a road."""
+        """Yield the names and triangles of the signals on a road."""
         for group in road.element.iterfind("signals"):
             self.unread.check(group, _KNOWN_SIGNALS)
             for element in group.iterfind("signal"):
@@ -61,27 +61,29 @@ class SignalBuilder(NamedTuple):
     def _signal(
         self, road: Road, sections: Sequence[LaneSection], element: Element, *, is_light: bool
     ) -> Iterator[Piece]:
-        """Yield plate or box, and pole, of a signal."""
+        """Yield the pole and the plate or box of a signal."""
         default_width, default_height = LIGHT_M if is_light else (SIZE_M, SIZE_M)
-        width = positive(element, "width", 0.0) or default_width
-        height = positive(element, "height", 0.0) or default_height
+        width = read_non_negative(element, "width", 0.0) or default_width
+        height = read_non_negative(element, "height", 0.0) or default_height
         position = _position(element)
         if position is not None:
-            origin = np.array([number(position, name) for name in "xyz"])
-            heading = number(position, "hdg", 0.0)
+            origin = np.array([read_number(position, name) for name in "xyz"])
+            heading = read_number(position, "hdg", 0.0)
         else:
             frame = self._frame(road, element)
-            bottom = number(element, "zOffset", 0.0)
+            bottom = read_number(element, "zOffset", 0.0)
             bottom = bottom if bottom > 0 else BOTTOM_M
             origin = frame.foot + np.array([0, 0, bottom])
             heading = frame.heading
             if bottom > _MIN_POLE_M and not _hangs(road, sections, element):
-                # Poles stand behind their signs.
-                turn = rotation(heading)
+                # The pole is behind the sign.
+                turn = rotation_matrix(heading)
                 behind = (PLATE_M + LAMP_M * is_light) / 2 + POLE_M
                 foot = frame.foot - behind * turn[:, 0]
                 yield cylinder(POLE_M, bottom + height, foot, turn, METAL, _POLE_SAG_M)
-        turn = rotation(heading, number(element, "pitch", 0.0), number(element, "roll", 0.0))
+        turn = rotation_matrix(
+            heading, read_number(element, "pitch", 0.0), read_number(element, "roll", 0.0)
+        )
         thickness = LAMP_M if is_light else PLATE_M
         solid = box((thickness, width, height), origin, turn, METAL)
         if is_light:
@@ -93,32 +95,32 @@ class SignalBuilder(NamedTuple):
         yield solid._replace(faces=solid.faces[is_front], material=SIGN)
 
     def _frame(self, road: Road, element: Element) -> _SignalFrame:
-        """Return the frame of a signal, which faces the traffic of its orientation."""
+        """Return the frame of a signal, which faces the traffic for which it is valid."""
         placement = element.find("positionRoad")
         if placement is None:
             placement = element.find("physicalPosition/positionRoad")
         source = element if placement is None else placement
-        at = Stations.at(np.array([number(source, "s")]))
+        at = RoadStations.at(np.array([read_number(source, "s")]))
         frames = self.network.frames([road], [at])
-        foot = frames.origins[0] + number(source, "t") * frames.side[0]
+        foot = frames.origins[0] + read_number(source, "t") * frames.side[0]
         if road.curved_across:
-            t = np.array([number(source, "t")])
+            t = np.array([read_number(source, "t")])
             foot = foot + road.heights(at, t)[0] * frames.up[0]
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
-        if element.get("orientation", "+") != "-":  # traffic along the road sees the front
+        if element.get("orientation", "+") != "-":  # it faces traffic in the direction of the road
             heading += np.pi
-        return _SignalFrame(foot, heading + number(source, "hOffset", 0.0))
+        return _SignalFrame(foot, heading + read_number(source, "hOffset", 0.0))
 
 
 class _SignalFrame(NamedTuple):
-    """Foot and direction of a signal."""
+    """The foot and the direction of a signal."""
 
-    foot: Floats  # (3,): on the plane of the road, m
-    heading: float  # direction that the signal faces, rad
+    foot: Floats  # (3,) point on the plane of the road, in meters
+    heading: float  # direction that the signal faces, in radians
 
 
 def _position(element: Element) -> Element | None:
-    """Return the position of a signal in inertial coordinates, or None."""
+    """Return the inertial position element of a signal, or None."""
     position = element.find("positionInertial")
     return element.find("physicalPosition/positionInertial") if position is None else position
 
@@ -131,12 +133,12 @@ def _is_painted(element: Element) -> bool:
 
 def _hangs(road: Road, sections: Sequence[LaneSection], element: Element) -> bool:
     """Return True if a signal is above lanes on which vehicles drive."""
-    s = number(element, "s")
-    t = number(element, "t")
+    s = read_number(element, "s")
+    t = read_number(element, "t")
     section = next((x for x in sections if x.start <= s <= x.stop), None)
     if section is None:
         return False
-    at = Stations.at(np.array([s]))
+    at = RoadStations.at(np.array([s]))
     borders = {key: float(t[0]) for key, t in section.borders(road, at).items()}
     for lane in section.all_lanes:
         inner = max(

@@ -1,4 +1,4 @@
-"""Solids of objects and signals: boxes, cylinders, prisms and painted strips."""
+"""Build the solids of objects and signals: boxes, cylinders, prisms, and painted strips."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import applied, length, matmul
+from lidarsim.base.vectors import matmul, matvec, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.files.scene_graph import Piece
 
 MAX_SEGMENTS = 64
 MIN_SEGMENTS = 8
-MIN_SIZE_M = 0.01  # size of boxes whose length or width is zero
+MIN_SIZE_M = 0.01  # minimum size of a box, used if its length or width is zero
 # Triangles of a box whose corners are numbered 4 * upper + 2 * left + front.
 _BOX = np.array([
     [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
@@ -25,8 +25,11 @@ FRONT_FACES = slice(10, 12)  # triangles of a box that face along x
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 
 
-def rotation(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
-    """Return the matrix (3, 3) of a rotation about x by roll, y by pitch and z by heading, rad."""
+def rotation_matrix(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
+    """Return a rotation (3, 3) about x by roll, then y by pitch, then z by heading.
+
+    Angles are in radians.
+    """
     (sh, sp, sr), (ch, cp, cr) = (
         values.tolist() for values in sin_cos(np.array([heading, pitch, roll]))
     )
@@ -36,27 +39,30 @@ def rotation(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
     return matmul(matmul(about_z, about_y), about_x)
 
 
-def placed(points: Floats, origin: Floats, turn: Floats) -> Floats:
-    """Return points (n, 3) rotated by a matrix and moved to an origin."""
-    return np.asarray(applied(turn, points) + origin)
+def transform_points(points: Floats, origin: Floats, turn: Floats) -> Floats:
+    """Rotate points (n, 3) by a matrix, and translate them to an origin."""
+    return np.asarray(matvec(turn, points) + origin)
 
 
 def box(size: ArrayLike, origin: Floats, turn: Floats, material: str) -> Piece:
-    """Return a rotated box of the given size whose bottom face is centered at `origin`."""
+    """Return a rotated box whose bottom face is centered at `origin`."""
     size = np.maximum(size, MIN_SIZE_M)
-    return Piece(placed(_CORNERS * size, origin, turn), _BOX, material=material)
+    return Piece(transform_points(_CORNERS * size, origin, turn), _BOX, material=material)
 
 
 def cylinder(
     radius: float, height: float, origin: Floats, turn: Floats, material: str, sag_m: float
 ) -> Piece:
-    """Return a cylinder that stands at an origin, with a tolerance of its circle."""
+    """Return a cylinder whose base is centered at `origin`.
+
+    `sag_m` is the maximum distance between its circle and the polygon.
+    """
     sag_share = min(0.5, sag_m / radius)
     count = int(np.clip(np.ceil(np.pi / np.sqrt(2 * sag_share)), MIN_SEGMENTS, MAX_SEGMENTS))
     sines, cosines = sin_cos(2 * np.pi * np.arange(count) / count)
     ring = np.stack([radius * cosines, radius * sines, np.zeros(count)], axis=1)
     up = np.array([0, 0, height])
-    points = placed(np.concatenate([ring, ring + up]), origin, turn)
+    points = transform_points(np.concatenate([ring, ring + up]), origin, turn)
     lower = np.arange(count)
     following = (lower + 1) % count
     walls = _walls(lower, following, count)
@@ -66,16 +72,20 @@ def cylinder(
 
 
 def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, material: str) -> Piece:
-    """Return walls and roof over outlines: the first is the outside, the others are holes.
+    """Return walls and a roof over outlines.
+
+    The first outline is the outside, and the others are holes.
 
     Parameters
     ----------
     rings
-        (n, 3): bottom corners of each outline, m.
+        (n, 3) bottom corners of each outline in meters.
     heights
-        (n,): of the walls at these corners, m.
+        (n,) heights of the walls at these corners in meters.
     closed
-        Whether the outline is a ring with a roof; otherwise there are walls alone.
+        Whether the outline is a closed ring with a roof. Otherwise, there are only walls.
+    material
+        Name of the material.
     """
     bottom = np.concatenate(list(rings))
     height = np.concatenate(list(heights))
@@ -101,8 +111,11 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
     return Piece(points, triangles, material=material)
 
 
-def extruded(sections: Floats, material: str, *, capped: bool = True) -> Piece:
-    """Return the surface through cross sections (k, c, 3), each a ring of corners, with ends."""
+def extrude_sections(sections: Floats, material: str, *, capped: bool = True) -> Piece:
+    """Return the surface through cross sections (k, c, 3), each of which is a ring of corners.
+
+    The ends are closed if `capped` is set.
+    """
     count, corners, _ = sections.shape
     numbers = np.arange(count * corners).reshape(count, corners)
     following = np.roll(numbers, -1, axis=1)
@@ -120,8 +133,8 @@ def extruded(sections: Floats, material: str, *, capped: bool = True) -> Piece:
     return Piece(sections.reshape(-1, 3), faces, material=material)
 
 
-def joined(pieces: Sequence[Piece]) -> Piece:
-    """Return pieces of a material as one."""
+def merge_pieces(pieces: Sequence[Piece]) -> Piece:
+    """Merge pieces with the same material."""
     counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)]).tolist()
     return Piece(
         np.concatenate([piece.vertices for piece in pieces]),
@@ -131,9 +144,9 @@ def joined(pieces: Sequence[Piece]) -> Piece:
 
 
 def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -> Piece:
-    """Return level strips of a width between points (n, 3), with their lines in the middle."""
+    """Return level strips with a given width, centered on lines between points (n, 3)."""
     along = stops - starts
-    size = np.maximum(length(along), 1e-9)[:, None]
+    size = np.maximum(norm(along), 1e-9)[:, None]
     left = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=1) / size * (width / 2)
     points = np.concatenate([starts - left, stops - left, stops + left, starts + left])
     strip_indices = np.arange(len(starts))
@@ -142,12 +155,12 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
     return Piece(points, faces, material=material)
 
 
-def zebra(ring: Floats, stripe_m: float, material: str) -> Piece:
-    """Return stripes and gaps across the longest side of a convex, level outline (n, 3)."""
+def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
+    """Return alternate stripes across the longest side of a convex, level outline (n, 3)."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring
-    longest = int(length(sides).argmax())
-    direction = sides[longest] / max(float(length(sides)[longest]), 1e-9)
+    longest = int(norm(sides).argmax())
+    direction = sides[longest] / max(float(norm(sides)[longest]), 1e-9)
     along = ((ring - ring[longest]) * direction).sum(axis=1)
     points: list[Floats] = []
     faces: list[Ints] = []
@@ -190,7 +203,7 @@ def _clipped(ring: Floats, along: Floats, lower: float, upper: float) -> Floats:
 
 
 def _walls(numbers: Ints, following: Ints, upper: int) -> Ints:
-    """Return triangles (f, 3) of walls from corners to the following, and to corners above."""
+    """Return triangles (f, 3) of walls between consecutive corners and the corners above them."""
     return np.concatenate(
         [
             np.stack([numbers, following, following + upper], axis=1),

@@ -1,1 +1,1 @@
-"""Robots of URDF files, whose joints move."""
+"""Read robots from URDF files, and move their joints."""

@@ -1,4 +1,4 @@
-"""Robots: links, the joints between links, and the poses of links over time."""
+"""Define robots: links, the joints between links, and the poses of links over time."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import as_array, check_fits, check_list
 from lidarsim.base.elementary import interp, sin_cos
 from lidarsim.base.errors import LidarError, message_of
-from lidarsim.base.signatures import ReadableSignature, shown_readably
 from lidarsim.base.tables import METERS, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.time_units import TimeUnit
-from lidarsim.base.validation import as_array, checked
-from lidarsim.base.vectors import applied, matmul
+from lidarsim.base.vectors import matmul, matvec
 from lidarsim.base.words import name_hint, plural
 from lidarsim.motion.pose_columns import TIME
 from lidarsim.motion.trajectory import (
@@ -35,7 +34,7 @@ from lidarsim.scene.actors import AT_ZERO, Actor, join_meshes
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import rotation_about
 
-_LATE_S = 1e-3  # the beams of the last firing are fired a little after the survey's end
+_LATE_S = 1e-3  # some beams of the last firing are fired slightly after the survey's end
 MOVING = ("revolute", "continuous", "prismatic")
 HELD = ("fixed", "floating", "planar")
 
@@ -53,18 +52,19 @@ class Joint:
     name
         Name of the joint.
     kind
-        revolute, continuous or prismatic, if the joint moves; else fixed, floating or planar.
+        "revolute", "continuous", or "prismatic" if the joint moves, otherwise "fixed", "floating",
+        or "planar".
     parent
         Name of the parent link.
     origin
-        float64 (4, 4): from the joint's frame, which is the link's frame at the value zero, to the
-        parent link's frame.
+        float64 (4, 4) matrix from the joint's frame to the frame of the parent link. At a joint
+        value of zero, the joint's frame is the frame of the link.
     axis
-        float64 (3,): unit vector about or along which the joint moves, in the joint's frame.
+        float64 (3,) unit vector of the rotation or translation, in the joint's frame.
     limits
-        Smallest and largest value, radians or meters; None without limits.
+        Minimum and maximum value in radians or meters, or None.
     mimic
-        Another joint, and factor and offset of its value; None for a joint with its own value.
+        Name of another joint, with the factor and the offset to apply to its value, or None.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether the joint moves, and so has a value."""
+        """Whether the joint moves and therefore has a value."""
         return self.kind in MOVING
 
 
@@ -104,8 +104,6 @@ class Robot:
         {link: mesh in the frame of the link}, for all links with a visual mesh.
     """
 
-    __signature__ = ReadableSignature()
-
     name: str
     links: tuple[str, ...]
     joints: Mapping[str, Joint]
@@ -127,7 +125,7 @@ class Robot:
 
     @cached_property
     def _body_meshes(self) -> dict[frozenset[str], dict[str, SceneMesh]]:
-        """Results of `_bodies`, {links left out: result}."""
+        """Results of `_bodies` by the omitted links."""
         return {}
 
     @cached_property
@@ -135,7 +133,6 @@ class Robot:
         """Names of the movable joints."""
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
-    @shown_readably
     def path(
         self,
         link: str,
@@ -158,8 +155,6 @@ class Robot:
             raise LidarError(f"{self.name} has no link {link!r}.{name_hint(link, self.links)}")
         return self._path(link, trajectory, *self._values(joints, ignore, time_unit))
 
-    @checked
-    @shown_readably
     def actors(
         self,
         trajectory: Trajectory = AT_ZERO,
@@ -198,6 +193,7 @@ class Robot:
         LidarError
             If the joint values cannot be used.
         """
+        check_list("without", without)
         times_s, values = self._values(joints, ignore, time_unit, tell)
         robot_name = self.name if name is None else name
         return tuple(
@@ -210,15 +206,15 @@ class Robot:
         )
 
     def _bodies(self, without: frozenset[str]) -> dict[str, SceneMesh]:
-        """Return the bodies: {moving link: mesh of the link with all links fixed on top}.
+        """Return the mesh of each moving link, joined with the links that are fixed to it.
 
-        A body is named by its first link with triangles. Meshes are joined once, since actors that
-        share arrays share a tree.
+        A body is named after its first link with triangles. Meshes are joined only once, because
+        actors that share arrays also share an acceleration structure.
         """
         if without not in self._body_meshes:
             link_meshes: dict[str, list[SceneMesh]] = {}
             names: dict[str, str] = {}
-            # {link: moving link of its body, matrix from the link's frame to the body's}
+            # {link: (moving link of its body, matrix from the link's frame to the body's)}
             bodies = {self.links[0]: (self.links[0], np.eye(4))}
             for link in self.links:
                 if (joint := self.joints.get(link)) is not None:
@@ -242,7 +238,7 @@ class Robot:
     ) -> Trajectory:
         """Return the trajectory of a link.
 
-        Joints whose values do not change are rigid.
+        Joints with constant values are treated as rigid.
         """
         chain: list[Joint] = []
         while link in self.joints:
@@ -259,7 +255,7 @@ class Robot:
                     hinges.append(Hinge(matrix, joint.axis, slides, value))
                     matrix = np.eye(4)
                 elif slides:
-                    matrix[:3, 3] += applied(matrix[:3, :3], joint.axis * value[0])
+                    matrix[:3, 3] += matvec(matrix[:3, :3], joint.axis * value[0])
                 elif value[0]:
                     rotation = rotation_about(joint.axis, np.degrees(value[0]))
                     matrix[:3, :3] = matmul(matrix[:3, :3], rotation)
@@ -277,7 +273,9 @@ class Robot:
         time_unit: TimeUnit | None,
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Return times (k,), seconds, and values {joint: (k,)} of all joints that move."""
+        """Return the times (k,) in seconds, and the values (k,) of all movable joints by name."""
+        check_fits("time_unit", time_unit, TimeUnit | None)
+        check_list("ignore", ignore)
         table: dict[str, Any] = {}
         if isinstance(joints, (str, Path)):
             table = self._read_values(Path(joints), ignore, time_unit)
@@ -288,13 +286,13 @@ class Robot:
         times = table.pop("time_s", np.zeros(1))
         self._check_table(times, table)
         self._add_missing(table, len(times))
-        self._tell_limits(table, tell)
+        self._report_limits(table, tell)
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
-        """Check the times (k,) and values {joint: (k,)} of a table.
+        """Check the times (k,) and joint values (k,) in a table.
 
-        Raises LidarError if these are wrong.
+        Raises LidarError if they are invalid.
         """
         for name, value in table.items():
             if name not in self.moving:
@@ -310,11 +308,11 @@ class Robot:
             raise LidarError("The values of time_s must be finite and strictly increasing.")
 
     def _moving_joints(self) -> dict[str, Joint]:
-        """Return the joints that move, {name: joint}."""
+        """Return the movable joints by name."""
         return {joint.name: joint for joint in self.joints.values() if joint.moves}
 
     def _add_missing(self, table: dict[str, Floats], count: int) -> None:
-        """Add the values (count,) of joints that are not in a table: mimicked, or at rest."""
+        """Add the values (count,) of joints that are missing in a table: mimicked or at rest."""
         joints = self._moving_joints()
         for name in joints:
             chain = [joints[name]]
@@ -329,8 +327,8 @@ class Robot:
                 mimicked, factor, offset = joint.mimic
                 table[joint.name] = factor * table[mimicked] + offset
 
-    def _tell_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
-        """Tell of the joints whose values are beyond their limits."""
+    def _report_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
+        """Report the joints whose values exceed their limits."""
         for name, joint in self._moving_joints().items():
             lower, upper = joint.limits or (-np.inf, np.inf)
             min_value = table[name].min()
@@ -344,9 +342,9 @@ class Robot:
     def _read_values(
         self, path: Path, ignore: Sequence[str], time_unit: TimeUnit | None
     ) -> dict[str, Floats]:
-        """Return the values in a file with a table of joints.
+        """Read the joint values in a table file.
 
-        Raises LidarError for an unusable file.
+        Raises LidarError if the file is unusable.
         """
         quantities = [
             Quantity(
@@ -382,27 +380,27 @@ class Robot:
 
 @dataclass(frozen=True, eq=False)
 class Hinge:
-    """A joint whose value changes, in a chain of hinges."""
+    """A joint with changing values in a chain of hinges."""
 
-    before: Floats  # (4, 4): from the joint's frame to the frame behind the hinge before
-    axis: Floats  # (3,): unit vector, in the joint's frame
-    slides: bool  # along its axis; else it turns
-    values: Floats  # (k,): radians or meters
+    before: Floats  # (4, 4) from the joint's frame to the frame beyond the previous hinge
+    axis: Floats  # (3,) unit vector in the joint's frame
+    slides: bool  # whether it translates along its axis instead of rotating
+    values: Floats  # (k,) in radians or meters
 
 
 @dataclass(frozen=True, eq=False)
 class LinkPath:
-    """Trajectory of a link, by the trajectory of the robot's root and the joints in between.
+    """The trajectory of a link, given the trajectory of the robot's root and the joints in between.
 
-    Poses are exact at any time: values of joints are linear between their times, and poses are
-    computed from these values, not interpolated.
+    Joint values are interpolated linearly in time. Poses are then computed from these values, so
+    they are exact at any time.
     """
 
     base: Trajectory
     hinges: tuple[Hinge, ...]
-    last: Floats  # (4, 4): from the link's frame to the frame behind the last hinge
-    times_s: Floats  # (k,): of the joints' values
-    start_s: float  # start of the trajectory, by the clock of `times_s`
+    last: Floats  # (4, 4) from the link's frame to the frame beyond the last hinge
+    times_s: Floats  # (k,) times of the joint values
+    start_s: float  # start of the trajectory in the clock of `times_s`
 
     @property
     def stations(self) -> int:
@@ -416,7 +414,7 @@ class LinkPath:
 
     @property
     def duration_ns(self) -> float:
-        """Duration for which the root has poses and the joints have values, nanoseconds."""
+        """Duration in nanoseconds for which the root has poses and the joints have values."""
         if not self.hinges:
             return self.base.duration_ns
         return min(self.base.duration_ns, (float(self.times_s[-1]) - self.start_s) * 1e9)
@@ -427,34 +425,36 @@ class LinkPath:
         return presence_ns(self.base)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time since the start of a station, nanoseconds."""
+        """Return the pose at a time since the start of a station, in nanoseconds."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station, ns.
+        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station.
 
-        All sums are in one order of rounding, for any number of times.
+        Times are in nanoseconds. Sums are evaluated in a fixed order, so the results do not depend
+        on the number of times.
 
         Raises
         ------
         LidarError
             If the trajectory or the joints have no values for a time.
         """
-        times_ns = np.clip(times_ns, *self.presence_ns)  # poses while absent do not count
+        times_ns = np.clip(times_ns, *self.presence_ns)  # poses are irrelevant while absent
         motion = self._root_motion(station, times_ns, moving=False)
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            motion = motion.transformed(hinge.before).through(hinge, value)
+            motion = motion.transformed(hinge.before).after_hinge(hinge, value)
         motion = motion.transformed(self.last)
         return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return velocities (k, 3), m/s, and angular velocities (k, 3), rad/s, at times (k,), ns.
+        """Return linear and angular velocities (k, 3) at times (k,) of a station.
 
-        Both are in the scene frame, and exact through all joints; at a time of the joints' values,
-        the velocities of the following interval count.
+        Times are in nanoseconds. The velocities are in the scene frame, in m/s and rad/s, and
+        include the motion of all joints exactly. At a time of the joint values, they are those of
+        the following interval.
 
         Raises
         ------
@@ -468,16 +468,16 @@ class LinkPath:
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            at_hinge = motion.transformed(hinge.before).anchored()
-            driven = at_hinge.driven(hinge, self._slopes(hinge, moments_s))
-            motion = driven.through(hinge, value)
-        motion = motion.transformed(self.last).anchored()
+            at_hinge = motion.transformed(hinge.before).at_origin()
+            driven = at_hinge.with_hinge_velocity(hinge, self._slopes(hinge, moments_s))
+            motion = driven.after_hinge(hinge, value)
+        motion = motion.transformed(self.last).at_origin()
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
         """Return the motion of the root at times (k,).
 
-        Velocities are zero unless `moving`.
+        Velocities are zero unless `moving` is set.
         """
         positions, rotations = full_poses(self.base, station, times_ns)
         linear = angular = np.zeros((len(times_ns), 3))
@@ -492,9 +492,9 @@ class LinkPath:
         )
 
     def _moments_s(self, times_ns: Floats) -> Floats:
-        """Return times (k,) by the clock of the joints' values, seconds.
+        """Convert times (k,) to the clock of the joint values, in seconds.
 
-        Raises LidarError for times outside.
+        Raises LidarError if a time is outside the joint values.
         """
         moments_s = times_ns / 1e9 + self.start_s
         first_s = moments_s.min(initial=np.inf)
@@ -508,7 +508,7 @@ class LinkPath:
         return moments_s
 
     def _slopes(self, hinge: Hinge, moments_s: Floats) -> Floats:
-        """Return the rates of change of a joint's value at times (k,), per second: (k,)."""
+        """Return the rates of change (k,) of a joint value at times (k,), per second."""
         if len(self.times_s) < 2:
             return np.zeros(len(moments_s))
         slopes = np.diff(hinge.values) / np.diff(self.times_s)
@@ -518,34 +518,34 @@ class LinkPath:
 
 
 class _LinkMotion(NamedTuple):
-    """Poses and velocities of a frame of the robot at k times, in the scene frame."""
+    """Poses and velocities of a robot frame at k times, in the scene frame."""
 
-    positions: Floats  # (3, k): meters
+    positions: Floats  # (3, k) meters
     rotations: Floats  # (3, 3, k)
-    anchors: Floats  # (3, k): points of the frame that have the velocities
-    velocities: Floats  # (3, k): m/s
-    rates: Floats  # (3, k): angular velocities, rad/s
+    anchors: Floats  # (3, k) points to which the velocities refer
+    velocities: Floats  # (3, k) m/s
+    rates: Floats  # (3, k) angular velocities, rad/s
 
     def transformed(self, matrix: Floats) -> _LinkMotion:
-        """Return the motion of the frame with a constant pose (4, 4) in this frame."""
+        """Return the motion of a frame with a constant pose (4, 4) in this frame."""
         moved = _product(self.rotations, matrix[:3, :, None])
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
 
-    def anchored(self) -> _LinkMotion:
-        """Return the motion with the velocities of the frame's origin."""
+    def at_origin(self) -> _LinkMotion:
+        """Return the motion with velocities that refer to the origin of the frame."""
         levers = self.positions - self.anchors
         moved = self.velocities + np.cross(self.rates, levers, axis=0)
         return self._replace(anchors=self.positions, velocities=moved)
 
-    def driven(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
-        """Return the motion with the velocity of a hinge, whose value changes by `slopes` (k,)."""
+    def with_hinge_velocity(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
+        """Add the velocity of a hinge whose value changes at the rates `slopes` (k,)."""
         added = _product(self.rotations, hinge.axis[:, None, None] * slopes)[:, 0]
         if hinge.slides:
             return self._replace(velocities=self.velocities + added)
         return self._replace(rates=self.rates + added)
 
-    def through(self, hinge: Hinge, value: Floats) -> _LinkMotion:
-        """Return the motion with the poses behind a hinge with values (k,)."""
+    def after_hinge(self, hinge: Hinge, value: Floats) -> _LinkMotion:
+        """Return the motion with the poses beyond a hinge with values (k,)."""
         if hinge.slides:
             slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]
             return self._replace(positions=self.positions + slide)

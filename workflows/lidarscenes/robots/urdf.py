@@ -1,8 +1,8 @@
-"""Robots from URDF files, with the visual meshes of their links.
+"""Read robots from URDF files, with the visual meshes of their links.
 
-After the specification at http://wiki.ros.org/urdf/XML, and urdfdom 4 where the specification
-leaves questions open. yourdfpy 0.0.60 is not used: it evaluates one pose at a time, reads meshes
-through trimesh, follows entities and reads mesh files in any folder.
+The reader follows the specification at http://wiki.ros.org/urdf/XML and, where it is ambiguous,
+urdfdom 4. yourdfpy 0.0.60 is not used, because it evaluates one pose at a time, reads meshes with
+trimesh, follows XML entities, and reads mesh files from any folder.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Bytes, Floats
+from lidarsim.base.checks import check_fits
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import is_inside
-from lidarsim.base.validation import checked
 from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import length
+from lidarsim.base.vectors import norm
 from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.motion.rotations import rotations_of
@@ -40,13 +40,12 @@ from lidarsim.scene.transform import affine
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot
 
-_MAX_LINKS = 1000  # humanoids with hands have 150
+_MAX_LINKS = 1000  # humanoid robots with hands have about 150
 _MAX_FOLDERS_UP = 5  # folders above a robot's file that are searched for its packages
-_MAX_NUMBER = 1e8  # limit for numbers in a file
-_NO_FOLDERS = ("", ".", "..")  # parts of a path that name no folder
+_MAX_NUMBER = 1e8  # largest number in a file
+_NO_FOLDERS = ("", ".", "..")  # parts of a path that are not names of folders
 
 
-@checked
 def load_robot(
     path: str | Path,
     *,
@@ -88,8 +87,9 @@ def load_robot(
         If the file or a mesh cannot be read, or if the joints do not form a tree.
     """
     path = Path(path)
+    check_fits("opacity", opacity, OpacityMode)
     root, size = _read_root(path)
-    with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused
+    with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused later
         name = printable(root.get("name", "")) or path.stem
         links = {_name(element): element for element in _named(root, "link")}
         joints = _joints(root, links, lambda line: tell(f"{path}: {line}"))
@@ -109,16 +109,16 @@ def load_robot(
         meshes = {}
         for link in order:
             with prefixed(f"link {link!r}"):
-                if parts := list(reader.meshes_of(link, links[link])):
+                if parts := list(reader.link_meshes(link, links[link])):
                     meshes[link] = join_meshes(link, parts)
-        reader.tell_left_out()
+        reader.report_skipped_links()
         if not meshes:
             raise LidarError("no link has a <visual> with triangles.")
     return Robot(name, tuple(order), {link: joints[link] for link in order[1:]}, meshes)
 
 
 def _read_root(path: Path) -> tuple[Element, int]:
-    """Return the <robot> of a URDF file, and the size of the file, bytes."""
+    """Return the <robot> element of a URDF file, and the size of the file in bytes."""
     try:
         data = read_input(path)
     except (OSError, ValueError) as error:
@@ -148,7 +148,7 @@ def _read_root(path: Path) -> tuple[Element, int]:
 
 
 def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) -> dict[str, Joint]:
-    """Return the joints of a robot: {link that a joint holds: joint}."""
+    """Return the joints of a robot by their child link."""
     joints: dict[str, Joint] = {}
     for element in _named(root, "joint"):
         with prefixed(f"joint {_name(element)!r}"):
@@ -165,20 +165,20 @@ def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) 
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element, without characters that cannot be printed."""
+    """Return the name of an element without unprintable characters."""
     return printable(element.get("name", ""))
 
 
 def _material(visual: Element) -> FaceMaterials | None:
-    """Return the material of a visual, by its name, or None without a material."""
+    """Return the named material of a visual, or None."""
     material = visual.find("material")
     return None if material is None else FaceMaterials.named(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:
-    """Return the elements of a kind.
+    """Return the elements with a tag.
 
-    Raises LidarError unless all have different names.
+    Raises LidarError unless they all have different names.
     """
     elements = root.findall(kind)
     if len(elements) > _MAX_LINKS:
@@ -192,13 +192,13 @@ def _named(root: Element, kind: str) -> list[Element]:
 
 
 def _numbers(element: Element | None, name: str, count: int, default: str) -> Floats:
-    """Return `count` numbers of an attribute, or of `default` without attribute or element."""
+    """Return `count` numbers in an attribute, or in `default` if it is missing."""
     text = default if element is None else element.get(name, default)
     try:
         values = np.array(text.split(), np.float64)
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count or not (np.abs(values) <= _MAX_NUMBER).all():  # nor NaN
+    if len(values) != count or not (np.abs(values) <= _MAX_NUMBER).all():  # also rejects NaN
         tag = "" if element is None else element.tag
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         hint = " Expand the file with xacro first." * ("$" in text)
@@ -207,14 +207,17 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
 
 
 def _origin(element: Element) -> Floats:
-    """Return the matrix (4, 4) of an <origin>: rotated about fixed x, y and z axes, then moved."""
+    """Return the matrix (4, 4) of an <origin>.
+
+    It rotates about the fixed x, y, and z axes, and then translates.
+    """
     origin = element.find("origin")
     position, angles = (_numbers(origin, name, 3, "0 0 0") for name in ("xyz", "rpy"))
     return affine(rotations_of(np.degrees(angles[::-1])) if angles.any() else np.eye(3), position)
 
 
 def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
-    """Return the link that a joint holds, and the joint."""
+    """Return a joint and its child link."""
     kind = element.get("type", "")
     if kind not in (*MOVING, *HELD):
         raise LidarError(
@@ -232,7 +235,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     mimic = None
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
-        if not (size := length(axis)) > 1e-9:
+        if not (size := norm(axis)) > 1e-9:
             raise LidarError("its axis has zero length.")
         axis = axis / size
         limit = element.find("limit")
@@ -260,7 +263,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
 def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
     """Return the links, each after its parent.
 
-    Raises LidarError unless links and joints are a tree.
+    Raises LidarError unless links and joints form a tree.
     """
     roots = [link for link in links if link not in joints]
     if not links:
@@ -278,7 +281,7 @@ def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
-    """Check that joints mimic moving joints, and not themselves."""
+    """Check that mimicked joints move, and that no joint mimics itself."""
     moving = {joint.name: joint.mimic for joint in joints.values() if joint.moves}
     mimicked_joints = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
     for name, (mimicked,) in mimicked_joints.items():
@@ -294,15 +297,15 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
 
 @dataclass(eq=False)
 class _LinkMeshes:
-    """Reader of the visual meshes of links."""
+    """Reads the visual meshes of links."""
 
     path: Path
     root: Element
-    size: int  # size of the file, bytes
+    size: int  # file size in bytes
     opacity: OpacityMode
     colors: bool
     materials: bool
-    assets: tuple[Path, ...]  # resolved folders; all files come from these folders
+    assets: tuple[Path, ...]  # resolved folders from which all files may be read
     tell: Callable[[str], None]
     _files: dict[Path, list[SceneMesh]] = field(default_factory=dict)
     _collide: list[str] = field(default_factory=list)  # links with collision shapes only
@@ -316,8 +319,8 @@ class _LinkMeshes:
         self._folders_above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
         self._package = next(filter(_is_package, self._folders_above), folder)
 
-    def meshes_of(self, link: str, element: Element) -> Iterator[SceneMesh]:
-        """Yield the meshes of a link, in the link's frame."""
+    def link_meshes(self, link: str, element: Element) -> Iterator[SceneMesh]:
+        """Yield the meshes of a link in the frame of the link."""
         visuals = element.findall("visual")
         if not visuals and element.find("collision/geometry") is not None:
             self._collide.append(link)
@@ -340,8 +343,8 @@ class _LinkMeshes:
                     mesh = replace(mesh, materials=_material(visual))
                 yield mesh
 
-    def tell_left_out(self) -> None:
-        """Tell of the links that were left out."""
+    def report_skipped_links(self) -> None:
+        """Report the links that were skipped."""
         for links, reason in (
             (self._collide, "have collision shapes but no visual shapes"),
             (self._flat, "have shapes of size zero"),
@@ -351,7 +354,7 @@ class _LinkMeshes:
                 self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
     def _color(self, visual: Element) -> Bytes | None:
-        """Return the color (1, 1, 3) of a visual, or of its material in the robot, or None."""
+        """Return the color (1, 1, 3) of a visual or of its material in the robot, or None."""
         material = visual.find("material")
         if not self.colors or material is None:
             return None
@@ -362,9 +365,9 @@ class _LinkMeshes:
         return as_bytes(_numbers(color, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
-        """Return factors (3,) along the axes, which may be zero, and the meshes to be scaled."""
+        """Return scale factors (3,), which may be zero, and the meshes to be scaled."""
         if shape.tag == "mesh":
-            if len(factors := shape.get("scale", "").split()) == 4:  # public files have four
+            if len(factors := shape.get("scale", "").split()) == 4:  # some public files have four
                 shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
@@ -387,16 +390,16 @@ class _LinkMeshes:
         return np.ones(3), [capsule(radius, length, SIDES, "capsule")]
 
     def _sizes(self, sizes: Floats) -> Floats:
-        """Return sizes of a shape.
+        """Return the sizes of a shape.
 
-        Raises LidarError for a negative size.
+        Raises LidarError if one is negative.
         """
         if (sizes < 0).any():
             raise LidarError(f"a size is {sizes.min()}; it must not be negative.")
         return sizes
 
     def _meshes(self, name: str) -> list[SceneMesh]:
-        """Return the meshes of a file, in the axes of the file."""
+        """Return the meshes in a file, in the axes of the file."""
         path, package = self._find(name)
         if not is_inside(path, (package, *self.assets)):
             kind = "package" if _is_package(package) else "folder of the .urdf file"
@@ -405,9 +408,9 @@ class _LinkMeshes:
                 "to a folder that contains the mesh."
             )
         if path not in self._files:
-            # Like RViz, which lets assimp ignore Collada's up_axis
-            # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp),
-            # but not its unit. assimp rotates no other format.
+            # Do as RViz does, which ignores the up_axis in COLLADA files, but not the unit
+            # (AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION in rviz_rendering's assimp_loader.cpp).
+            # assimp does not rotate other formats.
             meshes = load_meshes(
                 path,
                 up_axis="z",
@@ -424,7 +427,7 @@ class _LinkMeshes:
         return self._files[path]
 
     def _find(self, name: str) -> tuple[Path, Path]:
-        """Return the file that a URI names, and the folder that must contain the file."""
+        """Return the file at a URI, and the folder that must contain it."""
         scheme, mark, location = unquote(name.strip()).partition("://")
         if not mark:
             return self.path.parent / scheme, self._package
@@ -451,7 +454,7 @@ class _LinkMeshes:
         )
 
     def _without_package(self, name: str, scheme: str, location: str) -> str:
-        """Return the error of a URI without the name of a package: package:///my_robot/leg.dae."""
+        """Return the error for a URI without a package name: package:///my_robot/leg.dae."""
         parts = [part for part in location.split("/") if part not in _NO_FOLDERS]
         start = f"its mesh {name[:200]!r} does not specify a package. Write"
         if len(parts) < 2:
@@ -468,12 +471,12 @@ class _LinkMeshes:
 
 
 def _is_package(folder: Path) -> bool:
-    """Return whether a folder is a package of ROS."""
+    """Return whether a folder is a ROS package."""
     return (folder / "package.xml").is_file()
 
 
 def _name_of(folder: Path) -> str:
-    """Return the name in the package.xml of a folder, or no text without a readable package.xml."""
+    """Return the name in the package.xml of a folder, or an empty string if it is unreadable."""
     file = folder / "package.xml"
     try:
         return (xml_root(read_input(file)).findtext("name") or "").strip()

@@ -1,1 +1,1 @@
-"""Sensors of other programs as lists of rays, and as scenarios."""
+"""Convert sensors from other programs to ray lists and scenarios."""

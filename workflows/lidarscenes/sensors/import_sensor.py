@@ -1,4 +1,4 @@
-"""Files with the rays of a sensor as scenarios: lists of rays, and OmniLidar prims."""
+"""Convert files with the rays of a sensor to scenarios: ray lists and OmniLidar prims."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import yaml
 
 from lidarsim.base.errors import LidarError, converted
 from lidarsim.sensor_files import ray_npz
-from lidarsim.sensor_files.fired_rays import FiredRays
+from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.sensor_files.format_table import read_rays
 
-from ..writers.lidar_scenario import SCENARIO_FILE, clean
-from .omnilidar import ReadSensor, read_omnilidar
+from ..writers.lidar_scenario import SCENARIO_FILE, rounded
+from .omnilidar import ImportedSensor, read_omnilidar
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 ENDINGS = (".csv", ".npz", ".parquet", *USD_ENDINGS)
@@ -22,39 +22,39 @@ _RAYS_FILE = "rays.npz"
 
 
 def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a sensor's file as a scenario into a folder: `scenario.yaml`, and its rays.
+    """Write a sensor file as a scenario: `scenario.yaml`, and a file with the rays.
 
-    The scenario has the scene of `lidarpool demo`, with this sensor in place of the demo's.
+    The scenario has the scene of `lidarpool demo`, but with this sensor.
 
     Parameters
     ----------
     path
-        Livox's list of rays (.csv), a table of rays (.csv, .parquet), arrays of rays, of
-        MuJoCo-LiDAR or of RobotecGPULidar (.npz), or an OmniLidar prim (.usd, .usda, .usdc, .usdz).
+        A Livox ray list (.csv), a ray table (.csv, .parquet), ray arrays of MuJoCo-LiDAR or
+        RobotecGPULidar (.npz), or an OmniLidar prim (.usd, .usda, .usdc, .usdz).
     folder
-        The folder, which exists.
+        Existing output folder.
     assets
-        None: the files name no others.
+        Must be empty, because sensor files do not refer to other files.
 
     Returns
     -------
-    What is not as in the file, a line each.
+    Differences from the file, one line each.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, or is not of a sensor.
+        If the file cannot be read or does not describe a sensor.
     """
     if assets:
         raise LidarError("it is a sensor file, for which `--assets` is not allowed.")
     sensor = _read(path)
-    lines = list(sensor.left_out)
+    lines = list(sensor.unsupported)
     rays = sensor.rays
     if rays.times_ns is None:
         lines.append(
             f"files without firing times ({len(rays):,} rays are fired in {1 / rays.rate_hz:g} s)"
         )
-    ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
+    ray_npz.write(folder / _RAYS_FILE, rays.with_times(), lines)
     head = [
         f"Created from {path.name} by lidarpool import.",
         *(f"Not supported: {line}." for line in lines),
@@ -65,19 +65,19 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     return lines
 
 
-def _section(rays: FiredRays) -> dict[str, float | str]:
-    """Return the section `sensor` of a scenario, whose ranges are for users to change."""
+def _section(rays: RayList) -> dict[str, float | str]:
+    """Return the `sensor` section of a scenario, in which users can change the ranges."""
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}
     if min_range_m:
-        section["min_range_m"] = clean(min_range_m)
+        section["min_range_m"] = rounded(min_range_m)
     if isfinite(max_range_m):
-        section["max_range_m"] = clean(max_range_m)
+        section["max_range_m"] = rounded(max_range_m)
     return section
 
 
-def _read(path: Path) -> ReadSensor:
-    """Return the sensor of a file.
+def _read(path: Path) -> ImportedSensor:
+    """Read the sensor in a file.
 
     Raises LidarError if the file cannot be used.
     """
@@ -89,4 +89,4 @@ def _read(path: Path) -> ReadSensor:
         raise LidarError("it contains no rays with azimuths and elevations, or with directions.")
     channels = int(rays.channels.max()) + 1
     lost = [f"{channels} channels (a ray list has one channel)"] if channels > 1 else []
-    return ReadSensor(rays, lost)
+    return ImportedSensor(rays, lost)

@@ -1,8 +1,9 @@
-"""OmniLidar prims of Isaac Sim and Omniverse as rays: `omnilidar_child.py` reads the files.
+"""Convert OmniLidar prims of Isaac Sim and Omniverse to rays.
 
-Attributes by the extension omni.sensors.nv.lidar, "Setting Lidar Attributes". Azimuths are taken
-counter-clockwise from x, where x is forward, y left and z up. Attributes that are not read are
-listed, unless they have no effect.
+`omnilidar_child.py` reads the files. The attributes are defined by the extension
+omni.sensors.nv.lidar, "Setting Lidar Attributes". Azimuths are counterclockwise from x, with x
+forward, y left, and z up. Attributes that are not supported are reported unless they have no
+effect.
 """
 
 from __future__ import annotations
@@ -24,77 +25,78 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import listed, printable
 from lidarsim.sensor.optics import Optics
-from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
+from lidarsim.sensor_files.fired_rays import RayList, directions_of
 
-from ..files.child_process import Child
+from ..files.child_process import ReaderProcess
 from ..files.usd import USD_CORE_BYTES
 
 _SENSOR = "omni:sensor:"
 CORE = f"{_SENSOR}Core:"
 _STATE = f"{CORE}emitterState:"
 _MAX_RAYS = 20_000_000
-# Attributes of a state that are understood, and those that do not change rays.
+# Supported attributes of a state, and attributes that do not affect rays.
 _READ = ("azimuthDeg", "elevationDeg", "fireTimeNs")
 _OF_NO_RAY = ("channelId", "bank", "rangeId", "roi", "isROIState", "reportRateDiv")
-# Attributes of the model that are understood, of all lidars and of rotary ones alone.
+# Supported attributes of the model, for all lidars and for rotary lidars only.
 _MODEL_READ = ("scanType", "scanRateBaseHz", "nearRangeM", "farRangeM")
 _ROTARY_READ = (
     "patternFiringRateHz", "reportRateBaseHz", "rotationDirection", "stateResolutionStep",
     "startAzimuthOffsetDeg", "validStartAzimuthDeg", "validEndAzimuthDeg",
 )  # fmt: skip
-# Attributes that repeat what the emitter states and rates say, or name the sensor.
+# Attributes that repeat information in the emitter states and rates, or name the sensor.
 _REDUNDANT = (
     "emitterStateCount", "numberOfEmitters", "numberOfChannels", "numLines", "numRaysPerLine",
 )  # fmt: skip
 _NAMES = ("marketName", "modelName", "modelVendor", "modelVersion", "tickRate")
-# Attributes that have no effect at these values, besides zero.
+# Attributes that have no effect at these values, in addition to zero. None means any value.
 _WITHOUT_EFFECT = {
-    "patternFiringRateHz": None,  # of a solid-state lidar, whose scans have their own rate
+    "patternFiringRateHz": None,  # scans of a solid-state lidar have their own rate
     "reportRateBaseHz": None,
     "rotationDirection": None,
     "stateResolutionStep": 1,
     "validEndAzimuthDeg": 360,
-    "waveLengthNm": Optics().wavelength_nm,  # which the scenario has
+    "waveLengthNm": Optics().wavelength_nm,  # default of scenarios
 }
 _AZIMUTH_TOLERANCE_DEG = 1e-4  # angles are float32
 
 
-class ReadSensor(NamedTuple):
-    """A sensor of another program.
+class ImportedSensor(NamedTuple):
+    """A sensor from another program.
 
     Attributes
     ----------
     rays
-        Its rays.
-    left_out
-        What is not as in the other program, a clause each.
+        Rays of the sensor.
+    unsupported
+        Differences from the other program, one clause each.
     """
 
-    rays: FiredRays
-    left_out: list[str]
+    rays: RayList
+    unsupported: list[str]
 
 
-def read_omnilidar(path: Path) -> ReadSensor:
-    """Return the rays of the first OmniLidar prim of a file of OpenUSD.
+def read_omnilidar(path: Path) -> ImportedSensor:
+    """Return the rays of the first OmniLidar prim in an OpenUSD file.
 
     Raises
     ------
     LidarError
-        If usd-core is missing, the file cannot be read, or the prim has no usable emitter states.
+        If usd-core is not installed, the file cannot be read, or the prim has no usable emitter
+        states.
     """
     if find_spec("pxr") is None:
         command = install_command("lidarpool[usd]")
         raise LidarError(
             f"{path} is an OpenUSD file, which requires usd-core. Install it with `{command}`."
         )
-    if sys.platform == "win32":  # where a process has no limits of memory
+    if sys.platform == "win32":  # memory limits of processes are not supported
         raise LidarError(f"{path} is an OpenUSD file, which is not supported on Windows.")
     with converted(f"{path} cannot be used as an OmniLidar"):
         return _sensor(_read_prim(path))
 
 
 class _Prim(NamedTuple):
-    """Attributes of a prim."""
+    """The attributes of a prim."""
 
     paths: list[str]  # paths of all OmniLidar prims of the file
     values: dict[str, Any]  # {name: plain value}
@@ -106,12 +108,12 @@ class _Prim(NamedTuple):
 
 
 def _read_prim(path: Path) -> _Prim:
-    """Read the first OmniLidar prim of a file.
+    """Read the first OmniLidar prim in a file.
 
     Raises ValueError if the file has no such prim.
     """
     allowance = Allowance(check_input(path), "export it with fewer rays")
-    child = Child(
+    child = ReaderProcess(
         Path(__file__).with_name("omnilidar_child.py"),
         "usd-core",
         memory_share() + USD_CORE_BYTES,
@@ -126,10 +128,10 @@ def _read_prim(path: Path) -> _Prim:
     return _Prim(frame["prims"], frame["values"], dict(zip(frame["names"], arrays, strict=True)))
 
 
-def _sensor(prim: _Prim) -> ReadSensor:
-    """Return the rays of a prim.
+def _sensor(prim: _Prim) -> ImportedSensor:
+    """Convert a prim to a sensor.
 
-    Raises ValueError if its attributes make no pattern.
+    Raises ValueError if its attributes do not describe a pattern.
     """
     states = _states(prim)
     rate_hz = prim.number("scanRateBaseHz", 10)
@@ -141,7 +143,7 @@ def _sensor(prim: _Prim) -> ReadSensor:
         raise ValueError(f"scanType is {kind!r}, but only SOLID_STATE and ROTARY are supported")
     pattern = fires[kind](prim, states, rate_hz)
     order = np.argsort(pattern.times_ns, kind="stable")
-    rays = FiredRays(
+    rays = RayList(
         directions_of(pattern.azimuths_deg[order], pattern.elevations_deg[order]),
         pattern.times_ns[order],
         cycle_ns=max(pattern.cycle_ns, float(pattern.times_ns.max()) + 1),
@@ -149,19 +151,19 @@ def _sensor(prim: _Prim) -> ReadSensor:
         range_m=(prim.number("nearRangeM", 0.0), prim.number("farRangeM", np.inf)),
         name=str(prim.values.get("omni:sensor:modelName", "")) or "OmniLidar",
     )
-    return ReadSensor(rays, [*_left_out(prim, states, kind)])
+    return ImportedSensor(rays, [*_left_out(prim, states, kind)])
 
 
 class _State(NamedTuple):
-    """Emitters that fire in a tick."""
+    """The emitters that fire in a tick."""
 
     azimuths_deg: Floats  # (n,)
     elevations_deg: Floats  # (n,)
-    times_ns: Ints  # (n,), since the tick
+    times_ns: Ints  # (n,) relative to the tick
 
 
 class _Pattern(NamedTuple):
-    """Rays of some scans."""
+    """The rays of one or several scans."""
 
     azimuths_deg: Floats  # (n,)
     elevations_deg: Floats  # (n,)
@@ -170,9 +172,9 @@ class _Pattern(NamedTuple):
 
 
 def _states(prim: _Prim) -> list[_State]:
-    """Return the emitter states in their order.
+    """Return the emitter states in order.
 
-    Raises ValueError if a state cannot be used.
+    Raises ValueError if a state is invalid.
     """
     names = sorted(
         {name[len(_STATE) :].partition(":")[0] for name in prim.arrays if name.startswith(_STATE)}
@@ -196,7 +198,7 @@ def _states(prim: _Prim) -> list[_State]:
 
 
 def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of a scan for each state."""
+    """Return the rays of a solid-state lidar, with a scan for each state."""
     del prim
     starts_ns = np.rint(np.arange(len(states)) * (1e9 / rate_hz)).astype(np.int64)
     return _Pattern(
@@ -210,9 +212,9 @@ def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 
 
 def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of the ticks of a scan, within the window of azimuths.
+    """Return the rays of a rotary lidar in a scan, restricted to its azimuth window.
 
-    Raises ValueError without a rate of ticks, or if no ray is within the window.
+    Raises ValueError if the tick rate is missing, or if no ray is within the window.
     """
     tick_hz = prim.number("patternFiringRateHz", 0) or prim.number("reportRateBaseHz", 0)
     if not tick_hz > 0:
@@ -241,9 +243,8 @@ def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
     """Return the rays within the azimuths from which a rotary lidar accepts returns.
 
-    A window whose end is below its start contains azimuth 0, as from 300 to 60 degrees.
-
-    Raises ValueError if no ray is within the window.
+    If the end of the window is below its start, for example from 300 to 60 degrees, the window
+    contains azimuth 0. Raises ValueError if no ray is within the window.
     """
     start_deg = prim.number("validStartAzimuthDeg", 0.0)
     end_deg = prim.number("validEndAzimuthDeg", 360.0)
@@ -266,7 +267,7 @@ def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
 
 
 def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
-    """Return what is not as in the other program, a clause each."""
+    """Describe the differences from the other program, one clause each."""
     clauses = []
     if prim.paths[1:]:
         clauses.append(f"several OmniLidar prims (only {prim.paths[0]} is read)")
@@ -280,9 +281,9 @@ def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
 
 
 def _unread(prim: _Prim, kind: str) -> Iterator[tuple[str, str]]:
-    """Yield the attributes of the model that are not read but may change its points, with values.
+    """Yield the unsupported attributes that may change the points, with their values.
 
-    Attributes of zero, or of another value without effect, are left out.
+    Attributes that are zero or have another value without an effect are skipped.
     """
     rotary = kind == "ROTARY"
     read = {
@@ -300,5 +301,5 @@ def _unread(prim: _Prim, kind: str) -> Iterator[tuple[str, str]]:
 
 
 def _used_arrays(arrays: Mapping[str, AnyArray]) -> list[str]:
-    """Return the arrays of emitter states that hold a number other than zero."""
+    """Return the names of emitter state arrays that contain a nonzero value."""
     return [name for name, values in arrays.items() if name.startswith(_STATE) and values.any()]

@@ -1,8 +1,8 @@
-"""Reads an OmniLidar prim with usd-core, in a process that `omnilidar.py` starts: a script.
+"""Read an OmniLidar prim with usd-core in the process that `omnilidar.py` starts; this is a script.
 
-usd-core ends its process on some broken files; here only this process. The script imports nothing
-of lidarpool. Standard output gets one frame: a line of JSON with the attributes of the prim, and
-the bytes of the arrays that `names` of the line names.
+Invalid files can crash usd-core, and here this affects only this process. The script imports
+nothing from lidarpool. It writes one frame to standard output: a line of JSON with the attributes
+of the prim, followed by the bytes of the arrays that the line lists.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from pxr import Tf, Usd
 
-MAX_WAIT_S = 120  # broken files may take for ever
+MAX_WAIT_S = 120  # invalid files may never finish
 _API = "OmniSensorGenericLidarCoreAPI"
 _PREFIX = "omni:sensor:"
 
@@ -54,7 +54,7 @@ def main(path: str) -> None:
 
 
 def _reason(error: Exception, path: str) -> str:
-    """Return the reason of an error, without names of C++ and folders."""
+    """Return the reason for an error without C++ names and folders."""
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
@@ -63,7 +63,7 @@ def _reason(error: Exception, path: str) -> str:
 
 
 def _check_layers(stage: Usd.Stage, path: str) -> None:
-    """Raise ValueError if content is from outside the folder of the file."""
+    """Raise ValueError if content comes from outside the folder of the file."""
     folder = Path(path).resolve().parent
     for layer in stage.GetUsedLayers():
         if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
@@ -71,7 +71,7 @@ def _check_layers(stage: Usd.Stage, path: str) -> None:
 
 
 def _is_lidar(prim: Usd.Prim) -> bool:
-    """Return True for an OmniLidar with the attributes of the generic model."""
+    """Return True for an OmniLidar prim with the attributes of the generic model."""
     applied = prim.GetMetadata("apiSchemas")
     names = applied.GetAddedOrExplicitItems() if applied else []
     return str(prim.GetTypeName()) == "OmniLidar" or _API in names

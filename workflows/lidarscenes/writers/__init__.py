@@ -1,1 +1,1 @@
-"""Scenes as mesh files."""
+"""Write scenes as mesh files, and imported lidars as scenarios."""

@@ -1,6 +1,6 @@
-"""Scenes as .glb files: an object is a node, and its masks and colors are materials.
+"""Write scenes as .glb files, with a node for each object and materials for masks and colors.
 
-trimesh is not used: it writes one material for a mesh.
+trimesh is not used, because it writes only one material per mesh.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from PIL import Image
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import applied, matmul, turned
+from lidarsim.base.vectors import matmul, matvec, rotate
 from lidarsim.scene.colors import LINEAR
 from lidarsim.scene.files.scene_graph import GENERATOR
 from lidarsim.scene.scene import Scene
@@ -29,15 +29,16 @@ _NEAREST = 9728  # filter of textures
 _TYPES = {"f": 5126, "u": 5125}  # {kind of NumPy type: component type}
 
 
-def glb_of(scene: Scene) -> bytes:
-    """Return a .glb file with all objects of a scene but the actors, in meters, Y-up.
+def encode_glb(scene: Scene) -> bytes:
+    """Return a .glb file with all objects in a scene except the actors, in meters, Y-up.
 
-    Nodes have the scene's origin, in double precision, so that scenes far from zero lose no digits.
+    The scene's origin is stored in the nodes in double precision, so that scenes far from the
+    origin lose no precision.
 
     Raises
     ------
     LidarError
-        If the file would have more than 4 GiB.
+        If the file would exceed 4 GiB.
     """
     writer = _Writer(scene.origin, scene.epsg)
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
@@ -51,7 +52,7 @@ def glb_of(scene: Scene) -> bytes:
 
 
 class _Writer:
-    """The JSON object of a file, and its buffer."""
+    """The JSON content and the buffer of a file."""
 
     def __init__(self, origin: Floats, epsg: int | None) -> None:
         self._origin = origin
@@ -70,13 +71,13 @@ class _Writer:
         }
 
     def _put(self, kind: str, part: dict[str, Any]) -> int:
-        """Add a part of a kind, such as «nodes», and return its number."""
+        """Add an entry to an array of the JSON content, such as "nodes", and return its index."""
         parts = self._tree.setdefault(kind, [])
         parts.append(part)
         return len(parts) - 1
 
     def add(self, name: str, object_parts: list[SceneMesh | SceneInstance]) -> None:
-        """Add an object, whose parts have a common matrix, as a node."""
+        """Add an object as a node; its parts share a matrix."""
         meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in object_parts]
         key = tuple(id(mesh) for mesh in meshes)
         translated = self._origin.any() and not isinstance(object_parts[0], SceneInstance)
@@ -93,11 +94,11 @@ class _Writer:
                 matmul(matmul(to_y_up, object_parts[0].matrix), to_y_up.T).T.ravel().tolist()
             )
         elif translated:
-            node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
+            node["translation"] = matvec(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
-        """Return the primitives of opaque triangles by their images, then of each mask."""
+        """Return the primitives of opaque triangles by image, followed by those of each mask."""
         opaque = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         names: tuple[str, ...] = ("",)
         index = np.zeros(len(mesh.faces), np.int32)
@@ -110,9 +111,9 @@ class _Writer:
     def _opaque_primitives(
         self, mesh: SceneMesh, index: Ints32, names: tuple[str, ...]
     ) -> list[dict[str, Any]]:
-        """Return a primitive for each image and material of the first, opaque triangles.
+        """Return a primitive for each combination of image and material among the opaque triangles.
 
-        `index` (n,) are rows of the triangles' materials in `names`.
+        `index` (n,) contains the indices of the triangles' materials in `names`.
         """
         colors = mesh.colors
         image = np.full(len(index), -1) if colors is None else colors.image[: len(index)]
@@ -130,7 +131,7 @@ class _Writer:
                     tints = shown.corners
             if uv is None and tints is None:
                 if points is None:
-                    vertices = turned(mesh.vertices, UP_AXES["y"].T).astype("<f4")
+                    vertices = rotate(mesh.vertices, UP_AXES["y"].T).astype("<f4")
                     points = self._array(vertices, "VEC3")
                 faces = self._array(mesh.faces[rows].astype("<u4").reshape(-1, 1), "SCALAR")
                 primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
@@ -161,7 +162,7 @@ class _Writer:
         self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
-        corners = turned(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
+        corners = rotate(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
             attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")
@@ -171,7 +172,7 @@ class _Writer:
         return attributes
 
     def _array(self, values: AnyArray, kind: str) -> int:
-        """Add an accessor of attributes, or of indices (scalars), and return its number."""
+        """Add an accessor for attributes or, if scalar, for indices, and return its index."""
         view = self._view(values.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self._put(
@@ -186,7 +187,7 @@ class _Writer:
         )
 
     def _view(self, data: bytes, **fields: Any) -> int:
-        """Add a view of data in the buffer, and return its number."""
+        """Add a buffer view of data, and return its index."""
         view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **fields}
         data += b"\0" * (-len(data) % 4)
         self._pieces.append(data)
@@ -194,9 +195,10 @@ class _Writer:
         return self._put("bufferViews", view)
 
     def _material(self, image: AnyArray | None, name: str) -> int:
-        """Return the number of the material of a mask, bool (h, w), an image, color or name.
+        """Return the index of a material, which is added on first use.
 
-        The material is added on its first use.
+        `image` is a mask, bool (h, w), an image, a single color, or None for a material with only a
+        name.
         """
         key = id(image), name
         if key not in self._materials:
@@ -219,7 +221,7 @@ class _Writer:
         return self._materials[key]
 
     def _texture(self, image: Image.Image) -> int:
-        """Add a texture of an image, and return its number."""
+        """Add a texture with an image, and return its index."""
         png = io.BytesIO()
         image.save(png, "png")
         view = self._view(png.getvalue())
@@ -231,7 +233,7 @@ class _Writer:
     def data(self) -> bytes:
         """Return the content of the file.
 
-        Raises LidarError for more than 4 GiB.
+        Raises LidarError if it exceeds 4 GiB.
         """
         self._tree["buffers"] = [{"byteLength": self._size}]
         text = json.dumps(self._tree, separators=(",", ":")).encode()

@@ -1,4 +1,4 @@
-"""Lidars of other programs' worlds as scenarios: a sensor for each, on one carrier that stands."""
+"""Write lidars in worlds of other programs as scenarios, on a common stationary platform."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidarsim.scene.transform import inverted
 from lidarsim.survey.survey import MAX_SENSORS
 
 SCENARIO_FILE = "scenario.yaml"
-_ZERO = 1e-9  # numbers below are roundings
+_ZERO = 1e-9  # smaller numbers are rounding errors
 
 
 class Lidar(NamedTuple):
@@ -40,7 +40,7 @@ class Lidar(NamedTuple):
         Minimum and maximum range in meters. The maximum may be infinite.
     matrix, model_matrix
         Transforms from the frames of the lidar and of the model to the world. Shape (4, 4).
-    left_out
+    unsupported
         Differences from the other program, as one clause each.
     unseen
         Name patterns of the objects that the lidar does not see.
@@ -53,7 +53,7 @@ class Lidar(NamedTuple):
     range_m: tuple[float, float]
     matrix: Floats
     model_matrix: Floats
-    left_out: tuple[str, ...] = ()
+    unsupported: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
 
 
@@ -63,28 +63,29 @@ def write_scenario(
     entry: Mapping[str, Any],
     lidars: Sequence[Lidar],
     sections: Mapping[str, Any],
-    left_out: Sequence[str] = (),
+    unsupported: Sequence[str] = (),
 ) -> list[str]:
-    """Write a scenario of lidars into a folder, with a data file of each lidar.
+    """Write a scenario with lidars to a folder, with a data file for each distinct lidar.
 
     Parameters
     ----------
     folder
-        The folder, which exists.
+        Existing output folder.
     program
         Name of the other program.
     entry
-        The entry of `scene.files`, with the path of the world as `file`, perhaps one as `assets`.
+        Entry of `scene.files`, with the path of the world as `file` and, optionally, a path as
+        `assets`.
     lidars
-        At least one.
+        One or more lidars.
     sections
-        Further sections of the scenario.
-    left_out
-        What is not as in the other program, besides what the lidars state.
+        Additional sections of the scenario.
+    unsupported
+        Differences from the other program, in addition to those that the lidars state.
 
     Returns
     -------
-    What is not as in the other program, a line each.
+    Differences from the other program, one line each.
 
     Raises
     ------
@@ -95,7 +96,10 @@ def write_scenario(
         raise LidarError(
             f"it has {len(lidars)} lidars, but a scenario can have at most {MAX_SENSORS} sensors."
         )
-    lines = [*left_out, *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.left_out)]
+    lines = [
+        *unsupported,
+        *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.unsupported),
+    ]
     files = _Files()
     data = {
         "scene": {"files": [_relative(entry, folder)]},
@@ -112,7 +116,10 @@ def write_scenario(
 
 
 def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
-    """Return an entry of `scene.files` with paths from a folder, or the file's name alone."""
+    """Return an entry of `scene.files` with paths relative to a folder.
+
+    If the entry has only a file, its name is returned.
+    """
     paths = {
         name: Path(os.path.relpath(value.resolve(), folder.resolve())).as_posix()
         for name, value in entry.items()
@@ -122,7 +129,11 @@ def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
 
 
 def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
-    """Return the sections of sensors and poses: of the lidars' model, or of the world's zero."""
+    """Return the sections with sensors and poses.
+
+    If all lidars belong to the same model, the pose is that of the model; otherwise it is the
+    origin.
+    """
     of_one_model = len({lidar.model for lidar in lidars}) == 1
     counts = Counter(lidar.sensor for lidar in lidars)
     sensors = {}
@@ -135,8 +146,8 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
         sensors[name] = {
             "model": files.name_of(lidar),
             "step_deg": 360,
-            **({"min_range_m": clean(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": clean(max_range_m)} if math.isfinite(max_range_m) else {}),
+            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": rounded(max_range_m)} if math.isfinite(max_range_m) else {}),
             "mount": _pose(mount),
             **({"unseen": list(lidar.unseen)} if lidar.unseen else {}),
         }
@@ -145,26 +156,23 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
 
 
 def _pose(matrix: Floats) -> dict[str, Any]:
-    """Return the pose of a matrix (4, 4) as a scenario has it."""
+    """Return a matrix (4, 4) as a pose in a scenario."""
     pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
-    angles = {name: clean(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+    angles = {name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
     return {
-        "position": [clean(value) for value in matrix[:3, 3].tolist()],
+        "position": [rounded(value) for value in matrix[:3, 3].tolist()],
         **{name: angle for name, angle in angles.items() if angle},
     }
 
 
 class _Files:
-    """Data files of lidars.
-
-    Lidars with the same figures share a file.
-    """
+    """The data files of lidars, which lidars with identical values share."""
 
     def __init__(self) -> None:
         self._data: dict[str, dict[str, Any]] = {}  # {name: content}
 
     def name_of(self, lidar: Lidar) -> str:
-        """Return the name of the file of a lidar."""
+        """Return the name of a lidar's data file."""
         for name, data in self._data.items():
             if {**data, "name": ""} == {**lidar.data, "name": ""}:
                 return name
@@ -178,7 +186,7 @@ class _Files:
         return name
 
     def texts(self) -> dict[str, str]:
-        """Return the files: {name: text}."""
+        """Return the text of the data files by name."""
         return {name: _dumped(data) for name, data in self._data.items()}
 
 
@@ -187,9 +195,6 @@ def _dumped(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def clean(value: float) -> float:
-    """Return a number for a file, rounded to 12 digits.
-
-    Roundings of zero are zero.
-    """
+def rounded(value: float) -> float:
+    """Round a number to 12 significant digits for a file, with tiny values set to zero."""
     return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0

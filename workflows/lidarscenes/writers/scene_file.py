@@ -1,4 +1,4 @@
-"""Scenes as mesh files."""
+"""Write scenes as mesh files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import stacked
 from lidarsim.scene.simplified import SimplifiedScene
 
-from .glb_file import glb_of
+from .glb_file import encode_glb
 
 SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -27,20 +27,20 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colors
-    are kept in .glb only: in .ply and .obj, triangles are solid and gray. Where a triangle has both
-    a mask and a texture, its color is the texture's mean. All formats store meters; .glb is Y-up,
-    by its standard, .ply and .obj are Z-up. Coordinates are world coordinates; .ply and .glb have
-    single precision, .glb from the scene's origin. The coordinate system, `Scene.epsg`, is kept. A
-    comment, or the generator of .glb, tells
-    `load_meshes` that this package wrote the file. An existing file is replaced only by a complete
-    file.
+    A .ply file stores one object without a name, while .glb and .obj store all objects with their
+    names. Only .glb stores masks and colors; in .ply and .obj, triangles are opaque and gray. If a
+    triangle has both a mask and a texture, its color is the mean of the texture. All formats store
+    world coordinates in meters. A .glb file is Y-up, as its standard requires; .ply and .obj are
+    Z-up. Coordinates in .ply and .glb have single precision; in .glb, they are relative to the
+    scene's origin. The coordinate system, `Scene.epsg`, is preserved. A comment, or the generator
+    in .glb, tells `load_meshes` that this package has written the file. An existing file is
+    replaced only once the new file is complete.
 
     Raises
     ------
     LidarError
-        If the path has another suffix, the folder is missing or not writable, the disk is full, or
-        a .ply is too coarse for a scene far from zero.
+        If the path has another extension, the folder is missing or not writable, the disk is full,
+        or the precision of a .ply file is insufficient for a scene far from the origin.
     """
     path = Path(path)
     check_target(path)
@@ -51,12 +51,12 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
 
 def check_target(path: Path) -> None:
-    """Check that a scene can be written to a path, before the scene is made.
+    """Check that a scene can be written to a path, before the scene is generated.
 
     Raises
     ------
     LidarError
-        If the path has another suffix than `SUFFIXES`, or the folder is missing or not writable.
+        If the extension is not one of `SUFFIXES`, or the folder is missing or not writable.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise LidarError(
@@ -70,7 +70,7 @@ def check_target(path: Path) -> None:
 
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
-    """Return the content of a file with a suffix of `SUFFIXES`."""
+    """Return the content of a file with an extension in `SUFFIXES`."""
     if scene.has_voxels.any():
         name = scene.object_names[scene.has_voxels.argmax()]
         raise LidarError(
@@ -91,7 +91,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         comments = "".join(f"\ncomment {line}" for line in _comments(scene))
         return head + f"{comments}\n".encode() + tail.partition(b"\n")[2]
     if suffix == ".glb":
-        return glb_of(scene)
+        return encode_glb(scene)
     objects = trimesh.Scene()
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
         flat = [part.flat() if isinstance(part, SceneInstance) else part for part in parts]
@@ -103,5 +103,5 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 
 def _comments(scene: Scene) -> list[str]:
-    """Return the comments that begin a file: units and axes, and a coordinate system."""
+    """Return the comments at the start of a file: units and axes, and the coordinate system."""
     return [FORMAT_COMMENT, *([] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"])]

@@ -1,8 +1,9 @@
 """Declarations of quantities that users set, with descriptions and limits for scenario files.
 
-A quantity is a field of a dataclass: `Annotated[type, about(description, limits)] = default`.
-`checked_fields` lets the dataclass refuse values outside the limits, and be a section of a
-scenario; other sections inherit its fields (`lidarpool.scenario.sections`).
+A quantity is a field of a dataclass: `Annotated[type, about(description, limits)] = default`. The
+dataclass checks the limits itself (`lidarsim.base.checks.check_fields`). In scenario files it is a
+section if it derives from `FileSection`; other sections inherit its fields
+(`lidarpool.scenario.sections`).
 """
 
 from __future__ import annotations
@@ -14,15 +15,18 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     BeforeValidator,
+    ConfigDict,
     Field,
+    GetCoreSchemaHandler,
     GetPydanticSchema,
     Strict,
     ValidationError,
     WrapValidator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from .errors import LidarError
 from .words import joined
 
 UnitShare = Annotated[float, Field(ge=0, le=1)]
@@ -31,6 +35,9 @@ Text = Annotated[str, Field(min_length=1)]
 # No point on Earth is farther from the origin of its map.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 AngleDeg = Annotated[float, Field(ge=-36_000, le=36_000)]
+
+# No further fields, finite numbers, no conversion of text to numbers.
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 T = TypeVar("T")
 # YAML has only lists, which strict validation does not accept as tuples.
@@ -65,6 +72,26 @@ Rectangle = Annotated[Four[Coordinate], WrapValidator(_upright)]
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
+
+
+class FileSection:
+    """Base class of dataclasses that are sections of files, as a mapping of their fields."""
+
+    __pydantic_config__ = STRICT
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler(source)
+        inner_schema: Any = handler.resolve_ref_schema(schema)
+        inner_schema["strict"] = False  # a strict schema accepts only instances
+
+        def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
+            try:
+                return validate(value)
+            except LidarError as error:  # raised in `__post_init__`
+                raise ValueError(str(error)) from error
+
+        return core_schema.no_info_wrap_validator_function(validated, schema)
 
 
 def about(description: str, *examples: Any, **limits: Any) -> Any:

@@ -29,8 +29,8 @@ class LidarError(Exception):
     command line prints the message without a traceback and exits with code 2. Very long lines are
     shortened in the middle, and long lists of names are wrapped.
 
-    If a file does not exist, the error is also a FileNotFoundError. If an argument does not match
-    the annotation of its parameter, the error is also a ValueError.
+    If a file does not exist, the error is also a FileNotFoundError. If an argument has a wrong type
+    or value, the error is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -42,7 +42,7 @@ class MissingFileError(LidarError, FileNotFoundError):
 
 
 class ArgumentError(LidarError, ValueError):
-    """A LidarError for an argument that does not fit the annotation of its parameter."""
+    """A LidarError for an argument with a wrong type or value."""
 
 
 def _cut(line: str) -> str:

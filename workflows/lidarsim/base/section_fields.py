@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
+from dataclasses import is_dataclass
 from functools import cache
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -12,7 +13,8 @@ from pydantic.fields import FieldInfo
 Fields = Mapping[str, FieldInfo]
 FieldPath = tuple[int | str, ...]
 
-LIMITS = ("ge", "gt", "le", "lt")  # limits of numbers, named as in pydantic's `Field`
+_LIMIT_WORDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+LIMITS = tuple(_LIMIT_WORDS)  # limits of numbers, named as in pydantic's `Field`
 
 
 def fields_by_name(hint: Any) -> Fields:
@@ -45,8 +47,8 @@ def _dataclass_fields(section: Any) -> Fields:
 
 
 def is_section(kind: Any) -> bool:
-    """Return True for a section of files: a model, or a dataclass with `checked_fields`."""
-    return hasattr(kind, "model_fields") or hasattr(kind, "__pydantic_config__")
+    """Return True for a section of files: a model, or a dataclass."""
+    return hasattr(kind, "model_fields") or is_dataclass(kind)
 
 
 def sections_in(annotation: Any) -> Iterator[Any]:
@@ -62,14 +64,32 @@ def classes_in(annotation: Any) -> Iterator[type]:
         yield from classes_in(inner)
 
 
-def limits_of(hint: Any, names: Iterable[str] = LIMITS) -> dict[str, Any]:
-    """Return the limits in an annotation, named as in pydantic's `Field`: {name: limit}."""
+def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
+    """Return the limits in the notes of an annotation, named as in pydantic's `Field`."""
+    return {
+        name: getattr(limit, name)
+        for note in notes
+        for limit in (note, *getattr(note, "metadata", ()))
+        for name in (*LIMITS, "min_length", "max_length", "allow_inf_nan")
+        if hasattr(limit, name)
+    }
+
+
+def limits_of(hint: Any) -> dict[str, Any]:
+    """Return the limits of the numbers in an annotation: {name: limit}."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    limits = {name: limit for arg in inner for name, limit in limits_of(arg, names).items()}
-    for note in getattr(hint, "__metadata__", ()):
-        for limit in (note, *getattr(note, "metadata", ())):
-            limits |= {name: getattr(limit, name) for name in names if hasattr(limit, name)}
-    return limits
+    limits = {name: limit for arg in inner for name, limit in limits_of(arg).items()}
+    own = own_limits(getattr(hint, "__metadata__", ()))
+    return limits | {name: limit for name, limit in own.items() if name in LIMITS}
+
+
+def range_words(limits: Mapping[str, Any]) -> str:
+    """Return limits as text: «from 1 to 10», «at least 1 and below 10»."""
+    bounds = {name: limits[name] for name in _LIMIT_WORDS if name in limits}
+    numbers = {name: limit if limit % 1 else int(limit) for name, limit in bounds.items()}
+    if numbers.keys() == {"ge", "le"}:
+        return f"from {numbers['ge']} to {numbers['le']}"
+    return " and ".join(f"{_LIMIT_WORDS[name]} {number}" for name, number in numbers.items())
 
 
 def dotted(path: Sequence[int | str]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import reprlib
 import secrets
 import shutil
 import tempfile
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .checksum import crc32
-from .errors import LidarError
+from .errors import ArgumentError, LidarError
 from .extras import install_command
 from .input_files import open_input
 from .words import printable
@@ -78,6 +79,10 @@ class Storage:
         """
         if isinstance(location, Storage):
             return location
+        if not isinstance(location, (str, Path)):
+            raise ArgumentError(
+                f"location must be a str or a Path, but is {reprlib.repr(location)}."
+            )
         text = str(location)
         if not is_url(text):
             path = str(Path(text).absolute())

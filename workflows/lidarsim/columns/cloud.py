@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..base.arrays import AnyArray, AnyFloats
+from ..base.checks import as_array, check_choice, check_fields
 from ..base.errors import LidarError
 from ..base.extras import install_command
 from ..base.notebook import picture_of
-from ..base.validation import as_array, checked, checked_fields
 from ..base.value_texts import shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
@@ -69,7 +69,6 @@ class CloudDisplay:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-@checked_fields
 class Cloud(CloudDisplay):
     """Point cloud of a survey, ordered by scan and ray.
 
@@ -104,9 +103,8 @@ class Cloud(CloudDisplay):
     custom_columns: tuple[Column, ...] = ()
     sweeps: Callable[[], Any] | None = None
 
-    __repr__ = CloudDisplay.__repr__  # `checked_fields` would replace an inherited method
-
     def __post_init__(self) -> None:
+        check_fields(self)
         positions = np.asarray(self.positions)
         if positions.dtype not in (np.float32, np.float64):
             positions = as_array("positions", self.positions)
@@ -214,7 +212,6 @@ class Cloud(CloudDisplay):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
-    @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
         """Convert the cloud to a pandas or polars DataFrame.
 
@@ -230,6 +227,7 @@ class Cloud(CloudDisplay):
         LidarError
             If the library is not installed.
         """
+        check_choice("library", library, ("pandas", "polars"))
         need_packages(library)
         return import_module(library).DataFrame(self.by_name)
 

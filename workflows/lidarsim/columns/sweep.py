@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Ints32
-from ..base.signatures import ReadableSignature
 from .column_names import STRENGTHS
 
 Columns = Mapping[str, AnyArray]
@@ -62,8 +61,6 @@ class Sweep:
         Recording to which the sweep belongs. It determines `rings` and `times_s` where the file
         does not state them.
     """
-
-    __signature__ = ReadableSignature()
 
     def __init__(
         self,

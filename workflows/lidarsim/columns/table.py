@@ -13,8 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ..base.arrays import AnyArray
+from ..base.checks import check_fields
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
@@ -33,7 +34,6 @@ _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Column:
     """Description of a point cloud column, which has one value per point.
 
@@ -82,7 +82,10 @@ class Column:
     file_name: str = ""
     scale: Scale = "linear"
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if not self.name.isidentifier():
             raise LidarError(f"The name of a column must be an identifier, but is {self.name!r}.")
         try:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from pydantic import Field, WrapValidator
 
 from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
+from ..base.checks import check_fields
+from ..base.declared import FileSection, TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
-from ..base.value_texts import shown
+from ..base.value_texts import one_line, shown
 from ..base.words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
@@ -49,22 +49,29 @@ SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
 
 
-def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
-    """Raise ValueError for names of classes that files cannot hold, or that two classes share."""
-    if not isinstance(names, Mapping):
-        return handler(names)
+def class_names_problem(names: Mapping[Any, Any]) -> str:
+    """Return why names of classes, {number: name}, cannot be stored in files, or an empty string.
+
+    Two classes must not have the same name.
+    """
     for number, name in names.items():
         valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
         unique = [*names.values()].count(name) == 1
         if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
-            raise ValueError(
+            return (
                 "expected whole numbers from 0 to 65535 with unique names, such as {10: car}, "
                 f"but found {shown({number: name})}."
             )
+    return ""
+
+
+def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
+    if isinstance(names, Mapping) and (problem := class_names_problem(names)):
+        raise ValueError(problem)
     return handler(names)
 
 
-ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_validate_names)]
 
 
 class Measured(NamedTuple):
@@ -88,8 +95,7 @@ def reflectances() -> dict[str, Measured]:
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Material:
+class Material(FileSection):
     """Optical properties and semantic class of surfaces.
 
     A material selects objects by name, faces by the name of their material in the scene file, or
@@ -208,7 +214,10 @@ class Material:
         ),
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.objects is None and self.material is None:
             raise LidarError(
                 'A material must apply to something. Set objects, such as `objects: "*"`, or '

@@ -14,10 +14,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.declared import UnitShare, about
+from ..base.checks import check_fields
+from ..base.declared import FileSection, UnitShare, about
 from ..base.elementary import exp, geomspace, power
 from ..base.elementary_scalars import exp_of
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import hypot
 from .materials import REFERENCE_M, WATER_INDEX, extinction
 
@@ -49,8 +50,7 @@ LARGE = 2.0  # extinction of a large particle, in its cross-sections: half of it
 
 
 @dataclass(frozen=True, kw_only=True)
-@checked_fields
-class Weather:
+class Weather(FileSection):
     """Extinction of the air, and returns from the air.
 
     Rain, snow and dust need `Noise.detection_range_m`, which decides what a sensor detects. Fog
@@ -114,6 +114,11 @@ class Weather:
             le=1000,
         ),
     ] = 0.0
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def returns_light(self) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..base.arrays import Floats, Ints
 from ..base.errors import LidarError
-from ..base.vectors import applied, matmul
+from ..base.vectors import matmul, matvec
 from ..base.words import did_you_mean, joined, plural
 from ..columns.bags import messages_of, opened_bag
 from .navigation import local_positions
@@ -289,7 +289,7 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     for edge_times, rows in tables:
         edge_positions, edge_rotations = _edge_poses(edge_times, rows, times)
-        positions = edge_positions + applied(edge_rotations, positions)
+        positions = edge_positions + matvec(edge_rotations, positions)
         rotations = matmul(edge_rotations, rotations)
     return TimedPoses(times / 1e9, positions, quaternions_of(rotations))
 

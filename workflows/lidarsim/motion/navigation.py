@@ -24,14 +24,15 @@ import numpy as np
 from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import MinMax, Seed, Several, UnitShare, about
+from ..base.checks import check_fields, check_order
+from ..base.declared import FileSection, MinMax, Seed, Several, UnitShare, about
 from ..base.elementary import arctan2, exp, sin_cos
 from ..base.elementary_scalars import exp_of, sin_cos_of
 from ..base.errors import LidarError
 from ..base.extras import install_command
 from ..base.random_numbers import Purpose, named_seed, normal
-from ..base.validation import checked_fields
-from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
+from ..base.value_texts import one_line
+from ..base.vectors import hypot, matmul, matvec, norm, rotate, rotate_into_frames
 from .rotations import rotation_sines
 from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
 
@@ -57,8 +58,7 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Imu:
+class Imu(FileSection):
     """An inertial measurement unit (IMU) on the platform.
 
     By default, the measurements have no errors.
@@ -109,10 +109,14 @@ class Imu:
         Skew, about("standard deviation in degrees of the misalignment between axes")
     ] = 0.0
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
-@checked_fields
-class Gnss:
+class Gnss(FileSection):
     """A GNSS receiver on the platform.
 
     By default, the measurements have no errors.
@@ -160,10 +164,16 @@ class Gnss:
         ),
     ] = None
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for index, outage in enumerate(self.outages):
+            check_order(f"outages[{index}]", outage)
+
 
 @dataclass(frozen=True)
-@checked_fields
-class Navigation:
+class Navigation(FileSection):
     """Instruments that measure the motion of the platform.
 
     Their samples are written to files next to the point cloud.
@@ -207,6 +217,11 @@ class Navigation:
         ),
     ] = 9.80665
     seed: Annotated[Seed, about("seed of the errors; the same seed produces the same errors")] = 0
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 class ImuSamples(NamedTuple):
@@ -299,7 +314,7 @@ def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints
     forces = np.diff(motion.velocities, axis=0) * imu.rate_hz - gravity
     rates = _rotation_vectors(motion.rotations[:-1], motion.rotations[1:]) * imu.rate_hz
     times_ns = np.rint(ends_ns[1:]).astype(np.int64)
-    return ImuSamples(times_ns, rates, into_axes(forces, halfway))
+    return ImuSamples(times_ns, rates, rotate_into_frames(forces, halfway))
 
 
 class _Triad(NamedTuple):
@@ -325,7 +340,7 @@ class _Triad(NamedTuple):
 
     def measure(self, truth: Floats, samples: Ints) -> Floats:
         """Return the measurements (k, 3) of true values (k, 3), the next samples (k,)."""
-        return turned(truth, self.axes) + self.errors.next_errors(samples)
+        return rotate(truth, self.axes) + self.errors.next_errors(samples)
 
 
 def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
@@ -399,7 +414,7 @@ def _mounted_motion(path: Trajectory, mount: Pose, times_ns: Floats) -> _Motion:
     times_ns = np.minimum(times_ns, path.duration_ns)
     positions, rotations = full_poses(path, 0, times_ns)
     speeds, rates = velocities(path, 0, times_ns)
-    levers = applied(rotations, mount.position)
+    levers = matvec(rotations, mount.position)
     return _Motion(
         positions + levers,
         matmul(rotations, mount.rotation_matrix),
@@ -415,7 +430,7 @@ def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
     change = matmul(earlier.transpose(0, 2, 1), later)
     sines = rotation_sines(change)
     sines /= 2
-    sine = length(sines)
+    sine = norm(sines)
     cosine = (change[:, 0, 0] + change[:, 1, 1] + change[:, 2, 2] - 1) / 2
     scale = np.where(sine > 1e-9, arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
     return np.asarray(sines * scale[:, None])

@@ -10,9 +10,9 @@ from ..base.errors import LidarError
 from ..base.vectors import (
     cross,
     determinant,
-    length,
+    dot,
     matmul_of_components,
-    products,
+    norm,
 )
 
 _ROUNDS = 8  # rounds of the power iteration: rotations are rounded by 2e-3 at most
@@ -88,7 +88,7 @@ def rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple
     q = last[:3]
     # conjugate(p) q
     axis = first[3] * q - last[3] * p - cross(p, q)
-    cosine = products(p, q) + first[3] * last[3]
+    cosine = dot(p, q) + first[3] * last[3]
     axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
     x, y, z = axis
     sine = np.sqrt((x * x + y * y) + z * z)
@@ -133,6 +133,6 @@ def quaternions_of(rotations: Floats) -> Floats:
     best = np.diagonal(table).argmax(axis=1)
     vectors = np.take_along_axis(table, best[None, None], axis=0)[0]
     for _ in range(_ROUNDS):
-        unit = vectors / length(vectors.T)
+        unit = vectors / norm(vectors.T)
         vectors = matmul_of_components(table, unit[:, None])[:, 0]
-    return np.ascontiguousarray((vectors / length(vectors.T)).T)
+    return np.ascontiguousarray((vectors / norm(vectors.T)).T)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats
 from ..base.elementary import arctan2, interp
-from ..base.vectors import length
+from ..base.vectors import norm
 
 _STEP_S = 0.1  # positions are resampled to this interval, so that jitter does not count as turning
 _MAX_STEPS = 1_000_000
@@ -101,9 +101,9 @@ class StraightLines(NamedTuple):
         step_s = span_s / (count - 1)
         velocities = np.gradient(np.stack([x, y]), step_s, axis=1)
         headings = np.degrees(np.unwrap(arctan2(velocities[1], velocities[0])))
-        moves: Bools = length(velocities.T) > _MOVES_M_S
+        moves: Bools = norm(velocities.T) > _MOVES_M_S
         pairs = _merged(headings, _steady_runs(headings, moves, round(_STEADY_S / step_s)))
-        passed_m = np.append(0.0, np.cumsum(length(np.diff([x, y, z]).T)))
+        passed_m = np.append(0.0, np.cumsum(norm(np.diff([x, y, z]).T)))
         starts, stops = np.reshape(pairs, (-1, 2)).astype(np.intp).T
         long = grid[stops] - grid[starts] >= _STEADY_S - 1e-9
         starts, stops = starts[long], stops[long]

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import AngleDeg, Triple, about, short, written_as
+from ..base.checks import as_array, check_fields
+from ..base.declared import AngleDeg, FileSection, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
-from ..base.errors import LidarError
-from ..base.validation import as_array, checked_fields
+from ..base.errors import ArgumentError, LidarError
 from ..base.value_texts import one_line, shown
 from ..base.vectors import (
-    applied,
     hypot,
-    length,
     matmul,
     matmul_of_components,
+    matvec,
+    norm,
 )
 from ..base.words import joined, rounded
 from .headings import CurveHeadings, Heading, headed_poses
@@ -51,8 +51,7 @@ Beyond = Literal["refuse", "hold", "absent"]
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Pose:
+class Pose(FileSection):
     """Position and orientation of a sensor or platform.
 
     The position is in meters. The angles are yaw, pitch and roll in degrees, applied in the
@@ -70,7 +69,10 @@ class Pose:
         AngleDeg, about("rotation about the new x axis in degrees, applied last")
     ] = 0.0
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "position", tuple(map(float, self.position)))
 
     @property
@@ -96,7 +98,7 @@ class Pose:
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix
-        position = self.position + applied(rotation, mount.position)
+        position = self.position + matvec(rotation, mount.position)
         return Pose.from_rotation(position, matmul(rotation, mount.rotation_matrix))
 
     @classmethod
@@ -153,7 +155,7 @@ def pose_of(name: str, value: Any) -> Pose:
 CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class InstrumentPose(Pose):
     """Position and angles of an instrument in the platform frame, as written in a file."""
 
@@ -214,6 +216,15 @@ def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
     if rotations is None:
         rotations = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
     return positions, rotations
+
+
+def check_trajectory_type(name: str, value: object) -> None:
+    """Check that an argument is a trajectory, and not the path of its file."""
+    if not hasattr(value, "poses"):
+        raise ArgumentError(
+            f"{name} must be a trajectory, but is {shown(value)}. To read a file, use "
+            "load_trajectory('drive.tum')."
+        )
 
 
 def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
@@ -309,7 +320,6 @@ class StaticPose:
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Track:
     """A trajectory that interpolates timed poses along straight lines or smooth curves.
 
@@ -375,12 +385,15 @@ class Track:
     stations: ClassVar[int] = 1
     moves: ClassVar[bool] = True
 
+    __repr__ = one_line
+
     def __post_init__(
         self,
         yaw_deg: ArrayLike | None,
         pitch_deg: ArrayLike | None,
         roll_deg: ArrayLike | None,
     ) -> None:
+        check_fields(self)
         angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
         if given := {name: angle for name, angle in angles.items() if angle is not None}:
             self._set_quaternions(given)
@@ -463,7 +476,7 @@ class Track:
                     f"quaternions must contain x, y, z and w for each of the {len(times)} poses, "
                     f"but has the shape {quaternions.shape}."
                 )
-            lengths = length(quaternions)
+            lengths = norm(quaternions)
             # Written so that NaN is an error.
             bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
             _check_poses(bad, "The quaternion of pose {} is not of unit length")

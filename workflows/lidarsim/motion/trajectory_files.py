@@ -11,12 +11,12 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats
+from ..base.checks import check_fits, check_list
 from ..base.errors import LidarError, message_of
 from ..base.tables import column_name, find_header, read_table
 from ..base.textfile import read_text
 from ..base.time_units import TimeUnit, seconds_of
-from ..base.validation import checked
-from ..base.vectors import turned
+from ..base.vectors import rotate
 from ..columns.bags import is_bag
 from .bag_trajectories import read_bag
 from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
@@ -39,6 +39,7 @@ Duration = Annotated[float, Field(gt=0, le=1e9)]
 Latitude = Annotated[float, Field(gt=-90, lt=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 Height = Annotated[float, Field(ge=-1e5, le=1e6)]
+Origin = tuple[Latitude, Longitude, Height]
 _KITTI_WIDTH = 12  # numbers of a row
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -61,7 +62,6 @@ class TimeOptions(NamedTuple):
     unit: TimeUnit | None
 
 
-@checked
 def load_trajectory(
     path: str | Path,
     *,
@@ -71,12 +71,12 @@ def load_trajectory(
     columns: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
     topic: str | None = None,
-    origin: tuple[Latitude, Longitude, Height] | None = None,
+    origin: tuple[float, float, float] | None = None,
     camera_axes: bool | None = None,
-    offset_s: Seconds = 0.0,
+    offset_s: float = 0.0,
     smooth: bool = False,
-    start_s: Seconds | None = None,
-    duration_s: Duration | None = None,
+    start_s: float | None = None,
+    duration_s: float | None = None,
     beyond: Beyond = "refuse",
 ) -> Track:
     """Read the trajectory of a platform from a file.
@@ -135,6 +135,10 @@ def load_trajectory(
         the name of the file.
     """
     path = Path(path)
+    check_fits("format", format, TrajectoryFormat | None)
+    check_fits("time_unit", time_unit, TimeUnit | None)
+    check_fits("origin", origin, Origin | None)
+    check_list("ignore", ignore)
     timing = TimeOptions(times, time_unit)
     try:
         if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
@@ -398,7 +402,7 @@ def _table(
 
 def _from_camera(track: Track) -> Track:
     """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
-    positions = turned(track.positions, _CAMERA)
+    positions = rotate(track.positions, _CAMERA)
     if track.quaternions is None:
         return replace(track, positions=positions)
     x, y, z, w = track.quaternions.T

@@ -1,1 +1,1 @@
-"""Packets that sensors send: returns of sweeps in the protocols of their makers."""
+"""Encode sweeps as sensor packets in the manufacturers' protocols, and decode such packets."""

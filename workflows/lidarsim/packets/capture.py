@@ -1,7 +1,7 @@
-"""Reads the UDP datagrams of a network capture: pcap or pcapng, whatever the file is called.
+"""Read the UDP datagrams of a network capture (pcap or pcapng, regardless of the file name).
 
 Frames may have any of the link types in `_LINKS`, VLAN tags, padding and a frame check sequence.
-Frames of other protocols are skipped, because captures contain ARP, mDNS and the like.
+Frames of other protocols are skipped, because captures usually contain ARP, mDNS and others.
 
 Sources: IETF drafts opsawg-pcap and opsawg-pcapng; registry of link types at tcpdump.org.
 """
@@ -21,16 +21,16 @@ ENDINGS = (".pcap", ".pcapng")
 _SECOND_NS = 1_000_000_000
 _MAX_FRAME_BYTES = 1 << 18
 _MAX_DATAGRAM_BYTES = 65_535
-_MAX_FRAGMENTED = 64  # datagrams that wait for further fragments; older ones are forgotten
+_MAX_FRAGMENTED = 64  # incomplete datagrams that are kept; older ones are discarded
 _UDP = 17
 
-# {magic number of pcap: (byte order, nanoseconds in a unit of the stamps, bytes of frame headers)}
+# {pcap magic number: (byte order, nanoseconds per time unit, size of the frame header in bytes)}
 _PCAP_MAGIC = {
     bytes.fromhex("d4c3b2a1"): ("<", 1000, 16),
     bytes.fromhex("a1b2c3d4"): (">", 1000, 16),
     bytes.fromhex("4d3cb2a1"): ("<", 1, 16),
     bytes.fromhex("a1b23c4d"): (">", 1, 16),
-    bytes.fromhex("34cdb2a1"): ("<", 1000, 24),  # of a modified libpcap
+    bytes.fromhex("34cdb2a1"): ("<", 1000, 24),  # written by a modified libpcap
     bytes.fromhex("a1b2cd34"): (">", 1000, 24),
 }
 _PCAPNG_MAGIC = bytes.fromhex("0a0d0d0a")
@@ -47,17 +47,17 @@ _OFFSET = 14
 
 
 class _Link(NamedTuple):
-    """Header of a link layer."""
+    """Header of a link layer protocol."""
 
     size: int  # bytes
-    protocol: int | None = None  # offset of the EtherType; None if the content is always IP
+    protocol: int | None = None  # offset of the EtherType; None if the payload is always IP
 
 
 _LINKS = {
     1: _Link(14, 12),  # Ethernet
     0: _Link(4),  # BSD loopback
     108: _Link(4),
-    12: _Link(0),  # raw IP, three numbers that programs have used
+    12: _Link(0),  # raw IP, for which programs have used three numbers
     14: _Link(0),
     101: _Link(0),
     113: _Link(16, 14),  # Linux "cooked", as from `tcpdump -i any`
@@ -67,15 +67,15 @@ _LINKS = {
 _IPV4 = 0x0800
 _TAGS = (0x8100, 0x88A8, 0x9100)  # VLAN: 802.1Q, 802.1ad, and an older QinQ
 _LOOPBACKS = (0, 108)
-_INET = (b"\2\0\0\0", b"\0\0\0\2")  # IPv4 in the byte order of the machine that captured
+_INET = (b"\2\0\0\0", b"\0\0\0\2")  # IPv4, in the byte order of the capturing machine
 
 
 class CapturedDatagram(NamedTuple):
     """A UDP datagram over IPv4."""
 
-    time_ns: int  # since 1970, when the frame was captured
+    time_ns: int  # capture time of the frame, nanoseconds since 1970
     source: str  # address of the sensor
-    port: int  # of the receiver
+    port: int  # destination port
     payload: bytes
 
 
@@ -88,22 +88,21 @@ class _Frame(NamedTuple):
 
 
 class Capture:
-    """A file of captured frames.
+    """A network capture file.
 
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     name
-        Name of the file in messages.
+        Name of the file for messages.
 
     Attributes
     ----------
     cut_datagrams
-        Number of datagrams that the capture did not record as a whole, and that are therefore
-        skipped, once `datagrams` has ended.
+        Number of truncated datagrams, which were skipped. Available once `datagrams` has ended.
     ends_early
-        Whether the file ends inside a frame, once `datagrams` has ended.
+        Whether the file ends inside a frame. Available once `datagrams` has ended.
     """
 
     def __init__(self, path: Path, name: str = "") -> None:
@@ -114,7 +113,7 @@ class Capture:
 
     @property
     def notes(self) -> list[str]:
-        """Clauses on what is missing from the file, once `datagrams` has ended."""
+        """Messages about data missing from the file, available once `datagrams` has ended."""
         notes = []
         if self.ends_early:
             notes.append("ends inside a frame. The rest of the recording is missing")
@@ -138,12 +137,12 @@ class Capture:
         return header_bytes == 16 and _link_of(head[4:], order) in links
 
     def datagrams(self) -> Iterator[CapturedDatagram]:
-        """Yield the datagrams in the order of the file; fragments are joined.
+        """Yield the datagrams in file order, with fragments reassembled.
 
         Raises
         ------
         LidarError
-            If the file is not a capture, is damaged, or contains no datagram.
+            If the file is not a capture, is damaged, or contains no datagrams.
         """
         self.cut_datagrams = 0
         self.ends_early = False
@@ -166,7 +165,7 @@ class Capture:
             raise LidarError(f"{self.name} {self._why_empty(unknown_links)}")
 
     def _why_empty(self, unknown_links: set[int]) -> str:
-        """Return the end of a sentence on a file without datagrams, and advice."""
+        """Return the predicate of an error message for a file without datagrams, with advice."""
         if self.cut_datagrams:
             return (
                 "contains only truncated datagrams. Capture whole frames, for example "
@@ -181,7 +180,7 @@ class Capture:
         return "has no UDP datagrams over IPv4. Expected a recording of a sensor."
 
     def _frames(self, file: BinaryIO) -> Iterator[_Frame]:
-        """Yield the frames of a file of either format."""
+        """Yield the frames of a pcap or pcapng file."""
         magic = file.read(4)
         if magic == _PCAPNG_MAGIC:
             file.seek(0)
@@ -196,7 +195,7 @@ class Capture:
     def _pcap_frames(
         self, file: BinaryIO, order: str, unit_ns: int, header_bytes: int
     ) -> Iterator[_Frame]:
-        """Yield the frames of a pcap file after its magic number."""
+        """Yield the frames of a pcap file that follow its magic number."""
         head = file.read(20)
         if len(head) < 20:
             raise LidarError(f"{self.name} ends inside its header. Copy or record it again.")
@@ -215,7 +214,7 @@ class Capture:
             yield _Frame(seconds * _SECOND_NS + rest * unit_ns, link, content)
 
     def _pcapng_frames(self, file: BinaryIO) -> Iterator[_Frame]:
-        """Yield the frames of a pcapng file, whose sections may differ in byte order."""
+        """Yield the frames of a pcapng file, whose sections may have different byte orders."""
         order = "<"
         interfaces: list[_Interface] = []
         last_ns = 0
@@ -250,17 +249,17 @@ class Capture:
                 raise self._damaged(file) from reason
 
     def _skip(self, file: BinaryIO, size: int) -> None:
-        """Skip bytes of a file."""
+        """Skip bytes of the file, and record whether it ends too early."""
         file.seek(size, os.SEEK_CUR)
         self.ends_early = file.tell() > os.fstat(file.fileno()).st_size
 
     def _check_size(self, size: int, file: BinaryIO) -> None:
-        """Raise LidarError for a size that no frame has."""
+        """Raise LidarError if a frame size is impossibly large."""
         if size > _MAX_FRAME_BYTES:
             raise self._damaged(file)
 
     def _damaged(self, file: BinaryIO) -> LidarError:
-        """Return the error of a damaged file."""
+        """Return the error for a damaged file."""
         return LidarError(
             f"{self.name} is damaged before byte {file.tell():,}. Copy or record it again."
         )
@@ -268,13 +267,13 @@ class Capture:
     def _datagram(
         self, frame: _Frame, start: int, fragments: _Fragments
     ) -> CapturedDatagram | None:
-        """Return the UDP datagram that an IPv4 packet completes, or None for other packets."""
+        """Return the UDP datagram that an IPv4 packet completes, or None if there is none."""
         packet = frame.content[start:]
         if len(packet) < 20 or packet[0] >> 4 != 4 or packet[9] != _UDP:
             return None
         header_bytes = 4 * (packet[0] & 15)
         length = int.from_bytes(packet[2:4], "big")
-        # Frames that the sending machine has recorded may state no length.
+        # Frames recorded on the sending machine may lack the length.
         stop = length or len(packet)
         if header_bytes < 20 or stop < header_bytes:
             return None
@@ -287,7 +286,7 @@ class Capture:
             content = fragments.join(packet[4:6] + packet[12:20], flags, packet[header_bytes:stop])
         if content is None or len(content) < 8:
             return None
-        # Padding and check sequences follow the datagram where IPv4 states no length.
+        # Padding and check sequences follow the datagram if the IPv4 header has no length.
         size = int.from_bytes(content[4:6], "big")
         if size > len(content):
             self.cut_datagrams += 1
@@ -298,22 +297,22 @@ class Capture:
 
 
 def _link_of(head: bytes, order: str) -> int:
-    """Return the link type in the header of a pcap file, after its magic number."""
+    """Return the link type from the header of a pcap file, without its magic number."""
     (link,) = unpack_from(f"{order}I", head, 16)
-    return int(link) & 0xFFFF  # the other bits describe frame check sequences
+    return int(link) & 0xFFFF  # the other bits describe the frame check sequence
 
 
 class _Interface(NamedTuple):
-    """An interface of a pcapng section."""
+    """An interface description in a pcapng section."""
 
     link: int
-    snap_bytes: int  # length after which frames are cut; 0 for none
+    snap_bytes: int  # length to which frames are truncated; 0 if they are not
     units_per_s: int = 1_000_000
     offset_s: int = 0
 
     @classmethod
     def from_block(cls, body: bytes, order: str) -> _Interface:
-        """Read the description of an interface, with its options."""
+        """Read the description of an interface and its options."""
         link, _, snap_bytes = unpack_from(f"{order}HHI", body)
         units_per_s = 1_000_000
         offset_s = 0
@@ -335,7 +334,7 @@ class _Interface(NamedTuple):
 def _frame_of_block(
     kind: int, body: bytes, order: str, interfaces: list[_Interface], last_ns: int
 ) -> _Frame:
-    """Return the frame of a pcapng block; simple blocks have the time of the last frame."""
+    """Return the frame of a pcapng block. Simple blocks get the time of the previous frame."""
     if kind == _SIMPLE_PACKET:
         interface = interfaces[0]
         (size,) = unpack_from(f"{order}I", body)
@@ -353,14 +352,14 @@ def _frame_of_block(
 
 
 def _part(body: bytes, start: int, size: int) -> bytes:
-    """Return bytes of a block. Raises IndexError if the block is shorter."""
+    """Return bytes of a block, or raise IndexError if the block is shorter."""
     if start + size > len(body):
         raise IndexError("the frame is longer than its block")
     return body[start : start + size]
 
 
 def _ipv4_start(frame: _Frame) -> int | None:
-    """Return where IPv4 begins in a frame, or None for other protocols."""
+    """Return the offset of the IPv4 header in a frame, or None for other protocols."""
     content = frame.content
     link = _LINKS[frame.link]
     if link.protocol is None:
@@ -369,24 +368,24 @@ def _ipv4_start(frame: _Frame) -> int | None:
         return link.size
     start = link.size
     protocol = int.from_bytes(content[link.protocol : link.protocol + 2], "big")
-    while protocol in _TAGS:  # four bytes each, which end with the next protocol
+    while protocol in _TAGS:  # each tag has four bytes and ends with the next protocol
         protocol = int.from_bytes(content[start + 2 : start + 4], "big")
         start += 4
     return start if protocol == _IPV4 else None
 
 
 class _Fragments:
-    """Fragments of datagrams that wait for the rest."""
+    """Fragments of incomplete datagrams."""
 
     def __init__(self) -> None:
-        self._parts: dict[bytes, dict[int, bytes]] = {}  # {datagram: {offset: part}}
+        self._parts: dict[bytes, dict[int, bytes]] = {}  # {datagram: {offset: fragment}}
 
     def join(self, key: bytes, flags: int, content: bytes) -> bytes | None:
-        """Keep a fragment of a datagram, and return the datagram once all are there, else None."""
+        """Add a fragment, and return its datagram if it is now complete, or None."""
         parts = self._parts.setdefault(key, {})
         parts[(flags & 0x1FFF) * 8] = content
         if not flags & 0x2000:
-            parts[-1] = b""  # the last is there
+            parts[-1] = b""  # marks that the last fragment has arrived
         while len(self._parts) > _MAX_FRAGMENTED:
             self._parts.pop(next(iter(self._parts)))
         if sum(map(len, parts.values())) > _MAX_DATAGRAM_BYTES:

@@ -1,4 +1,4 @@
-"""Encoders and decoders of packets: classes for each maker, in the tables or from plug-ins."""
+"""Base classes of packet encoders and decoders, and the tables that list them."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from .capture import ENDINGS, Capture
 from .service import Destination, Service
 from .shots import Shots, settings_of
 
-# Plug-ins are subclasses of `PacketEncoder`; the name of a plug-in is the `format` of data files.
+# Plug-ins are subclasses of `PacketEncoder`, selected by `format` in sensor data files.
 GROUP = "lidarpool.packets"
-# Start of a survey without a date, nanoseconds since 1970: as in bags, on 2001-09-09 at 01:46:40.
+# Start of a survey without a date, in nanoseconds since 1970: 2001-09-09 01:46:40, as in bags.
 START_NS = 1_000_000_000_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Datagrams:
-    """UDP datagrams of the same size to a port."""
+    """UDP datagrams of the same size and destination port."""
 
     payloads: Bytes  # (n, size)
-    due_ns: Ints  # (n,): when the sensor sends them, nanoseconds since the survey's start
+    due_ns: Ints  # (n,): send times, nanoseconds since the start of the survey
     port: int
-    source_port: int = 0  # port of the sensor; 0 for any: in files the same port
+    source_port: int = 0  # port of the sensor; 0 if any, which files replace by `port`
 
     def __len__(self) -> int:
         return len(self.payloads)
 
     def without(self, dropped: Bools) -> Datagrams:
-        """Return the datagrams without those that are lost: `dropped` (n,)."""
+        """Return the datagrams that are not lost. `dropped` (n,) is True for lost datagrams."""
         if not dropped.any():
             return self
         return replace(self, payloads=self.payloads[~dropped], due_ns=self.due_ns[~dropped])
@@ -50,29 +50,30 @@ class Datagrams:
 
 @dataclass(frozen=True, eq=False)
 class PacketSource:
-    """What packets depend on beside the shots: a sensor of a survey, and its times."""
+    """Everything that packets depend on besides the shots: the sensor and its times."""
 
     sensor: Sensor
-    mode: str  # mode of its returns (`Returns`)
+    mode: str  # mode of the reported returns (`Returns`)
     name: str = ""  # name of the sensor in its survey
-    start_ns: int = START_NS  # start of the survey, since 1970-01-01 UTC
-    dated: bool = False  # whether the survey has a start, as of a clock that a receiver sets
-    instruments: Instruments | None = None  # instruments of the carrier
-    mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the carrier
+    start_ns: int = START_NS  # start of the survey, nanoseconds since 1970-01-01 UTC
+    dated: bool = False  # whether the survey has a start time, as from a synchronized clock
+    instruments: Instruments | None = None  # instruments on the platform
+    mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the platform
 
     @property
     def settings(self) -> PacketSettings:
-        """Packets of the sensor.
+        """Packet settings of the sensor.
 
-        Raises LidarError without packets.
+        Raises LidarError if the sensor has no packet format.
         """
         return settings_of(self.sensor)
 
     @classmethod
-    def of_sensor(cls, sweeps: Sweeps, number: int) -> PacketSource:
-        """Return the source of the packets of the sensor `number` of a survey.
+    def for_sensor(cls, sweeps: Sweeps, number: int) -> PacketSource:
+        """Return the packet source for sensor `number` of a survey.
 
-        LidarError if the survey does not keep every return, or the sensor has no packets.
+        Raises LidarError if the survey does not keep every return, or if the sensor has no packet
+        format.
         """
         if sweeps.fired is None:
             raise LidarError(
@@ -93,21 +94,21 @@ class PacketSource:
 
 
 class PacketEncoder(ABC):
-    """Makes the datagrams of a sensor from its shots, sweep by sweep.
+    """Encodes the shots of a sensor as datagrams, sweep by sweep.
 
-    A subclass checks the identifiers and the mode of the source when it is made, and keeps shots
-    that fill no packet for the next sweep (`CarryOver`).
+    The constructor of a subclass checks the identifiers and the return mode of the source. Shots
+    that do not fill a packet are kept for the next sweep (`CarryOver`).
     """
 
-    columns: tuple[str, ...] = ("reflectivity",)  # columns of the cloud, beside ray and range
-    identifiers: ClassVar[tuple[str, ...]] = ()  # the data file must state them
-    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # the data file may state them
-    address: ClassVar[str] = "192.168.1.201"  # address of the sensor, as it leaves the factory
+    columns: tuple[str, ...] = ("reflectivity",)  # required cloud columns besides ray and range
+    identifiers: ClassVar[tuple[str, ...]] = ()  # required in the sensor's data file
+    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # optional in the sensor's data file
+    address: ClassVar[str] = "192.168.1.201"  # factory default address of the sensor
     destination: ClassVar[str] = "255.255.255.255"
-    default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
-    # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
-    told_apart: ClassVar[bool] = False
-    # Whether the maker's software ignores datagrams from the receiver's address.
+    default_ports: ClassVar[Mapping[str, int]] = {}  # {packet kind: port}, starting with returns
+    # Whether receivers distinguish sensors on the same port by their addresses or serial numbers.
+    distinguished_by_receivers: ClassVar[bool] = False
+    # Whether the manufacturer's software ignores datagrams from the receiver's own address.
     has_own_address: ClassVar[bool] = False
 
     def __init__(self, source: PacketSource) -> None:
@@ -122,47 +123,47 @@ class PacketEncoder(ABC):
 
     @abstractmethod
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the datagrams that the shots of a sweep fill, a group for each port."""
+        """Return the datagrams that are complete after the shots of a sweep, grouped by port."""
 
     @abstractmethod
     def finish(self) -> list[Datagrams]:
-        """Return the datagrams of the shots that are left after the last sweep."""
+        """Return the datagrams with the shots that remain after the last sweep."""
 
     def files(self) -> Mapping[str, bytes]:
-        """Return files that readers need beside the packets, {suffix: content}."""
+        """Return additional files that readers of the packets need, by file name suffix."""
         return {}
 
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service | None:
-        """Return what answers the maker's software for a live sensor, or None for no service.
+        """Return the service that answers the manufacturer's software for a live sensor, if any.
 
-        `address` is where it listens: HOST for the maker's port, or HOST:PORT. The other parameters
-        are as in `Service`.
+        `address` is the address to listen on, HOST for the usual port or HOST:PORT. The other
+        parameters are the same as in `Service`.
         """
         return None
 
     @property
     def ports(self) -> Mapping[str, int]:
-        """Ports of all kinds of packets, the port of the returns first: {kind: port}."""
+        """Ports of all kinds of packets by kind, starting with the port of the returns."""
         return {**self.default_ports, **self.source.settings.ports}
 
     @property
     def firing_interval_ns(self) -> int:
-        """Time from a firing to the next, nanoseconds, rounded."""
+        """Rounded time between consecutive firings in nanoseconds."""
         firings = np.arange(2)
         return int(np.rint(np.diff(self.source.sensor.begins_ns(firings))[0]))
 
     def port(self, kind: str, default: int) -> int:
-        """Return the port of a kind of packets from the data file, else the default."""
+        """Return the port of a kind of packets from the data file, or the default."""
         return self.source.settings.ports.get(kind, default)
 
     def unusable(self, reason: str) -> LidarError:
-        """Return the error of packets that cannot be made: «… {reason}»."""
+        """Return an error for packets that cannot be encoded, whose message ends with `reason`."""
         return LidarError(f"Packets of {self.source.sensor.model} {reason}.")
 
     def number(self, name: str) -> int:
-        """Return an identifier that is a whole number.
+        """Return an identifier that must be an integer.
 
         Raises LidarError for other values.
         """
@@ -176,7 +177,7 @@ class PacketEncoder(ABC):
         return str(self.source.settings.identifiers[name])
 
     def decimal(self, name: str) -> float:
-        """Return an identifier that is a number.
+        """Return an identifier that must be a number.
 
         Raises LidarError for other values.
         """
@@ -187,25 +188,25 @@ class PacketEncoder(ABC):
 
 
 class PacketDecoder(ABC):
-    """Reads the sweeps of a maker's packets from a file.
+    """Reads the sweeps in a file of a manufacturer's packets.
 
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     name
-        Name of the file in messages.
+        Name of the file for messages.
 
     Raises
     ------
     LidarError
-        If the packets are not read, or a package that reads them is not installed.
+        If the packets are not supported, or a package that reads them is not installed.
     """
 
-    intensity: ClassVar[str] = ""  # column that is `WHITE` for a white surface, at any range
-    refusal: ClassVar[str] = ""  # what the file contains and what to do, if it is not read
-    sensors: Sequence[str] = ("",)  # names of the sensors in the file; "" for an only one
-    notes: Sequence[str] = ()  # clauses that follow the name of the file
+    intensity: ClassVar[str] = ""  # column that is `WHITE` for a white surface at any range
+    refusal: ClassVar[str] = ""  # for unsupported packets, what the file contains and what to do
+    sensors: Sequence[str] = ("",)  # names of the sensors in the file; "" for a single sensor
+    notes: Sequence[str] = ()  # messages that follow the name of the file
 
     def __init__(self, path: Path, name: str) -> None:
         self.path = path
@@ -214,25 +215,25 @@ class PacketDecoder(ABC):
     @staticmethod
     @abstractmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a UDP datagram is a packet of this maker."""
+        """Return whether a UDP datagram is a packet of this manufacturer."""
 
     @abstractmethod
     def sweeps(self, sensor: int) -> Iterable[Any]:
-        """Return the sweeps of a sensor, an object of the maker's software each, from the first."""
+        """Return the sweeps of a sensor in order, as objects of the manufacturer's software."""
 
     @abstractmethod
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return the columns (n,) of a sweep's points, with x, y and z in meters."""
+        """Return the point columns (n,) of a sweep, including x, y and z in meters."""
 
     @abstractmethod
     def time_ns(self, sweep: Any) -> float:
-        """Return the start of a sweep, nanoseconds."""
+        """Return the start time of a sweep in nanoseconds."""
 
 
 _OUSTER = "lidarsim.packets.ouster:OusterDecoder"
-WHITE = 100.0  # intensity that Velodyne and Ouster report of a white surface at any range
+WHITE = 100.0  # intensity that Velodyne and Ouster report for a white surface at any range
 
-# {format of packets: module and class of its encoder}
+# {packet format: module and class of its encoder}
 ENCODERS = {
     "hesai": "lidarsim.packets.hesai:HesaiEncoder",
     "livox": "lidarsim.packets.livox:LivoxEncoder",
@@ -242,7 +243,7 @@ ENCODERS = {
 }
 
 
-# Classes of decoders, in the order in which they are asked.
+# Decoder classes, in the order in which they are tried.
 _DECODERS = (
     "lidarsim.packets.velodyne:VelodyneDecoder",
     "lidarsim.packets.hesai:HesaiDecoder",
@@ -253,17 +254,17 @@ _DECODERS = (
 
 
 def decoder_of(path: Path, name: str) -> PacketDecoder:
-    """Return the decoder of a file, for the file's `name` in messages.
+    """Return the decoder of a file.
 
-    The first packet that a decoder recognizes decides, because captures also contain datagrams of
-    other programs.
+    Captures may also contain datagrams of other programs, so the first packet that any decoder
+    recognizes determines the decoder.
 
     Raises
     ------
     LidarError
-        If the packets of the file are not read, or a package that reads them is not installed.
+        If the packets are not supported, or a package that reads them is not installed.
     """
-    if path.suffix.lower() not in ENDINGS:  # a recording of Ouster's software
+    if path.suffix.lower() not in ENDINGS:  # a recording made by Ouster's software
         return _decoder(_imported(_OUSTER), path, name)
     classes: list[type[PacketDecoder]] = [_imported(entry) for entry in _DECODERS]
     for datagram in Capture(path, name).datagrams():
@@ -277,26 +278,20 @@ def decoder_of(path: Path, name: str) -> PacketDecoder:
 
 
 def _decoder(decoder: type[PacketDecoder], path: Path, name: str) -> PacketDecoder:
-    """Return a decoder of a file.
-
-    Raises LidarError if the file is not read.
-    """
+    """Create a decoder for a file, or raise LidarError if its packets are not supported."""
     if decoder.refusal:
         raise LidarError(f"{name} contains {decoder.refusal}.")
     return decoder(path, name)
 
 
 def _imported(value: str) -> Any:
-    """Return the class of «module:class»."""
+    """Return the class that "module:class" refers to."""
     module, _, attribute = value.partition(":")
     return getattr(import_module(module), attribute)
 
 
 def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
-    """Return the encoder of a plug-in.
-
-    Raises LidarError for another class.
-    """
+    """Return the encoder class of a plug-in, or raise LidarError if it is no encoder class."""
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):
         raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
@@ -307,12 +302,12 @@ _TABLE: PluginTable[Any] = PluginTable(GROUP, "packet format", ENCODERS, _encode
 
 
 def encoder_class(name: str) -> type[PacketEncoder]:
-    """Return the encoder of a format of packets, of the table or of a plug-in.
+    """Return the encoder class of a packet format, built in or from a plug-in.
 
     Raises
     ------
     LidarError
-        If there is no format of that name, or its plug-in cannot be used.
+        If there is no format with this name, or its plug-in cannot be used.
     """
     entry = _TABLE[name]
     encoder: type[PacketEncoder] = _imported(entry) if isinstance(entry, str) else entry
@@ -325,6 +320,7 @@ def encoder_of(source: PacketSource) -> PacketEncoder:
     Raises
     ------
     LidarError
-        If the sensor has no packets, or its format, identifiers or mode cannot be encoded.
+        If the sensor has no packet format, or its format, identifiers or return mode are not
+        supported.
     """
     return encoder_class(source.settings.format)(source)

@@ -1,6 +1,6 @@
-"""Packets of Hesai: PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128 and OT128.
+"""Hesai packets: PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128 and OT128.
 
-Sources: see hesai_layouts.py.
+The sources are listed in hesai_layouts.py.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from ..base.words import did_you_mean
 from ..sensor.beams import Mirror, Spin
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
-from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, Layout
+from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, HesaiPacketLayout
 from .hesai_ptc import PtcDevice, PtcService
 from .service import Destination
 from .shots import CarryOver, Shots, last_and_strongest
 
 DATA_PORT = 2368
-_AZIMUTHS = 36_000  # azimuths in a revolution
+_AZIMUTHS = 36_000  # azimuth units per revolution
 _MAX_UNITS = 65_535
 _FACTORY = 0x42
 _SECOND_NS = 1_000_000_000
 _CLOCKS = ("gps", "ptp")
-_NORMAL_STATE = 1 << 5  # functional safety: normal, without a fault
-_COUNTED_US = 5000  # functional safety counts modulo 8 in steps of this time
+_NORMAL_STATE = 1 << 5  # functional safety: normal state without a fault
+_COUNTED_US = 5000  # functional safety counts modulo 8 in steps of this duration
 _PERIOD_TOLERANCE_US = 0.02
 
 
 class HesaiEncoder(PacketEncoder):
-    """Data packets of a model, with sequence numbers, and checksums where the model has them.
+    """Encodes data packets with sequence numbers and, depending on the model, checksums.
 
-    Azimuths are the head's at the reference time of each block, clockwise from the sensor's
-    y axis. In the mode dual, each block of last returns is followed by a block of strongest
-    returns, or of second strongest where the last return is the strongest; an only return is in
-    both. The identifier `clock` is gps, the default, for dates, or ptp for seconds since 1970.
+    The azimuth of a block is the azimuth of the head at the block's reference time, clockwise from
+    the sensor's y axis. In dual mode, each block of last returns is followed by a block of
+    strongest returns, or of second strongest returns where the last return is the strongest. A
+    single return is in both blocks. The identifier `clock` is "gps" (default) for dates, or "ptp"
+    for seconds since 1970.
     """
 
     identifiers = ("model",)
@@ -53,7 +54,7 @@ class HesaiEncoder(PacketEncoder):
         if source.mode not in layout.modes:
             modes = ", ".join(layout.modes)
             raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
-        self._lasers = LaserTable.of_sensor(source.sensor, layout)
+        self._lasers = LaserTable.from_sensor(source.sensor, layout)
         self._planes = 2 if source.mode == "dual" else 1
         self._firings = layout.blocks // self._planes
         self._port = self.port("data", DATA_PORT)
@@ -62,7 +63,7 @@ class HesaiEncoder(PacketEncoder):
         self._next_number = 1
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that the shots of a sweep fill."""
+        """Return the data packets that are complete after the shots of a sweep."""
         filled = self._carry.whole_packets(shots)
         if not len(filled):
             return []
@@ -74,11 +75,11 @@ class HesaiEncoder(PacketEncoder):
         return [datagrams.without(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends no packet before its blocks are full."""
+        """Return no packets, because the sensor sends only packets whose blocks are full."""
         return []
 
     def files(self) -> Mapping[str, bytes]:
-        """Return the angles and the firing times of the lasers as the maker's files."""
+        """Return the lasers' angles and firing times in the manufacturer's file formats."""
         return {
             ".angles.csv": self._lasers.angles_file().encode(),
             ".firetimes.csv": self._lasers.firetimes_file().encode(),
@@ -87,7 +88,7 @@ class HesaiEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> PtcService:
-        """Return the service that gives readers calibration and identity."""
+        """Return the service that reports calibration and identity to readers."""
         files = self.files()
         device = PtcDevice(
             name=self.source.name,
@@ -105,14 +106,11 @@ class HesaiEncoder(PacketEncoder):
 
     @property
     def _rate_rpm(self) -> int:
-        """Revolutions a minute."""
+        """Rotation rate in revolutions per minute."""
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
-    def _layout_of_model(self) -> Layout:
-        """Return the layout of the model.
-
-        Raises LidarError for an unknown model.
-        """
+    def _layout_of_model(self) -> HesaiPacketLayout:
+        """Return the packet layout of the model, or raise LidarError if the model is unknown."""
         model = self.text("model")
         if model not in LAYOUTS:
             names = ", ".join(LAYOUTS)
@@ -121,7 +119,7 @@ class HesaiEncoder(PacketEncoder):
         return LAYOUTS[model]
 
     def _check_sensor(self) -> None:
-        """Raise LidarError unless the sensor fires as the model does."""
+        """Raise LidarError if the sensor does not fire as the model does."""
         sensor = self.source.sensor
         layout = self._layout
         head = sensor.head
@@ -139,10 +137,7 @@ class HesaiEncoder(PacketEncoder):
             )
 
     def _is_ptp(self) -> bool:
-        """Return whether times come from a PTP clock.
-
-        Raises LidarError for an unknown clock.
-        """
+        """Return whether times come from a PTP clock, or raise LidarError for an unknown clock."""
         clock = self.source.settings.identifiers.get("clock", "gps")
         clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
         if clock not in clocks:
@@ -150,7 +145,7 @@ class HesaiEncoder(PacketEncoder):
         return clock == "ptp"
 
     def _packets(self, shots: Shots) -> Records:
-        """Return the data packets of shots that fill packets, as records (n,)."""
+        """Return the data packets of shots that fill packets, as n records."""
         layout = self._layout
         packets = np.zeros(len(shots) // self._firings, layout.packet)
         if layout.header:
@@ -173,16 +168,16 @@ class HesaiEncoder(PacketEncoder):
         return packets
 
     def _stamps_us(self, firings_ns: Ints) -> Ints:
-        """Return stamps since 1970 of packets whose stamped blocks fire at `firings_ns` (n,)."""
+        """Return packet timestamps in µs since 1970, where stamped blocks fire at `firings_ns`."""
         offset_us = self._layout.first_laser_us + self._layout.reference_us
         stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
         return (stamps_ns + 500) // 1000
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots into blocks (n, b)."""
+        """Write azimuths and returns of shots to blocks (n, b)."""
         layout = self._layout
         units = np.rint(shots.range_m * (1000 / UNIT_MM))
-        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype("<u2")
         reflectivities = shots.columns["reflectivity"] * fits
         shape = len(blocks), self._firings, 1, layout.channels
@@ -203,18 +198,18 @@ class HesaiEncoder(PacketEncoder):
 
 
 def _epoch_seconds(seconds: Ints) -> Bytes:
-    """Return seconds since 1970 as dates of PTP clocks: (n, 6), a 0 and the big-endian number."""
+    """Return seconds since 1970 as 6-byte PTP dates: a zero byte and a big-endian number."""
     return seconds.astype(">u8").view(np.uint8).reshape(-1, 8)[:, 2:] * (np.arange(6) > 0)
 
 
 def _fill_checksums(packets: Records) -> None:
-    """Write the checksums of the blocks, of the functional safety and of the tail."""
-    from . import hesai_loops  # not before: numba takes half a second to import
+    """Write the checksums of blocks, functional safety and tail."""
+    from . import hesai_loops  # imported here because numba takes half a second to import
 
     fields = packets.dtype.fields
     assert fields is not None
     safety_start = fields["safety"][1]
-    parts = (  # record with the field, field, and the bytes that the checksum covers
+    parts = (  # record that contains the field, name of the field, and the checked bytes
         (packets, "checksum", slice(fields["blocks"][1], fields["checksum"][1])),
         (packets["safety"], "checksum", slice(safety_start + 1, safety_start + 5)),
         (packets, "tail_checksum", slice(fields["status"][1], fields["tail_checksum"][1])),
@@ -228,11 +223,11 @@ def _fill_checksums(packets: Records) -> None:
 
 
 class HesaiDecoder(PacketDecoder):
-    """Refuses packets of Hesai, which no package of the index reads as sweeps."""
+    """Rejects Hesai packets, because no Python package on PyPI reads them as sweeps."""
 
     refusal = "Hesai packets, which are not supported. Convert them to .pcd with the Hesai SDK"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram starts with Hesai's mark, as a header or of its first block."""
+        """Return whether a datagram starts with the mark of Hesai's header or first block."""
         return payload[:2] in (b"\xee\xff", b"\xff\xee")

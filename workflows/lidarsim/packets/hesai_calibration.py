@@ -1,6 +1,6 @@
-"""Angles and firing times of the lasers of a Hesai, as the files that its readers load.
+"""Calibration files of Hesai sensors, with the angles and firing times of the lasers.
 
-Sources: HesaiLidar_SDK_2.0, folder correction, and the parsers that load the files.
+Sources: the folder "correction" of HesaiLidar_SDK_2.0, and the parsers that load the files.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..sensor import Sensor
-from .hesai_layouts import Layout
+from .hesai_layouts import HesaiPacketLayout
 
-_NEAR_M = "2.85"  # distance below which a Pandar128 fires otherwise, in the maker's file
+_NEAR_M = "2.85"  # range below which a Pandar128 fires differently, as in the original file
 
 
 class LaserTable(NamedTuple):
-    """Lasers in the maker's order."""
+    """Lasers in the manufacturer's order."""
 
-    layout: Layout
+    layout: HesaiPacketLayout
     elevation_deg: Floats  # (c,)
-    azimuth_deg: Floats  # (c,): clockwise from the head
-    time_us: Floats  # (c,): after the reference of the block
+    azimuth_deg: Floats  # (c,): clockwise relative to the head
+    time_us: Floats  # (c,): time after the reference of the block
 
     @classmethod
-    def of_sensor(cls, sensor: Sensor, layout: Layout) -> LaserTable:
-        """Return the lasers of a sensor."""
+    def from_sensor(cls, sensor: Sensor, layout: HesaiPacketLayout) -> LaserTable:
+        """Return the laser table of a sensor."""
         channels = sensor.packets.channels  # type: ignore[union-attr]
         beams = sensor.beams
-        # The beams of a sensor hold the rotation of the head within a firing.
+        # The beam azimuths of a sensor include the rotation of the head within a firing.
         turned = sensor.head.radians_per_ns * beams.time_ns  # type: ignore[attr-defined]
         return cls(
             layout,
@@ -39,7 +39,7 @@ class LaserTable(NamedTuple):
         )
 
     def angles_file(self) -> str:
-        """Return the file of angles, degrees."""
+        """Return the content of the angle file, in degrees."""
         rows = zip(self.elevation_deg, self.azimuth_deg, strict=True)
         lines = [
             f"{laser},{_decimal(elevation)},{_decimal(azimuth)}"
@@ -48,7 +48,7 @@ class LaserTable(NamedTuple):
         return "\n".join(["Channel,Elevation,Azimuth", *lines, ""])
 
     def firetimes_file(self) -> str:
-        """Return the file of firing times, the same in all states and distances."""
+        """Return the content of the firing time file. All states and ranges have equal times."""
         states = self.layout.listed_states
         times_us = [_decimal(time) for time in self.time_us]
         if not states:
@@ -67,11 +67,11 @@ class LaserTable(NamedTuple):
 
 
 def _table(heads: list[list[Any]], times: list[str], columns: int) -> str:
-    """Return a table with the same time of each laser in some columns."""
+    """Return a table that repeats the time of each laser in several columns."""
     rows = [[laser, *[time] * columns] for laser, time in enumerate(times, 1)]
     return "\n".join([*(",".join(map(str, row)) for row in [*heads, *rows]), ""])
 
 
 def _decimal(number: float) -> str:
-    """Return a number with six decimals at most."""
-    return f"{round(number, 6) + 0.0:.6f}".rstrip("0").rstrip(".")  # not -0
+    """Format a number with at most six decimals."""
+    return f"{round(number, 6) + 0.0:.6f}".rstrip("0").rstrip(".")  # + 0.0 avoids -0

@@ -1,8 +1,8 @@
-"""Layouts of Hesai's packets: fields, return modes and times of each model.
+"""Layouts of Hesai packets: fields, return modes and times of each model.
 
 Sources: user manuals of PandarXT-32, PandarXT-16, Pandar40P, Pandar64, PandarQT, Pandar128 and
-Pandar128E3X; HesaiLidar_SDK_2.0, UdpProtocol and UdpParser; tier4/nebula, hesai decoders, with its
-recordings of PandarXT-32, Pandar40P, Pandar64 and PandarQT.
+Pandar128E3X; UdpProtocol and UdpParser in HesaiLidar_SDK_2.0; the Hesai decoders of tier4/nebula
+with recordings of PandarXT-32, Pandar40P, Pandar64 and PandarQT.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from ..base.arrays import Ints
 
 _STRONGEST_OR_LAST = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _FIRST = {"first": 0x33}
-_SOP = (0xEE, 0xFF)  # start of a packet
+_SOP = (0xEE, 0xFF)  # start of packet
 UNIT_MM = 4
-_SEQUENCE_FLAG = 1  # flags of a header: what follows the blocks
+_SEQUENCE_FLAG = 1  # header flags that state what follows the blocks
 _IMU_FLAG = 2
 _SAFETY_FLAG = 4
-_OT128_STATUS = 128  # version of the status; it tells readers OT128 from Pandar128
+_OT128_STATUS = 128  # status version, by which readers distinguish OT128 from Pandar128
 
 _RETURN = [("distance", "<u2"), ("reflectivity", "u1")]
 _RETURN_WITH_BYTE = [*_RETURN, ("reserved", "u1")]
@@ -30,33 +30,33 @@ _SEQUENCE = ("sequence", "<u4")
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Packets of a model.
+class HesaiPacketLayout:
+    """Packet layout of a model.
 
-    The reference of a block is the time when its azimuth is the azimuth of the head.
+    The reference of a block is the time at which the block's azimuth is the azimuth of the head.
     """
 
     channels: int
     blocks: int
     firing_us: float
     packet: np.dtype[np.void]
-    modes: Mapping[str, int]  # {mode of returns: number in the packet}
-    first_laser_us: float  # time between the reference of a block and the laser that fires first
-    reference_us: float  # time between the stamp of a packet and the reference of the stamped block
+    modes: Mapping[str, int]  # {return mode: number in the packet}
+    first_laser_us: float  # time from the reference of a block to the first laser that fires
+    reference_us: float  # time from the timestamp of a packet to the reference of the stamped block
     epoch: int  # year 0 of dates
-    model_code: int  # code of the device information (hesai_ptc.py)
-    header: tuple[int, ...] = ()  # bytes; `dual_header` replaces some
-    dual_header: Mapping[int, int] | None = None  # {position: byte in the mode dual}
+    model_code: int  # code in the device information (hesai_ptc.py)
+    header: tuple[int, ...] = ()  # header bytes, some of which `dual_header` replaces
+    dual_header: Mapping[int, int] | None = None  # {position: byte in dual mode}
     block_start: int | None = None  # first bytes of each block
     return_byte: int = 0  # fourth byte of a return
-    stamps_first_block: bool = False  # else the stamp is of the last block
-    has_checksums: bool = False  # whether body, state and tail have checksums
-    has_epoch_seconds: bool = True  # whether the date may be seconds since 1970, of a PTP clock
+    stamps_first_block: bool = False  # whether timestamps belong to the first block or to the last
+    has_checksums: bool = False  # whether body, functional safety and tail have checksums
+    has_epoch_seconds: bool = True  # whether dates may be seconds since 1970 from a PTP clock
     listed_states: tuple[int, ...] = ()  # operational state of each column of firing times
     lists_distances: bool = False  # whether each state has columns for far and for near targets
 
     def header_bytes(self, dual: bool) -> Ints:
-        """Return the bytes of the header."""
+        """Return the header bytes in single or dual mode."""
         header = np.array(self.header, np.int64)
         if dual and self.dual_header is not None:
             for position, byte in self.dual_header.items():
@@ -64,7 +64,7 @@ class Layout:
         return header
 
     def dates(self, seconds: Ints) -> NDArray[np.uint8]:
-        """Return the dates of seconds since 1970, UTC: (n, 6), year to second."""
+        """Return UTC dates (n, 6), from year to second, for seconds since 1970."""
         times = seconds.astype("datetime64[s]")
         months = times.astype("datetime64[M]")
         days = times.astype("datetime64[D]")
@@ -83,18 +83,18 @@ class Layout:
 def _numbered(
     version: tuple[int, int], status: int, lasers: int, blocks: int, flags: int
 ) -> tuple[int, ...]:
-    """Return the header of a numbered protocol, 12 bytes, in a mode of a single return."""
+    """Return the 12-byte header of a versioned protocol in a single return mode."""
     return (*_SOP, *version, status, 0, lasers, blocks, 0, UNIT_MM, 1, flags)
 
 
-# {position in the header of numbered protocols: byte}: the last return is first; two returns.
+# {header position: byte in dual mode}: the last return comes first; there are two returns.
 _DUAL_NUMBERED = {8: 1, 10: 2}
 
 
 def _blocks(
     count: int, lasers: int, returned: list[tuple[str, str]], starts: bool = False
 ) -> tuple[str, np.dtype[np.void], tuple[int]]:
-    """Return the field of the blocks of a packet."""
+    """Return the field of a packet that contains its blocks."""
     start = [("start", "<u2")] if starts else []
     block = np.dtype([*start, ("azimuth", "<u2"), ("returns", np.dtype(returned), (lasers,))])
     return "blocks", block, (count,)
@@ -160,11 +160,11 @@ _PACKET_128 = np.dtype(
         ("tail_checksum", "<u4"),
     ]
 )
-STANDARD_STATE = 2  # operational state: all lasers fire in each block
+STANDARD_STATE = 2  # operational state in which all lasers fire in each block
 _FLAGS_128 = _SEQUENCE_FLAG | _IMU_FLAG | _SAFETY_FLAG
 
 LAYOUTS = {
-    "PandarXT-32": Layout(
+    "PandarXT-32": HesaiPacketLayout(
         channels=32,
         blocks=8,
         firing_us=50.0,
@@ -186,7 +186,7 @@ LAYOUTS = {
         dual_header=_DUAL_NUMBERED,
         return_byte=0xFF,
     ),
-    "Pandar40P": Layout(
+    "Pandar40P": HesaiPacketLayout(
         channels=40,
         blocks=10,
         firing_us=500 / 9,
@@ -199,7 +199,7 @@ LAYOUTS = {
         block_start=0xEEFF,
         has_epoch_seconds=False,
     ),
-    "Pandar64": Layout(
+    "Pandar64": HesaiPacketLayout(
         channels=64,
         blocks=6,
         firing_us=500 / 9,
@@ -212,12 +212,12 @@ LAYOUTS = {
         header=(*_SOP, 64, 6, 0, UNIT_MM, 0, 0),
         has_epoch_seconds=False,
     ),
-    "PandarQT": Layout(
+    "PandarQT": HesaiPacketLayout(
         channels=64,
         blocks=4,
         firing_us=500 / 3,
         packet=np.dtype([("header", "u1", (12,)), _blocks(4, 64, _RETURN_WITH_BYTE), *_QT_TAIL]),
-        # Of two returns, it sends the last and the first.
+        # In dual mode, it sends the last and the first return.
         modes={"last": 0x38} | _FIRST,
         first_laser_us=2.31,
         reference_us=25.71,
@@ -226,7 +226,7 @@ LAYOUTS = {
         header=_numbered((3, 1), 0, 64, 4, _SEQUENCE_FLAG),
         stamps_first_block=True,
     ),
-    "Pandar128": Layout(
+    "Pandar128": HesaiPacketLayout(
         channels=128,
         blocks=2,
         firing_us=500 / 9,
@@ -242,7 +242,7 @@ LAYOUTS = {
         listed_states=(0, 0, 0, 0, 2, 2, 3, 3),
         lists_distances=True,
     ),
-    "OT128": Layout(
+    "OT128": HesaiPacketLayout(
         channels=128,
         blocks=2,
         firing_us=500 / 9,

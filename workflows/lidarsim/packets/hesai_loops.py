@@ -1,4 +1,4 @@
-"""Loop over the checksums of Hesai's packets: see hesai.py."""
+"""Compiled loop that computes the checksums of Hesai packets, see hesai.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from raybeam.compiled import compiled
 
-_POLYNOMIAL = np.uint32(0x04C11DB7)  # the highest bit first
+_POLYNOMIAL = np.uint32(0x04C11DB7)  # highest bit first
 _ALL_BITS = np.uint32(0xFFFF_FFFF)
 _HIGHEST_BIT = np.uint32(0x8000_0000)
 
 
 def remainders() -> NDArray[np.uint32]:
-    """Return the remainders of bytes, (256,)."""
+    """Return the CRC remainders of all 256 byte values."""
     remainder = np.arange(256, dtype=np.uint32) << np.uint32(24)
     for _ in range(8):
         carry = (remainder & _HIGHEST_BIT) >> np.uint32(31)
@@ -25,14 +25,14 @@ def remainders() -> NDArray[np.uint32]:
 
 @compiled()
 def checksums(contents, table, sums):
-    """Write CRC-32 (MPEG-2) of rows of bytes `contents` (n, k) to `sums` (n,).
+    """Write the CRC-32/MPEG-2 of each row of bytes `contents` (n, k) to `sums` (n,).
 
-    `table` is of `remainders`.
+    `table` is the result of `remainders`.
     """
     for row in range(contents.shape[0]):
         crc = _ALL_BITS
         for k in range(contents.shape[1]):
             highest = (crc >> np.uint32(24)) ^ np.uint32(contents[row, k])
-            # numba shifts to 64 bits.
+            # numba widens shifted numbers to 64 bits.
             crc = np.uint32((crc << np.uint32(8)) & _ALL_BITS) ^ table[highest]
         sums[row] = crc

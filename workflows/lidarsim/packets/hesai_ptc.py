@@ -1,7 +1,7 @@
-"""Commands of a live Hesai over TCP (PTC): calibration, identity, settings, destination.
+"""TCP commands (PTC) of a live Hesai sensor: calibration, identity, settings and destination.
 
-Sources: TCP API of the user manuals of PandarQT and PandarXT-16; HesaiLidar_SDK_2.0, PtcClient;
-tier4/nebula, hesai hardware interface.
+Sources: TCP API in the user manuals of PandarQT and PandarXT-16; PtcClient in HesaiLidar_SDK_2.0;
+the Hesai hardware interface of tier4/nebula.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .service import Destination, is_single_receiver
 from .tcp_service import TcpService
 
 PTC_PORT = 9347
-_MARK = b"\x47\x74"  # first bytes of requests and answers
-_HEADER = Struct(">2sBBI")  # mark, command, code of the answer, bytes that follow
+_MARK = b"\x47\x74"  # first bytes of requests and responses
+_HEADER = Struct(">2sBBI")  # mark, command, return code, number of bytes that follow
 _MAX_REQUEST_BYTES = 1024
-_WITHIN_S = 5.0  # limit for a request from start to end, and for its answer
+_WITHIN_S = 5.0  # time limit for receiving a request, and for sending its response
 
 _GET_CALIBRATION = 0x05
 _GET_INVENTORY = 0x07
@@ -38,37 +38,37 @@ _INVALID_PARAMETER = 1
 _UNSUPPORTED = 5
 
 _INVENTORY = Struct(">18s16s6s16s16s16s16shBBB")
-_INVENTORY_BYTES = {42: 162}  # {model code of OT128: size}; others have 120
+_INVENTORY_BYTES = {42: 162}  # {model code of OT128: size}; other models have 120 bytes
 _CONFIG = Struct(">4s4s4s4sHHHBHHHBBBBBBBHBBB6x")
 _STATUS = Struct(">IH8iBBiiB5x")
 _DESTINATION = Struct(">4sHH")
-# {mode of returns: number of the command}
+# {return mode: number in the command}
 _RETURN_MODES = {"last": 0, "strongest": 1, "dual": 2, "first": 3}
-_GPS_PORT = 10_110  # port of packets with the receiver's sentences, which are not sent
+_GPS_PORT = 10_110  # port of packets with GPS sentences, which are not sent
 
-# What ends a connection: the peer, bytes that are no command, or this side.
+# Exceptions that end a connection: caused by the peer, by invalid bytes, or by this side.
 _ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio.CancelledError)
 
 
 @dataclass(frozen=True)
 class PtcDevice:
-    """Facts of a sensor that its commands report."""
+    """Properties of a sensor that its commands report."""
 
     name: str  # name of the sensor in its survey
     model_code: int
     lasers: int
     rate_rpm: int
-    mode: str  # mode of returns
-    port: int  # port of the data
-    dated: bool  # whether a receiver sets the clock
+    mode: str  # return mode
+    port: int  # port of the data packets
+    dated: bool  # whether a GNSS receiver sets the clock
     ptp: bool  # whether the clock is a PTP clock
-    calibration: bytes  # file of angles
-    firetimes: bytes  # file of firing times
+    calibration: bytes  # content of the angle file
+    firetimes: bytes  # content of the firing time file
 
     def inventory(self) -> bytes:
         """Return serial number, versions and model."""
         number = crc32(self.name.encode())
-        mac = b"\x02" + number.to_bytes(5, "big")  # locally administered
+        mac = b"\x02" + number.to_bytes(5, "big")  # locally administered address
         fields = (f"SIM{number:010d}".encode(), b"", mac, b"", b"", b"", b"", 0)
         packed = _INVENTORY.pack(*fields, self.model_code, 0, self.lasers)
         return packed.ljust(_INVENTORY_BYTES.get(self.model_code, 120), b"\0")
@@ -95,7 +95,7 @@ class PtcDevice:
         )
 
     def status(self, uptime_s: float) -> bytes:
-        """Return the time of operation and the rate, with temperatures 0."""
+        """Return uptime and rotation rate; all temperatures are 0."""
         ptp_state = 2 if self.ptp else 0  # locked, or free run
         return _STATUS.pack(
             int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
@@ -103,7 +103,7 @@ class PtcDevice:
 
 
 class _RefusedError(Exception):
-    """A command that is answered by a code."""
+    """A command that is answered with an error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -111,20 +111,20 @@ class _RefusedError(Exception):
 
 
 class PtcService(TcpService):
-    """Answers commands, any number of commands on a connection.
+    """Answers PTC commands. Each connection can carry any number of commands.
 
     Parameters
     ----------
     device
-        What the answers state.
+        Properties that the responses report.
     address, destination, send_to
-        As of `TcpService`.
+        As in `TcpService`.
     """
 
     name = "Hesai commands (PTC)"
     usual_port = PTC_PORT
     example_port = 9348
-    max_connections = 16  # one more closes the connection that was silent longest
+    max_connections = 16  # a further connection closes the one that has been idle longest
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class PtcService(TcpService):
 
     @property
     def description(self) -> str:
-        """The address of the commands."""
+        """Address at which commands are accepted."""
         return f"{self.name} at {self.host}:{self.port}"
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -175,9 +175,9 @@ class PtcService(TcpService):
         return _HEADER.pack(_MARK, command, _OK, len(content)) + content
 
     def _content(self, command: int, parameter: bytes, own_host: str) -> bytes:
-        """Return the content of the answer to a command.
+        """Return the content of the response to a command.
 
-        Raises _RefusedError for what cannot be done.
+        Raises _RefusedError if the command cannot be executed.
         """
         device = self._device
         answers: dict[int, Callable[[], bytes]] = {
@@ -195,7 +195,7 @@ class PtcService(TcpService):
         return answers[command]()
 
     def _set_destination(self, parameter: bytes) -> bytes:
-        """Send datagrams to another address from now on."""
+        """Redirect all further datagrams to another address."""
         if len(parameter) != _DESTINATION.size:
             raise _RefusedError(_INVALID_PARAMETER)
         packed, port, _ = _DESTINATION.unpack(parameter)
@@ -208,9 +208,9 @@ class PtcService(TcpService):
 
 
 def _unchanged(parameter: bytes, current: bytes) -> bytes:
-    """Accept the current value of a setting, which cannot be changed.
+    """Accept the current value of a setting that cannot be changed.
 
-    Raises _RefusedError for others.
+    Raises _RefusedError for other values.
     """
     if parameter != current:
         raise _RefusedError(_INVALID_PARAMETER)

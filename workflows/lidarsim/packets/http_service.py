@@ -1,8 +1,9 @@
-"""Services over HTTP/1.1, as makers' sensors have them on port 80.
+"""HTTP/1.1 services, as sensors provide them on port 80.
 
-Requests are small and come from few programs on a network without enemies, or from a program that
-is broken: sizes, times and the number of connections have limits, and each connection carries one
-request. Requests of other websites are refused, as the protocols have no password.
+Requests are small and come from few programs on a trusted network, but these programs may be
+broken. Sizes, times and the number of connections are therefore limited, and each connection
+carries one request. Requests from other websites are rejected, because the protocols have no
+password.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from .tcp_service import TcpService
 HTTP_PORT = 80
 _MAX_HEAD_BYTES = 16 << 10  # limit for the request line and headers
 _MAX_BODY_BYTES = 64 << 10
-_WITHIN_S = 5.0  # limit between the connection and the answer
+_WITHIN_S = 5.0  # time limit from the connection to the response
 _METHODS = ("GET", "POST", "PUT", "DELETE", "HEAD")
 _READING = ("GET", "HEAD")
 
@@ -34,7 +35,7 @@ Headers = Mapping[str, str]  # {name in lower case: value}
 
 @dataclass(frozen=True)
 class Request:
-    """A request that was understood."""
+    """A parsed request."""
 
     method: str
     path: str
@@ -45,14 +46,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer: JSON, or text."""
+    """A response with JSON or text."""
 
-    content: Any = None  # plain data for JSON; None for no content
+    content: Any = None  # JSON-serializable data; None for no content
     status: int = HTTPStatus.OK
-    text: str | None = None  # replaces JSON
+    text: str | None = None  # sent instead of JSON if set
 
     def encode(self) -> bytes:
-        """Return the answer as bytes of HTTP."""
+        """Return the response as HTTP bytes."""
         body = b""
         kind = "application/json"
         if self.text is not None:
@@ -68,8 +69,8 @@ class Answer:
         return head.encode() + body
 
 
-class RefusedError(Exception):
-    """A request that is answered by an error, and the reason for the client."""
+class RequestRefusedError(Exception):
+    """A request that is answered with an error status, and the reason sent to the client."""
 
     def __init__(self, reason: str, status: int = HTTPStatus.BAD_REQUEST) -> None:
         super().__init__(reason)
@@ -77,7 +78,7 @@ class RefusedError(Exception):
 
 
 class HttpService(TcpService):
-    """Answers requests of HTTP, with the parameters of `TcpService`."""
+    """Answers HTTP requests. The parameters are the same as in `TcpService`."""
 
     usual_port = HTTP_PORT
     example_port = 8080
@@ -86,13 +87,13 @@ class HttpService(TcpService):
 
     @abstractmethod
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request.
+        """Return the response to a request.
 
-        Raises RefusedError for what is not understood.
+        Raises RequestRefusedError if the request is not understood.
         """
 
     def changes_state(self, method: str, path: str) -> bool:
-        """Return True if a request may change what the sensor does."""
+        """Return whether a request may change the state of the sensor."""
         return method not in _READING
 
     def __enter__(self) -> Self:
@@ -101,7 +102,7 @@ class HttpService(TcpService):
 
     @property
     def description(self) -> str:
-        """The address, and how a client whose port is 80 reaches another port."""
+        """Address of the service, with a hint for clients that always use port 80."""
         words = f"{self.name} at http://{self.host}:{self.port}"
         if self.port != HTTP_PORT:
             words += f" (for clients: http_proxy=http://{self.host}:{self.port})"
@@ -115,8 +116,8 @@ class HttpService(TcpService):
                     writer.write((await self._answered(reader, writer)).encode())
                     await writer.drain()
                     writer.write_eof()
-                    # What the client still sends must not reset the connection before the
-                    # client has read the answer.
+                    # Read what the client still sends, because unread data would reset the
+                    # connection before the client has read the response.
                     while await reader.read(_MAX_HEAD_BYTES):
                         pass
         finally:
@@ -128,7 +129,7 @@ class HttpService(TcpService):
             try:
                 head = await reader.readuntil(b"\r\n\r\n")
             except asyncio.LimitOverrunError as error:
-                raise RefusedError(
+                raise RequestRefusedError(
                     "the headers are too long", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
                 ) from error
             method, url, headers = _parsed(head)
@@ -141,11 +142,11 @@ class HttpService(TcpService):
             peer = writer.get_extra_info("peername")[0]
             answer = self.answer(Request(method, path, url.query, body, peer))
             return Answer(status=answer.status) if method == "HEAD" else answer
-        except RefusedError as error:
+        except RequestRefusedError as error:
             return error.answer
 
     def _refuse_other_sites(self, method: str, url: SplitResult, headers: Headers) -> None:
-        """Raise RefusedError for a request of another website."""
+        """Raise RequestRefusedError if a request comes from another website."""
         reason = refusal(
             headers,
             self.names,
@@ -153,22 +154,21 @@ class HttpService(TcpService):
             changes_state=self.changes_state(method, url.path),
         )
         if reason:
-            raise RefusedError(reason, HTTPStatus.FORBIDDEN)
+            raise RequestRefusedError(reason, HTTPStatus.FORBIDDEN)
 
 
 def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
-    """Return method, URL and headers of a request.
+    """Return the method, URL and headers of a request.
 
-    Raises RefusedError for other bytes.
-
-    The URL may be in absolute form, as for a proxy.
+    The URL may be in absolute form, as sent to a proxy. Raises RequestRefusedError if the bytes
+    are not a valid request.
     """
     line, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
     words = line.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):
-        raise RefusedError("this is not an HTTP/1.1 request")
+        raise RequestRefusedError("this is not an HTTP/1.1 request")
     if words[0] not in _METHODS:
-        raise RefusedError(
+        raise RequestRefusedError(
             f"the method must be {' or '.join(_METHODS)}", HTTPStatus.METHOD_NOT_ALLOWED
         )
     headers: dict[str, str] = {}
@@ -176,48 +176,48 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
         name, separator, value = entry.partition(":")
         name = name.strip().lower()
         if not separator or not name:
-            raise RefusedError("a header has no colon")
+            raise RequestRefusedError("a header has no colon")
         headers[name] = f"{headers[name]},{value.strip()}" if name in headers else value.strip()
     try:
         return words[0], urlsplit(words[1]), headers
     except ValueError as error:
-        raise RefusedError("the URL is invalid") from error
+        raise RequestRefusedError("the URL is invalid") from error
 
 
 def _body_size(headers: Headers) -> int:
-    """Return the size of the body that headers announce.
+    """Return the body size that the headers announce.
 
-    Raises RefusedError for other encodings.
+    Raises RequestRefusedError if the size is missing, invalid or too large.
     """
     if "transfer-encoding" in headers:
-        raise RefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
+        raise RequestRefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
     size = headers.get("content-length", "0")
     if not (size.isascii() and size.isdecimal()):
-        raise RefusedError("Content-Length must be a number")
+        raise RequestRefusedError("Content-Length must be a number")
     if len(size) > 9 or int(size) > _MAX_BODY_BYTES:
-        raise RefusedError("the body is too large", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        raise RequestRefusedError("the body is too large", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
     return int(size)
 
 
 def receiver_of(name: str, value: Any) -> str:
-    """Return the IPv4 address of one receiver.
+    """Return a parameter value that must be the IPv4 address of a single receiver.
 
-    Raises RefusedError for others, with the parameter's `name`.
+    Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """
     try:
         address = IPv4Address(str(value))
     except AddressValueError as error:
-        raise RefusedError(f"{name} is not an IPv4 address") from error
+        raise RequestRefusedError(f"{name} is not an IPv4 address") from error
     if not is_single_receiver(address):
-        raise RefusedError(f"{name} is not the address of a single receiver")
+        raise RequestRefusedError(f"{name} is not the address of a single receiver")
     return str(address)
 
 
 def receiver_port(name: str, value: Any) -> int:
-    """Return a port, or 0 for packets that are not sent.
+    """Return a parameter value that must be a port, or 0 for packets that are not sent.
 
-    Raises RefusedError for other values.
+    Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 16:
-        raise RefusedError(f"{name} is not a port")
+        raise RequestRefusedError(f"{name} is not a port")
     return value

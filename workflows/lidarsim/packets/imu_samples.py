@@ -1,4 +1,4 @@
-"""Samples of the carrier's IMU beside the shots of a sensor, for packets that sensors send."""
+"""IMU samples of the platform, in step with the shots of a sensor, for IMU packets."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from .shots import Shots
 
 
 class ImuBatch(NamedTuple):
-    """Consecutive samples of an IMU, in its frame."""
+    """Consecutive IMU samples in the IMU frame."""
 
-    times_ns: Ints  # (n,): since the survey's start
-    stamps_ns: Ints  # (n,): the same by the sensor's clock, with its jumps
+    times_ns: Ints  # (n,): since the start of the survey
+    stamps_ns: Ints  # (n,): the same on the sensor's clock, including its jumps
     rates: Floats  # (n, 3): angular velocities, rad/s
     forces: Floats  # (n, 3): specific forces, m/s²
 
 
-class ImuSamples:
-    """Samples of the carrier's IMU in the order of their times, or none without an IMU."""
+class PacketImuSamples:
+    """IMU samples of the platform in chronological order; there are none without an IMU."""
 
     def __init__(self, source: PacketSource) -> None:
         instruments = source.instruments
         self._rows = iter(()) if instruments is None else instruments.rows(IMU_FILE)
         self._next_row: list[str] | None = next(self._rows, None)
-        self._starts_ns: Ints = np.zeros(1, np.int64)  # starts of the last shots
-        self._jumps_ns: Ints = np.zeros(1, np.int64)  # jumps of the clock, at the last shots
+        self._starts_ns: Ints = np.zeros(1, np.int64)  # start times of the last shots
+        self._jumps_ns: Ints = np.zeros(1, np.int64)  # clock jumps at the last shots
 
     def during(self, shots: Shots) -> ImuBatch | None:
-        """Return the samples until the last of the shots, or None without samples."""
+        """Return the samples up to the last of the shots, or None if there are none."""
         self._starts_ns = shots.starts_ns
         self._jumps_ns = shots.stamps_ns - shots.starts_ns
         return self._until(int(shots.starts_ns[-1]))
 
     def remaining(self) -> ImuBatch | None:
-        """Return the samples after the last shots, or None without samples."""
+        """Return the samples after the last shots, or None if there are none."""
         return self._until(None)
 
     def _until(self, until_ns: int | None) -> ImuBatch | None:
-        """Return the samples up to a time, or all for None. Without samples return None."""
+        """Return the samples up to a time, or all if it is None. If there are none, return None."""
         rows = []
         while self._next_row is not None:
             if until_ns is not None and int(self._next_row[0]) > until_ns:

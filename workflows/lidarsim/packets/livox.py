@@ -1,8 +1,8 @@
-"""Packets of Livox, in the format of SDK2: Mid-360 and HAP, points and samples of the IMU.
+"""Livox packets in the format of SDK2, with points and IMU samples of Mid-360 and HAP.
 
-Sources: Livox's communication protocol of the Mid-360, 1.4.11, and of the HAP, 1.4.8; user manual
-of the HAP, page 15 (tags); Livox-SDK2 1.4.3, livox_lidar_def.h and define.h; livox_ros_driver2,
-pub_handler.cpp. All numbers are little-endian.
+Sources: Livox communication protocols of the Mid-360 (1.4.11) and the HAP (1.4.8); HAP user manual,
+page 15 (tags); livox_lidar_def.h and define.h in Livox-SDK2 1.4.3; pub_handler.cpp in
+livox_ros_driver2. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -14,36 +14,36 @@ from zlib import crc32
 import numpy as np
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
-from ..base.vectors import applied, inverse, matmul
+from ..base.vectors import inverse, matmul, matvec
 from ..motion.rotations import matrices
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
-from .imu_samples import ImuBatch, ImuSamples
+from .imu_samples import ImuBatch, PacketImuSamples
 from .service import Destination, Service
 from .shots import CarryOver, Shots
 
-DOTS = 96  # dots per packet
-IMU_DATA = 0  # type of data
-_CHECKED_FROM = 28  # first byte that the checksum of a packet covers
+DOTS = 96  # points per packet
+IMU_DATA = 0  # data type of IMU samples
+_CHECKED_FROM = 28  # first byte covered by the checksum of a packet
 _MODES = ("strongest", "first", "last")
-_STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
-_UNSYNCHRONIZED = 0  # sources of the time
+_STANDARD_GRAVITY = 9.80665  # m/s², the unit of accelerations
+_UNSYNCHRONIZED = 0  # time source
 _PTP = 1
 
 
 @dataclass(frozen=True)
 class Ports:
-    """UDP ports of a kind of device: of the sensor, and by default of the host."""
+    """UDP ports of a device type: ports of the sensor, and default ports of the host."""
 
     points: int
     imu: int
     host_points: int
     host_imu: int
     command: int
-    state: int  # port of state messages; 0: none are sent
+    state: int  # port of state messages; 0 if none are sent
     host_state: int
 
 
-_MID360 = 9  # types of devices
+_MID360 = 9  # device types
 _HAP = 10
 PORTS = {
     _MID360: Ports(
@@ -65,39 +65,39 @@ PORTS = {
         host_state=0,
     ),
 }
-# Tag of the HAP for the first return. The light that the sensor itself returns is return 0. Returns
-# nearer than 1.5 m are merged with return 0. Other tags, of noise, are 0: high confidence.
+# Tag of the HAP for the first return. Return 0 is light reflected by the sensor itself, and returns
+# closer than 1.5 m are merged with it. All other tag bits, for noise, are 0: high confidence.
 _HAP_FIRST_RETURN = 0x10
 _HAP_MERGED_M = 1.5
-_POSITION = "position_m"  # name of positions among the columns of shots
+_POSITION = "position_m"  # name of the position column of shots
 
 
 @dataclass(frozen=True)
 class Cartesian:
-    """Type of data with Cartesian coordinates."""
+    """Data type with Cartesian coordinates."""
 
-    number: str  # type of a coordinate
+    number: str  # dtype of a coordinate
     unit_m: float
 
     @property
     def dots(self) -> np.dtype[np.void]:
-        """Type of a point."""
+        """Dtype of a point."""
         return np.dtype([("position", self.number, (3,)), ("reflectivity", "u1"), ("tag", "u1")])
 
 
-# {pcl_data_type of the sensor's parameters: points of that type}
+# {pcl_data_type in the sensor's parameters: point format}
 CARTESIAN = {1: Cartesian("<i4", 0.001), 2: Cartesian("<i2", 0.01)}
 
 _IMU_SAMPLE = np.dtype([("rate", "<f4", (3,)), ("acceleration", "<f4", (3,))])  # rad/s, g
 
 
 def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
-    """Return the type of a packet with a number of points or samples."""
+    """Return the dtype of a packet with `count` points or samples."""
     return np.dtype(
         [
             ("version", "u1"),
             ("length", "<u2"),
-            ("interval", "<u2"),  # time between the first and the last point, 0.1 µs
+            ("interval", "<u2"),  # time from the first to the last point, in 0.1 µs
             ("count", "<u2"),
             ("number", "<u2"),  # number of the packet in its frame
             ("frame", "u1"),
@@ -112,20 +112,21 @@ def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
 
 
 class LivoxEncoder(PacketEncoder):
-    """Packets of 96 points, and packets of samples where the carrier has an IMU.
+    """Encodes packets of 96 points, and IMU packets if the platform has an IMU.
 
-    Points are positions in the sensor frame, at the time of each: a moving carrier's motion is not
-    removed. A pulse without a return is a point of zeros. Lines take turns: the point n is of line
-    n modulo the number of lines. The identifier `data_type` selects coordinates of 1 mm and 32 bits
-    (1, the default) or of 10 mm and 16 bits (2). Samples of the IMU are rotated to the sensor's
-    axes, as the sensor's IMU has them.
+    Points are positions in the sensor frame at their firing time; the motion of the platform is not
+    removed. A pulse without a return is a point with all coordinates 0. Lines alternate: point n
+    belongs to line n modulo the number of lines. The identifier `data_type` selects 32-bit
+    coordinates with a resolution of 1 mm (1, the default) or 16-bit coordinates with a resolution
+    of 10 mm (2). IMU samples are rotated to the sensor's axes, because a real sensor's IMU is
+    aligned with them.
     """
 
     identifiers = ("device_type",)
     optional_identifiers = ("data_type",)
     address = "192.168.1.100"
     destination = "192.168.1.5"
-    told_apart = True
+    distinguished_by_receivers = True
     has_own_address = True
 
     def __init__(self, source: PacketSource) -> None:
@@ -147,20 +148,20 @@ class LivoxEncoder(PacketEncoder):
                 f"require a number of lines that divides {DOTS}, but the sensor has {lines}"
             )
         self._firings = DOTS // lines
-        # Time from the first to the last line of a firing, as readers space points evenly.
+        # Time from the first to the last line of a firing, because readers space points evenly.
         self._lines_ns = self.firing_interval_ns * (lines - 1) / lines
         self._carry = CarryOver(self._firings)
         self._frame = 0
         self._packets_of_frame = 0
-        self._samples = ImuSamples(source)
+        self._samples = PacketImuSamples(source)
         self._to_sensor = _imu_axes(source)
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the packets that the shots of a sweep fill, and samples of the IMU until then."""
+        """Return the packets that are complete after the shots of a sweep, and IMU packets."""
         if not len(shots):
             return []
         imu = self._imu(self._samples.during(shots))
-        # By sweeps, whose directions the sensor has kept since they were cast.
+        # Convert whole sweeps, because the sensor has cached their directions since casting.
         positions = {_POSITION: self._positions_m(shots)[None]}
         shots = replace(shots, columns={**shots.columns, **positions})
         filling = self._carry.whole_packets(shots)
@@ -170,12 +171,12 @@ class LivoxEncoder(PacketEncoder):
         return [self._points(filling).without(np.asarray(dropped)), *imu]
 
     def finish(self) -> list[Datagrams]:
-        """Return the last samples of the IMU, while points that fill no packet are not sent."""
+        """Return the last IMU packets. Points that do not fill a packet are not sent."""
         return self._imu(self._samples.remaining())
 
     @property
     def ports(self) -> Mapping[str, int]:
-        """Ports of the host: {kind: port}."""
+        """Ports of the host by kind of packets."""
         ports = PORTS[self.device_type]
         defaults = {"points": ports.host_points, "imu": ports.host_imu}
         return {**defaults, **self.source.settings.ports}
@@ -202,12 +203,12 @@ class LivoxEncoder(PacketEncoder):
         return LivoxService(address, destination, send_to, state, self.set_data_type)
 
     def set_data_type(self, data_type: int) -> None:
-        """Change the type of the data of later packets, of `CARTESIAN`."""
+        """Set the data type of all further packets, a key of `CARTESIAN`."""
         self.data_type = data_type
 
     def _points(self, shots: Shots) -> Datagrams:
-        """Return the packets of points of shots that fill packets."""
-        data_type = int(self.data_type)  # which a service may change meanwhile
+        """Return the packets of shots that fill packets."""
+        data_type = int(self.data_type)  # a service thread may change it meanwhile
         kind = CARTESIAN[data_type]
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), packet_type(kind.dots, DOTS))
@@ -223,7 +224,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions in the sensor frame, meters: (n, c, 3), or NaN without a return."""
+        """Return positions (n, c, 3) in the sensor frame in meters, or NaN without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]
@@ -238,7 +239,7 @@ class LivoxEncoder(PacketEncoder):
         units = shots.columns[_POSITION][0] / kind.unit_m
         np.rint(units, out=units)
         limit = np.iinfo(np.dtype(kind.number)).max
-        fits = (np.abs(units) <= limit).all(axis=2)  # not NaN, without a return
+        fits = (np.abs(units) <= limit).all(axis=2)  # False without a return, where units are NaN
         units[~fits] = 0
         points["position"] = units.reshape(points["position"].shape)
         reflectivities = shots.columns["reflectivity"][0] * fits
@@ -248,9 +249,10 @@ class LivoxEncoder(PacketEncoder):
             points["tag"] = _HAP_FIRST_RETURN * is_first.reshape(points.shape)
 
     def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
-        """Return the numbers in their frame, and the frames, of packets that start at times (n,).
+        """Return the packet numbers within their frames, and the frames, of packets.
 
-        A frame lasts as long as a frame of the sensor; numbers continue from call to call.
+        `first_ns` (n,) are the start times of the packets. A frame lasts as long as a frame of the
+        sensor, and numbers continue from call to call.
         """
         frame_ns = 1e9 / self.source.sensor.head.rate_hz  # type: ignore[attr-defined]
         frames = np.floor(first_ns / frame_ns + 1e-6).astype(np.int64)
@@ -264,15 +266,15 @@ class LivoxEncoder(PacketEncoder):
         return numbers, frames % 256
 
     def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
-        """Return a packet for each sample of the IMU, or none for None."""
+        """Return a packet for each IMU sample, or no packets if `batch` is None."""
         if batch is None:
             return []
         packets = np.zeros(len(batch.times_ns), packet_type(_IMU_SAMPLE, 1))
         packets["data_type"] = IMU_DATA
         self._write_header(packets, batch.stamps_ns)
         samples = packets["data"]
-        samples["rate"] = applied(self._to_sensor, batch.rates)[:, None]
-        samples["acceleration"] = (applied(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
+        samples["rate"] = matvec(self._to_sensor, batch.rates)[:, None]
+        samples["acceleration"] = (matvec(self._to_sensor, batch.forces) / _STANDARD_GRAVITY)[
             :, None
         ]
         payloads = _with_checksums(packets)
@@ -280,9 +282,10 @@ class LivoxEncoder(PacketEncoder):
         return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
-        """Write the common fields of packets (n,), sent `stamps_ns` (n,) after the survey's start.
+        """Write the common header fields of packets (n,).
 
-        A sensor that no clock has told the time counts from its start.
+        `stamps_ns` (n,) are the send times since the start of the survey. The clock of a sensor
+        that is not synchronized starts at 0.
         """
         packets["length"] = packets.dtype.itemsize
         packets["count"] = packets["data"].shape[1]
@@ -292,27 +295,27 @@ class LivoxEncoder(PacketEncoder):
 
 
 def _imu_axes(source: PacketSource) -> Floats:
-    """Return the rotation (3, 3) from the axes of the carrier's IMU to the sensor's axes."""
+    """Return the rotation (3, 3) from the axes of the platform's IMU to the sensor's axes."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
-    on_carrier = matrices(np.array([source.instruments.imu.quaternion]))[0]
-    return matmul(inverse(source.mount[:3, :3]), on_carrier)
+    on_platform = matrices(np.array([source.instruments.imu.quaternion]))[0]
+    return matmul(inverse(source.mount[:3, :3]), on_platform)
 
 
 def _with_checksums(packets: Records) -> Bytes:
-    """Return packets (n,) as bytes (n, size), with their CRC-32."""
+    """Return packets as bytes (n, size) after computing their CRC-32 checksums."""
     payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
     packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
     return payloads
 
 
 class LivoxDecoder(PacketDecoder):
-    """Refuses packets of Livox, which no package of the index reads as sweeps."""
+    """Rejects Livox packets, because no Python package on PyPI reads them as sweeps."""
 
     refusal = "Livox packets, which are not supported. Record a ROS 2 bag with livox_ros_driver2"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram is a point or IMU packet: version 0, and its own length."""
+        """Return whether a datagram is a point or IMU packet, by its version and length."""
         size = int.from_bytes(payload[1:3], "little")
         return len(payload) > _CHECKED_FROM and payload[0] == 0 and size == len(payload)

@@ -1,7 +1,7 @@
-"""Commands of Livox's SDK2: frames with checksums, and parameters as keys and values.
+"""Commands of Livox SDK2: frames with checksums, and parameters as key-value pairs.
 
-Sources: Livox's communication protocol of the Mid-360, 1.4.11; Livox-SDK2 1.4.3, sdk_protocol.cpp,
-build_request.cpp and livox_lidar_def.h. All numbers are little-endian.
+Sources: Livox communication protocol of the Mid-360 (1.4.11); sdk_protocol.cpp, build_request.cpp
+and livox_lidar_def.h in Livox-SDK2 1.4.3. All numbers are little-endian.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import NamedTuple
 from zlib import crc32
 
 MAX_FRAME_BYTES = 1400
-_HEAD = Struct("<BBHIHBB6s")  # start, version, length, number, command, is it an answer, sender
-_CHECKSUMS = Struct("<HI")  # checksums of the head, of the data
+_HEAD = Struct("<BBHIHBB6s")  # start, version, length, number, command, frame type, sender
+_CHECKSUMS = Struct("<HI")  # checksums of the head and of the data
 _HEAD_BYTES = _HEAD.size + _CHECKSUMS.size
 _START = 0xAA
 _VERSION = 0
-_REQUEST = 0  # types of frames
+_REQUEST = 0  # frame types
 _ANSWER = 1
 _HOST = 0  # senders
 _LIDAR = 1
@@ -42,7 +42,7 @@ class Command(IntEnum):
 
 
 class Code(IntEnum):
-    """Return codes of answers."""
+    """Return codes in responses."""
 
     SUCCESS = 0x00
     FAILURE = 0x01
@@ -54,7 +54,7 @@ class Code(IntEnum):
 
 
 class Key(IntEnum):
-    """Parameters that this module or the service names."""
+    """Parameters that this module or the service refers to by name."""
 
     DATA_TYPE = 0x0000
     PATTERN = 0x0001
@@ -82,8 +82,8 @@ class Key(IntEnum):
     HEALTH_CODES = 0x8011
 
 
-class Frame(NamedTuple):
-    """A request."""
+class CommandFrame(NamedTuple):
+    """A parsed request."""
 
     command: int
     number: int
@@ -91,15 +91,15 @@ class Frame(NamedTuple):
 
 
 @dataclass
-class RefusedError(Exception):
-    """A request that is answered by a return code, and the parameter that is wrong, if any."""
+class CommandRefusedError(Exception):
+    """A request that is answered with an error code, and the key of the invalid parameter."""
 
     code: Code
     key: int = 0
 
 
-def parse_request(content: bytes) -> Frame | None:
-    """Return the request in a datagram, or None without a request with right checksums."""
+def parse_request(content: bytes) -> CommandFrame | None:
+    """Return the request in a datagram, or None if the frame or its checksums are invalid."""
     if len(content) < _HEAD_BYTES:
         return None
     start, version, length, number, command, kind, _, _ = _HEAD.unpack_from(content)
@@ -110,16 +110,16 @@ def parse_request(content: bytes) -> Frame | None:
         return None
     if head_checksum != crc_hqx(content[: _HEAD.size], 0xFFFF) or data_checksum != _checksum(data):
         return None
-    return Frame(command, number, data)
+    return CommandFrame(command, number, data)
 
 
 def answer_frame(command: int, number: int, data: bytes) -> bytes:
-    """Return the answer to a request."""
+    """Return the frame of the response to a request."""
     return _frame(command, number, data, _ANSWER)
 
 
 def push_frame(number: int, data: bytes) -> bytes:
-    """Return a frame with parameters that the sensor sends by itself."""
+    """Return the frame of parameters that the sensor sends unsolicited."""
     return _frame(Command.PUSH, number, data, _REQUEST)
 
 
@@ -130,51 +130,48 @@ def _frame(command: int, number: int, data: bytes, kind: int) -> bytes:
 
 
 def _checksum(data: bytes) -> int:
-    """Return the checksum of data, which is 0 without data."""
+    """Return the checksum of data, which is 0 for empty data."""
     return crc32(data) if data else 0
 
 
 def parse_values(data: bytes) -> dict[int, bytes]:
-    """Return the parameters of a request to set.
+    """Return the parameters in a set request, or raise CommandRefusedError if they are truncated.
 
-    Raises RefusedError if parameters are cut off.
+    The result maps keys to values.
     """
     values = {}
     offset = _COUNT.size
     for _ in range(_key_count(data)):
         if offset + _ENTRY.size > len(data):
-            raise RefusedError(Code.WRONG_KEY_NUMBER)
+            raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
         key, length = _ENTRY.unpack_from(data, offset)
         offset += _ENTRY.size + length
         if offset > len(data):
-            raise RefusedError(Code.INVALID_LENGTH, key)
+            raise CommandRefusedError(Code.INVALID_LENGTH, key)
         values[key] = data[offset - length : offset]
     return values
 
 
 def parse_keys(data: bytes) -> Sequence[int]:
-    """Return the keys of a request to get.
-
-    Raises RefusedError if keys are cut off.
-    """
+    """Return the keys in a get request, or raise CommandRefusedError if they are truncated."""
     count = _key_count(data)
     if _COUNT.size + count * _KEY.size > len(data):
-        raise RefusedError(Code.WRONG_KEY_NUMBER)
+        raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
     return [_KEY.unpack_from(data, _COUNT.size + n * _KEY.size)[0] for n in range(count)]
 
 
 def _key_count(data: bytes) -> int:
     if len(data) < _COUNT.size:
-        raise RefusedError(Code.WRONG_KEY_NUMBER)
+        raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
     count: int = _COUNT.unpack_from(data)[0]
     return count
 
 
 def packed_values(values: Mapping[int, bytes]) -> bytes:
-    """Return parameters as they stand in answers."""
+    """Return parameters in the encoding used in responses."""
     return b"".join(_ENTRY.pack(key, len(value)) + value for key, value in values.items())
 
 
 def packed_count(values: Mapping[int, bytes]) -> bytes:
-    """Return the head of parameters that a sensor sends by itself."""
+    """Return the header of parameters that a sensor sends unsolicited."""
     return _COUNT.pack(len(values), 0)

@@ -1,8 +1,9 @@
-"""The command interface of a live Livox: search, parameters, and state messages.
+"""Command interface of a live Livox sensor: discovery, parameters and state messages.
 
-Livox-SDK2 searches by broadcasts to port 56000, which do not reach a sensor on the same machine,
-and ignores datagrams from its own address. So the sensor has a separate address, such as 127.0.0.2,
-and tells the host each second that it is there, as if the host had searched.
+Livox-SDK2 searches for sensors with broadcasts to port 56000. These do not reach a sensor on the
+same machine, and the SDK ignores datagrams from its own address. The simulated sensor therefore has
+a separate address, such as 127.0.0.2, and announces itself to the host every second as if the host
+had searched.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from .livox_commands import (
     MAX_FRAME_BYTES,
     Code,
     Command,
-    Frame,
+    CommandFrame,
+    CommandRefusedError,
     Key,
-    RefusedError,
     answer_frame,
     packed_count,
     packed_values,
@@ -38,50 +39,50 @@ from .livox_commands import (
 from .service import Destination, Service, is_single_receiver
 
 SEARCH_PORT = 56_000
-_ANNOUNCE_S = 1.0  # the SDK searches as often
-_LOOKS_S = 0.1  # pause between looks for the end of the service
-_MAX_REQUESTS = 200  # limit per second: others are dropped, so that a flood takes little time
+_ANNOUNCE_S = 1.0  # same interval as searches of the SDK
+_LOOKS_S = 0.1  # interval of checks whether the service should stop
+_MAX_REQUESTS = 200  # per second; further requests are dropped so that a flood takes little time
 _SEARCH_ANSWER = Struct("<BB16s4sH")
 _SET_ANSWER = Struct("<BH")
 _GET_ANSWER = Struct("<BH")
-_HOST = Struct("<4sHH")  # address, port of the host, port of the sensor
-_SAMPLING = 1  # work modes
+_HOST = Struct("<4sHH")  # host address, host port, sensor port
+_SAMPLING = 1  # work mode
 _WORK_MODES = (_SAMPLING, 2, 9)  # sampling, idle, ready
-_APPLICATION = 1  # type of firmware
+_APPLICATION = 1  # firmware type
 _VERSION = bytes((1, 0, 0, 0))
 
-# {parameter that can be set: its length}; those without effect on the packets are kept as given.
+# {parameter that can be set: length}; parameters without effect on packets are only stored.
 _LENGTHS: dict[int, int] = {
     Key.DATA_TYPE: 1,
     Key.PATTERN: 1,
-    0x0002: 1,  # two returns
-    0x0003: 1,  # points are sent
+    0x0002: 1,  # dual returns
+    0x0003: 1,  # point sending enabled
     Key.STATE_HOST: 8,
     Key.POINTS_HOST: 8,
     Key.IMU_HOST: 8,
-    0x0012: 24,  # attitude of the installation
+    0x0012: 24,  # installation attitude
     0x0013: 4,  # blind spot
     0x0015: 20,  # first and second field of view
     0x0016: 20,
-    0x0017: 1,  # which of them are valid
-    0x0018: 1,  # mode of detection
-    0x0019: 4,  # pins
+    0x0017: 1,  # enabled fields of view
+    0x0018: 1,  # detection mode
+    0x0019: 4,  # pin configuration
     Key.WORK_MODE: 1,
-    0x001B: 1,  # heating of the window
+    0x001B: 1,  # window heating
     Key.IMU_ENABLED: 1,
 }
 
 
 @dataclass(frozen=True)
 class LivoxState:
-    """What the interface says of a sensor."""
+    """Properties of a sensor that the interface reports."""
 
     device_type: int
     product: str
     serial: str
     command_port: int
-    state_ports: tuple[int, int]  # ports of the sensor, and by default of the host; 0: none
-    points_ports: tuple[int, int]  # ports of the sensor, and of its datagrams
+    state_ports: tuple[int, int]  # port of the sensor, and default port of the host; 0 for none
+    points_ports: tuple[int, int]  # port of the sensor, and port of its datagrams
     imu_ports: tuple[int, int]
     data_type: int
     data_types: tuple[int, ...]
@@ -89,18 +90,18 @@ class LivoxState:
 
 
 class LivoxService(Service):
-    """Answers commands of Livox-SDK2 on a separate thread, and tells the host of the sensor.
+    """Answers commands of Livox-SDK2 on a separate thread, and announces the sensor to the host.
 
     Parameters
     ----------
     address
-        HOST to listen at; the ports are Livox's.
+        HOST to listen on; the ports are those of Livox sensors.
     destination, send_to
-        As of `Service`.
+        As in `Service`.
     state
-        What the interface says.
+        Properties that the interface reports.
     set_data_type
-        Changes the type of the data of later packets.
+        Function that changes the data type of further packets.
     """
 
     def __init__(
@@ -117,15 +118,15 @@ class LivoxService(Service):
         self._set_data_type = set_data_type
         self._values: dict[int, bytes] = self._first_values()
         self._stack = ExitStack()
-        self._sockets: dict[int, socket.socket] = {}  # {port: its socket}
+        self._sockets: dict[int, socket.socket] = {}  # {port: socket}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="Livox's commands", daemon=True)
-        self._pushed = 0  # state messages so far
+        self._pushed = 0  # number of state messages sent
         self._started_ns = time.monotonic_ns()
 
     @property
     def description(self) -> str:
-        """The address of the sensor."""
+        """Address of the sensor and of its host."""
         return f"Livox commands at {self.host} for the host {self.destination.host}"
 
     def __enter__(self) -> Self:
@@ -143,9 +144,9 @@ class LivoxService(Service):
         self._stack.close()
 
     def _bound(self, port: int) -> socket.socket:
-        """Return a socket at a port of the sensor.
+        """Return a socket bound to a port of the sensor.
 
-        Raises LidarError if the port cannot be had.
+        Raises LidarError if the port cannot be used.
         """
         if ":" in self.host:
             raise LidarError(
@@ -168,7 +169,7 @@ class LivoxService(Service):
     # -- the thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        """Answer requests, and tell the host of the sensor each second, until the end."""
+        """Answer requests, and announce the sensor every second, until the service stops."""
         announce_s = time.monotonic()
         requests = 0
         with selectors.DefaultSelector() as selector:
@@ -188,8 +189,8 @@ class LivoxService(Service):
                     self._serve(key.fileobj)
 
     def _serve(self, opened: socket.socket) -> None:
-        """Answer the next request of a socket, and ignore other datagrams."""
-        with suppress(OSError):  # such as of a host that has gone
+        """Answer the next request on a socket, and ignore other datagrams."""
+        with suppress(OSError):  # for example if the host has disappeared
             content, peer = opened.recvfrom(MAX_FRAME_BYTES + 1)
             request = parse_request(content)
             if request is not None:
@@ -197,7 +198,7 @@ class LivoxService(Service):
                 opened.sendto(answer_frame(request.command, request.number, data), peer)
 
     def _announce(self) -> None:
-        """Tell the host that the sensor is there, and its state."""
+        """Send the host an announcement and the state of the sensor."""
         announcement = answer_frame(Command.SEARCH, 0, self._search_answer())
         with suppress(OSError):
             self._sockets[SEARCH_PORT].sendto(announcement, (self.destination.host, SEARCH_PORT))
@@ -213,8 +214,8 @@ class LivoxService(Service):
 
     # -- answers ---------------------------------------------------------------------------------
 
-    def answer(self, request: Frame) -> bytes:
-        """Return the data of the answer to a request."""
+    def answer(self, request: CommandFrame) -> bytes:
+        """Return the data of the response to a request."""
         if request.command == Command.SEARCH:
             return self._search_answer()
         if request.command == Command.GET:
@@ -234,22 +235,22 @@ class LivoxService(Service):
         )
 
     def _get(self, data: bytes) -> bytes:
-        """Return the parameters of a request to get, except parameters that the sensor lacks."""
+        """Return the parameters that a get request asks for, skipping unknown parameters."""
         try:
             keys = parse_keys(data)
-        except RefusedError as error:
+        except CommandRefusedError as error:
             return _GET_ANSWER.pack(error.code, 0)
         parameters = self._all_values()
         values = {key: parameters[key] for key in keys if key in parameters}
         return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
 
     def _set(self, data: bytes) -> bytes:
-        """Set all parameters of a request, or none if a value is wrong, and return the answer."""
+        """Set all parameters of a request, or none if any value is invalid; return the response."""
         try:
             values = parse_values(data)
             for key, value in values.items():
                 self._check(key, value)
-        except RefusedError as error:
+        except CommandRefusedError as error:
             return _SET_ANSWER.pack(error.code, error.key)
         self._values |= values
         if Key.DATA_TYPE in values:
@@ -259,20 +260,20 @@ class LivoxService(Service):
         return _SET_ANSWER.pack(Code.SUCCESS, 0)
 
     def _check(self, key: int, value: bytes) -> None:
-        """Raise RefusedError unless a parameter can be set to a value."""
+        """Raise CommandRefusedError if a parameter cannot be set to the given value."""
         if key not in _LENGTHS:
             is_known = key in self._all_values()
-            raise RefusedError(Code.READ_ONLY if is_known else Code.NOT_SUPPORTED, key)
+            raise CommandRefusedError(Code.READ_ONLY if is_known else Code.NOT_SUPPORTED, key)
         if len(value) != _LENGTHS[key]:
-            raise RefusedError(Code.INVALID_LENGTH, key)
+            raise CommandRefusedError(Code.INVALID_LENGTH, key)
         if key in (Key.STATE_HOST, Key.POINTS_HOST, Key.IMU_HOST):
             _check_host(key, value)
         allowed = {Key.DATA_TYPE: self._state.data_types, Key.WORK_MODE: _WORK_MODES}
         if key in allowed and value[0] not in allowed[Key(key)]:
-            raise RefusedError(Code.OUT_OF_RANGE, key)
+            raise CommandRefusedError(Code.OUT_OF_RANGE, key)
 
     def _redirect(self) -> None:
-        """Send the datagrams to the host of the points, as the parameters say."""
+        """Send the datagrams to the host that the parameters specify for points."""
         address, points_port, _ = _HOST.unpack(self._values[Key.POINTS_HOST])
         _, imu_port, _ = _HOST.unpack(self._values[Key.IMU_HOST])
         if not self._values[Key.IMU_ENABLED][0]:
@@ -286,7 +287,7 @@ class LivoxService(Service):
     # -- parameters ------------------------------------------------------------------------------
 
     def _first_values(self) -> dict[int, bytes]:
-        """Return the parameters that can be set, with their values at the sensor's start."""
+        """Return the parameters that can be set, with their initial values."""
         state = self._state
         values = {key: bytes(length) for key, length in _LENGTHS.items()}
         values[Key.DATA_TYPE] = bytes([state.data_type])
@@ -302,7 +303,7 @@ class LivoxService(Service):
         return values
 
     def _all_values(self) -> dict[int, bytes]:
-        """Return all parameters, also read-only parameters."""
+        """Return all parameters, including read-only parameters."""
         state = self._state
         work_mode = self._values[Key.WORK_MODE]
         local_ns = time.monotonic_ns() - self._started_ns
@@ -315,7 +316,7 @@ class LivoxService(Service):
             Key.HARDWARE: _VERSION,
             Key.MAC: bytes.fromhex("020000000001"),
             Key.WORK_STATE: work_mode,
-            Key.CORE_TEMPERATURE: (4000).to_bytes(4, "little"),  # 0.01 degrees Celsius
+            Key.CORE_TEMPERATURE: (4000).to_bytes(4, "little"),  # in 0.01 °C
             Key.POWER_UPS: (1).to_bytes(4, "little"),
             Key.LOCAL_TIME: local_ns.to_bytes(8, "little"),
             Key.LAST_SYNCHRONIZED: bytes(8),
@@ -328,10 +329,10 @@ class LivoxService(Service):
 
 
 def _check_host(key: int, value: bytes) -> None:
-    """Raise RefusedError unless a value is the address of a single receiver."""
+    """Raise CommandRefusedError unless a value is the address of a single receiver."""
     try:
         address = IPv4Address(value[:4])
     except AddressValueError as error:
-        raise RefusedError(Code.OUT_OF_RANGE, key) from error
+        raise CommandRefusedError(Code.OUT_OF_RANGE, key) from error
     if not is_single_receiver(address):
-        raise RefusedError(Code.OUT_OF_RANGE, key)
+        raise CommandRefusedError(Code.OUT_OF_RANGE, key)

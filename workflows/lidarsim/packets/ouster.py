@@ -1,7 +1,7 @@
-"""Packets of Ouster sensors: lidar and IMU packets, and the metadata beside them.
+"""Ouster packets: lidar packets, IMU packets, and the metadata that readers need.
 
-Sources: firmware user manual, «Lidar Packet Format» and «IMU Data Format»; ouster-sdk 1.0.1,
-parsing.cpp, packet.cpp, xyzlut.cpp and metadata.cpp; recordings that come with ouster-sdk.
+Sources: firmware user manual, sections "Lidar Packet Format" and "IMU Data Format"; parsing.cpp,
+packet.cpp, xyzlut.cpp and metadata.cpp in ouster-sdk 1.0.1; sample recordings of ouster-sdk.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from ..base.elementary import sin_cos
 from ..base.errors import LidarError
 from ..base.extras import reading
 from ..base.input_files import input_size
-from ..base.vectors import applied, inverse, matmul
+from ..base.vectors import inverse, matmul, matvec
 from ..motion.rotations import matrices
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from .capture import ENDINGS, Capture
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
-from .imu_samples import ImuBatch, ImuSamples
+from .imu_samples import ImuBatch, PacketImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
 from .pcap import write_datagrams
 from .service import Destination, Service
@@ -43,10 +43,10 @@ IMU_PORT = 7503
 COLUMNS_PER_PACKET = 16
 _COLUMNS = (512, 1024, 2048, 4096)  # columns per revolution
 _ENCODER_TICKS = 90_112  # ticks per revolution
-_LIDAR_PACKET = 1  # type of packet
-_INITIALIZATION_ID = 1  # number of the sensor's start; the same in packets and metadata
-_STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
-# Settings of the sensor that do not change its packets, as a sensor leaves the factory.
+_LIDAR_PACKET = 1  # packet type
+_INITIALIZATION_ID = 1  # number of the sensor's start, which is the same in packets and metadata
+_STANDARD_GRAVITY = 9.80665  # m/s², the unit of accelerations
+# Factory settings of the sensor that do not affect its packets.
 _UNUSED_CONFIGURATION = {
     "azimuth_window": [0, 360_000],
     "multipurpose_io_mode": "OFF",
@@ -64,9 +64,9 @@ _UNUSED_CONFIGURATION = {
     "sync_pulse_out_polarity": "ACTIVE_HIGH",
     "sync_pulse_out_pulse_width": 10,
 }
-# {whether the survey has a start: timestamp_mode of the metadata}
+# {whether the survey has a start time: timestamp_mode in the metadata}
 _CLOCKS = {True: "TIME_FROM_PTP_1588", False: "TIME_FROM_INTERNAL_OSC"}
-# {mode of returns: return_order of the metadata}
+# {return mode: return_order in the metadata}
 _RETURN_ORDERS = {
     "strongest": "STRONGEST_TO_WEAKEST",
     "first": "NEAREST_TO_FARTHEST",
@@ -77,17 +77,17 @@ _RETURN_ORDERS = {
 
 @dataclass(frozen=True)
 class Profile:
-    """A layout of lidar packets, by its name in the metadata (`udp_profile_lidar`)."""
+    """A layout of lidar packets, with its name in the metadata (`udp_profile_lidar`)."""
 
     name: str
-    layout: int  # layout of pixels (`ouster_loops`)
-    pixel_words: int  # words of 32 bits
+    layout: int  # pixel layout (`ouster_loops`)
+    pixel_words: int  # number of 32-bit words
     range_bits: int
     unit_mm: int = 1
 
     @property
     def is_legacy(self) -> bool:
-        """Whether packets have the layout of the first firmware, without header and checksum."""
+        """Whether packets have the original layout, without header and checksum."""
         return self.name == "LEGACY"
 
 
@@ -103,35 +103,35 @@ PROFILES = {
 
 
 class RangeUnits(NamedTuple):
-    """Units of ranges in packets, which count from the sensor's axis."""
+    """Units of ranges in packets, which are measured from the sensor's axis."""
 
-    offset_mm: float  # distance from the axis to the start of the beams
+    offset_mm: float  # distance from the axis to the origin of the beams
     unit_mm: float
-    max_number: float  # longest range, in units
+    max_number: float  # largest range, in units
 
 
 class ReturnImages(NamedTuple):
-    """Returns of n columns of c beams: arrays (r, n, c) of up to r returns, the nearest first."""
+    """Returns of n columns of c beams, as arrays (r, n, c) of up to r returns, nearest first."""
 
-    range_m: AnyFloats  # range from the beam's start; 0 or NaN without a return
+    range_m: AnyFloats  # range from the beam origin; 0 or NaN without a return
     reflectivity: Bytes
     signal: NDArray[np.uint16]
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurementBlocks:
-    """Columns as a sensor measures them: n, a whole number of packets, the highest beam first."""
+    """Columns as a sensor measures them: n columns in complete packets, highest beam first."""
 
     frames: Ints  # (n,): number of the revolution
-    measurement_ids: Ints  # (n,): column of the revolution
-    times_ns: Ints  # (n,): by the sensor's clock, since 1970
+    measurement_ids: Ints  # (n,): column in the revolution
+    times_ns: Ints  # (n,): on the sensor's clock, since 1970
     valid: Bools  # (n,): whether the column was fired and reaches the receiver
     returns: ReturnImages
 
 
 @cache
 def lidar_packet(profile: Profile, beams: int) -> np.dtype[np.void]:
-    """Return the type of a lidar packet."""
+    """Return the dtype of a lidar packet."""
     pixels = ("pixels", "<u4", (beams, profile.pixel_words))
     if profile.is_legacy:
         column = np.dtype(
@@ -154,7 +154,7 @@ def lidar_packet(profile: Profile, beams: int) -> np.dtype[np.void]:
             ("serial_number", "u1", (5,)),
             ("alert_flags", "u1"),  # 0: no alert
             ("reserved", "u1", (3,)),
-            ("countdowns", "u1", (2,)),  # until thermal shutdown and shot limiting, s; 0: none
+            ("countdowns", "u1", (2,)),  # seconds to thermal shutdown and shot limiting; 0: none
             ("states", "u1", (2,)),  # states of thermal shutdown and shot limiting; 0: normal
             ("reserved_of_header", "u1", (12,)),
             ("columns", column, (COLUMNS_PER_PACKET,)),
@@ -169,18 +169,19 @@ _LEGACY_BYTES = tuple(
 )
 _HEADER_AND_FOOTER_BYTES = 64
 _SDK_LINKS = (0, 1, 101, 113)  # link types that ouster-sdk 1.0 reads
-_MIN_COLUMNS_BYTES = 16 * (12 + 16 * 4)  # of 16 beams with a word each
+_MIN_COLUMNS_BYTES = 16 * (12 + 16 * 4)  # for 16 beams with one word each
 
 
 def lidar_packets(
     blocks: MeasurementBlocks, profile: Profile, offset_mm: float, columns: int, serial_number: int
 ) -> Bytes:
-    """Return lidar packets, each with 16 measurement blocks: (n / 16, size).
+    """Return lidar packets as bytes, each with 16 measurement blocks.
 
-    Blocks that are not valid are zeros, except for their numbers. `offset_mm` is the distance from
-    the sensor's axis to the start of its beams; a revolution has `columns`.
+    Blocks that are not valid contain zeros, except for their numbers. `offset_mm` is the distance
+    from the sensor's axis to the origin of its beams, and `columns` the number of columns per
+    revolution.
     """
-    from . import ouster_loops  # not before: numba takes half a second to import
+    from . import ouster_loops  # imported here because numba takes half a second to import
 
     channels = blocks.returns.range_m.shape[2]
     packets = np.zeros(len(blocks.frames) // COLUMNS_PER_PACKET, lidar_packet(profile, channels))
@@ -212,7 +213,7 @@ def lidar_packets(
 
 
 def _little_endian(number: int, size: int) -> Bytes:
-    """Return a number as bytes (size,), the lowest first."""
+    """Return a number as bytes, least significant byte first."""
     return np.frombuffer(number.to_bytes(size, "little"), np.uint8)
 
 
@@ -221,23 +222,23 @@ _IMU_PACKET = np.dtype(
         ("system_ns", "<u8"),
         ("accelerometer_ns", "<u8"),
         ("gyroscope_ns", "<u8"),
-        ("acceleration", "<f4", (3,)),  # multiple of standard gravity
-        ("angular_velocity", "<f4", (3,)),  # degrees a second
+        ("acceleration", "<f4", (3,)),  # in units of standard gravity
+        ("angular_velocity", "<f4", (3,)),  # degrees per second
     ]
 )
 
 
 def imu_packets(times_ns: Ints, rates: Floats, forces: Floats) -> Bytes:
-    """Return a packet for each sample of an IMU: (n, 48).
+    """Return a 48-byte packet for each IMU sample.
 
     Parameters
     ----------
     times_ns
-        (n,): by the sensor's clock, since 1970.
+        (n,): times on the sensor's clock, in nanoseconds since 1970.
     rates
-        (n, 3): angular velocities, rad/s.
+        (n, 3): angular velocities in rad/s.
     forces
-        (n, 3): specific forces, m/s².
+        (n, 3): specific forces in m/s².
     """
     packets = np.zeros(len(times_ns), _IMU_PACKET)
     for name in ("system_ns", "accelerometer_ns", "gyroscope_ns"):
@@ -248,13 +249,13 @@ def imu_packets(times_ns: Ints, rates: Floats, forces: Floats) -> Bytes:
 
 
 class OusterEncoder(PacketEncoder):
-    """Lidar packets of 16 columns, and IMU packets where the carrier has an IMU.
+    """Encodes lidar packets of 16 columns, and IMU packets if the platform has an IMU.
 
-    The identifier `profile` selects the layout of lidar packets: by default RNG19_RFL8_SIG16_NIR16,
-    with `_DUAL` for the mode two_strongest. Reflectivity and signal are columns of the cloud; near
-    infrared, which the simulator does not measure, is 0, as are all values of a ray without a
-    return, or beyond the longest range of the profile. A packet without any column that reaches the
-    receiver is not sent.
+    The identifier `profile` selects the layout of lidar packets. The default is
+    RNG19_RFL8_SIG16_NIR16, with the suffix `_DUAL` for the mode two_strongest. Reflectivity and
+    signal come from cloud columns. Near infrared is 0, because the simulator does not compute it.
+    All values are 0 for a ray without a return, or beyond the maximum range of the profile. A
+    packet is not sent if none of its columns reaches the receiver.
     """
 
     columns = ("reflectivity", "signal")
@@ -263,7 +264,7 @@ class OusterEncoder(PacketEncoder):
     address = "192.168.1.200"
     destination = "192.168.1.100"
     default_ports: ClassVar[Mapping[str, int]] = {"lidar": LIDAR_PORT, "imu": IMU_PORT}
-    told_apart = True
+    distinguished_by_receivers = True
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
@@ -276,15 +277,15 @@ class OusterEncoder(PacketEncoder):
         self._origin_mm = 1000 * sensor.beams.origin[0]
         self._columns = int(sensor.head.firings_per_turn)  # type: ignore[attr-defined]
         self._serial_number = 122_000_000_000 + crc32(source.name.encode()) % 1_000_000_000
-        self._rest: Shots | None = None  # shots that fill no packet yet
+        self._rest: Shots | None = None  # shots that do not fill a packet yet
         self._next_firing = 0
-        self._frame_offset = 0  # number of a frame less the number of its revolution
-        self._samples = ImuSamples(source)
+        self._frame_offset = 0  # number of a frame minus the number of its revolution
+        self._samples = PacketImuSamples(source)
 
     def _profile_of_mode(self) -> Profile:
-        """Return the profile that the identifiers or the mode state.
+        """Return the profile that the identifiers or the return mode select.
 
-        Raises LidarError if both differ.
+        Raises LidarError if they are inconsistent.
         """
         mode = self.source.mode
         if mode not in _RETURN_ORDERS:
@@ -305,7 +306,7 @@ class OusterEncoder(PacketEncoder):
         return profile
 
     def _check_sensor(self) -> None:
-        """Raise LidarError unless an Ouster could be the sensor."""
+        """Raise LidarError if the sensor differs from what Ouster packets can represent."""
         sensor = self.source.sensor
         head = sensor.head
         if isinstance(head, Mirror):
@@ -328,7 +329,7 @@ class OusterEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the lidar packets that the shots of a sweep fill, and IMU packets until then."""
+        """Return the lidar packets completed by the shots of a sweep, and IMU packets."""
         if not len(shots):
             return []
         groups = []
@@ -338,7 +339,7 @@ class OusterEncoder(PacketEncoder):
             next_frame = -(-self._next_firing // self._columns) + self._frame_offset
             self._frame_offset = next_frame - first // self._columns
         self._next_firing = int(shots.firings[-1]) + 1
-        joined = shots if self._rest is None else Shots.joined([self._rest, shots])
+        joined = shots if self._rest is None else Shots.concatenate([self._rest, shots])
         count = self._next_firing // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
         count = max(count - int(joined.firings[0]), 0)
         self._rest = joined[count:] if count < len(joined) else None
@@ -346,11 +347,11 @@ class OusterEncoder(PacketEncoder):
         return [*groups, *self._imu(self._samples.during(shots))]
 
     def finish(self) -> list[Datagrams]:
-        """Return the packet of the last columns, and the IMU packets after them."""
+        """Return the packet with the last columns, and the remaining IMU packets."""
         return [*self._rest_of_packets(), *self._imu(self._samples.remaining())]
 
     def files(self) -> Mapping[str, bytes]:
-        """Return the metadata of the sensor as JSON, in the layout of its HTTP interface."""
+        """Return the metadata of the sensor as JSON, in the format of its HTTP API."""
         return {".json": (json.dumps(self.metadata(), indent=1) + "\n").encode()}
 
     def service(
@@ -363,13 +364,13 @@ class OusterEncoder(PacketEncoder):
         return OusterApi(address, destination, send_to, self.metadata(), ports)
 
     def _rest_of_packets(self) -> list[Datagrams]:
-        """Return the packet of columns that wait for further columns, and forget them."""
+        """Return the packet of columns that wait for further columns, and discard them."""
         rest = self._rest
         self._rest = None
         return [] if rest is None else self._lidar(rest)
 
     def _lidar(self, shots: Shots) -> list[Datagrams]:
-        """Return lidar packets of shots, where the first and the last packet may lack columns."""
+        """Return lidar packets of shots. The first and the last packet may lack columns."""
         if not len(shots):
             return []
         blocks = self._blocks(shots)
@@ -384,7 +385,7 @@ class OusterEncoder(PacketEncoder):
         return [datagrams.without(np.asarray(lost.all(axis=1)))]
 
     def _blocks(self, shots: Shots) -> MeasurementBlocks:
-        """Return the measurement blocks of shots, with blocks that are not valid around them."""
+        """Return the measurement blocks of shots, padded with invalid blocks to full packets."""
         first = int(shots.firings[0]) // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
         packets = -(-(int(shots.firings[-1]) + 1 - first) // COLUMNS_PER_PACKET)
         firings = first + np.arange(packets * COLUMNS_PER_PACKET)
@@ -407,17 +408,17 @@ class OusterEncoder(PacketEncoder):
         )
 
     def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
-        """Return a packet for each sample of the IMU, or none for None."""
+        """Return a packet for each IMU sample, or no packets if `batch` is None."""
         if batch is None:
             return []
         payloads = imu_packets(batch.stamps_ns + self.source.start_ns, batch.rates, batch.forces)
         return [Datagrams(payloads, batch.times_ns, self.port("imu", IMU_PORT))]
 
     def metadata(self) -> dict[str, Any]:
-        """Return the metadata of the sensor, in the layout of firmware 3.1."""
+        """Return the metadata of the sensor in the format of firmware 3.1."""
         profile = self._profile.name
         rate_hz = int(self.source.sensor.head.rate_hz)  # type: ignore[attr-defined]
-        # Azimuths are clockwise here; rows are shifted by whole columns to look ahead.
+        # Azimuths are clockwise here; rows are shifted by whole columns to face forward.
         azimuth_deg = -self._azimuth_deg
         shifts = np.rint(azimuth_deg * self._columns / 360).astype(int).tolist()
         beam_pose = np.eye(4)
@@ -477,29 +478,29 @@ class OusterEncoder(PacketEncoder):
         return pose
 
     def _imu_pose(self) -> Floats:
-        """Return the pose (4, 4) of the IMU in the sensor frame, mm, the identity without IMU."""
+        """Return the pose (4, 4) of the IMU in the sensor frame in mm; identity without one."""
         instruments = self.source.instruments
         if instruments is None or instruments.imu is None:
             return np.eye(4)
         imu = instruments.imu
-        on_carrier = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
+        on_platform = affine(matrices(np.array([imu.quaternion]))[0], np.array(imu.position))
         mount = self.source.mount
         to_sensor = inverse(mount[:3, :3])
-        pose = matmul(affine(to_sensor, -applied(to_sensor, mount[:3, 3])), on_carrier)
+        pose = matmul(affine(to_sensor, -matvec(to_sensor, mount[:3, 3])), on_platform)
         pose[:3, 3] *= 1000
         return pose
 
 
 def _rounded(values: Floats) -> list[float]:
-    """Return values without the last digits, which are not exact in radians, as a list."""
+    """Return values as a list, rounded to remove digits that the conversion from radians adds."""
     return [float(value) for value in np.round(values, 9).ravel() + 0.0]
 
 
 class OusterDecoder(PacketDecoder):
-    """Reads the scans of ouster-sdk, with metadata from a .json beside a capture.
+    """Reads scans with ouster-sdk, with the metadata in a .json file beside the capture.
 
-    ouster-sdk reads pcap files with the usual link types. Other captures, which it would find empty
-    or refuse, are rewritten into a temporary folder.
+    ouster-sdk reads pcap files with common link types. Other captures would appear empty or be
+    rejected, so they are rewritten to a temporary folder.
     """
 
     intensity = "reflectivity"
@@ -509,7 +510,7 @@ class OusterDecoder(PacketDecoder):
         with reading(name):
             input_size(path)
         if find_spec("ouster") is None:
-            # ouster-sdk requires old versions of packages that it can do without.
+            # ouster-sdk pins old versions of packages that are not needed here.
             raise LidarError(
                 f"{name} requires ouster-sdk, which is not installed. Run pip install --no-deps "
                 "ouster-sdk."
@@ -524,9 +525,9 @@ class OusterDecoder(PacketDecoder):
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram has the size of a lidar packet and, but for LEGACY, its type.
+        """Return whether a datagram has the size and, unless LEGACY, the type of a lidar packet.
 
-        All profiles fit, also those that are not encoded here.
+        All profiles are recognized, including profiles that cannot be encoded here.
         """
         size = len(payload)
         if size in _LEGACY_BYTES:
@@ -554,7 +555,7 @@ class OusterDecoder(PacketDecoder):
         return float(stamps.min()) if len(stamps) else 0.0
 
     def _readable_file(self, path: Path, metadata: Path) -> Path:
-        """Return the file, or a plain copy of it, which is removed with the decoder."""
+        """Return the file, or the path of a temporary copy in a format that ouster-sdk reads."""
         capture = Capture(path, self.name)
         if path.suffix.lower() not in ENDINGS or capture.is_classic(_SDK_LINKS):
             return path
@@ -571,7 +572,7 @@ class OusterDecoder(PacketDecoder):
         return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
-        """Return the function from a scan to positions (rings, columns, 3) in meters."""
+        """Return the function that converts a scan to positions (rings, columns, 3) in meters."""
         if sensor not in self._tables:
             core = import_module("ouster.sdk.core")
             self._tables[sensor] = core.XYZLut(self._infos[sensor], False)

@@ -1,8 +1,8 @@
-"""The configuration interface of a live Ouster sensor: HTTP as of firmware 3.0 and 3.1.
+"""Configuration interface of a live Ouster sensor: the HTTP API of firmware 3.0 and 3.1.
 
-Source: ouster-sdk 1.0.1, sensor_http_imp.cpp, client.cpp and sensor_packet_source.cpp; the
-firmware's documentation of its HTTP API. What can be set is where the packets go, and whether
-they are sent; the simulated sensor does not change otherwise.
+Sources: sensor_http_imp.cpp, client.cpp and sensor_packet_source.cpp in ouster-sdk 1.0.1; the HTTP
+API documentation of the firmware. Clients can only set where packets are sent and whether they are
+sent; other properties of the simulated sensor cannot be changed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,14 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs
 
-from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
+from .http_service import (
+    Answer,
+    HttpService,
+    Request,
+    RequestRefusedError,
+    receiver_of,
+    receiver_port,
+)
 from .service import Destination
 
 _ROOT = "/api/v1/"
@@ -24,16 +31,16 @@ _MODES = ("NORMAL", "STANDBY")
 
 
 class OusterApi(HttpService):
-    """Answers ouster-sdk, ouster-cli and the drivers of ROS.
+    """Answers ouster-sdk, ouster-cli and ROS drivers.
 
     Parameters
     ----------
     address, destination, send_to
-        As of `HttpService`.
+        As in `HttpService`.
     metadata
-        As of `OusterEncoder.metadata`.
+        Result of `OusterEncoder.metadata`.
     ports
-        Ports of the datagrams of the lidar and the IMU.
+        Ports of the lidar and IMU datagrams.
     """
 
     name = "Ouster's HTTP API"
@@ -60,13 +67,13 @@ class OusterApi(HttpService):
         self._user_data = ""
 
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request.
+        """Return the response to a request.
 
-        Raises RefusedError for what the sensor does not have.
+        Raises RequestRefusedError if the sensor does not provide the requested resource.
         """
         path = request.path.rstrip("/")
         if not path.startswith(_ROOT):
-            raise RefusedError("the interface is at /api/v1", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError("the interface is at /api/v1", HTTPStatus.NOT_FOUND)
         resource = path.removeprefix(_ROOT)
         if resource == "sensor/config":
             return self._config(request)
@@ -75,17 +82,19 @@ class OusterApi(HttpService):
         if resource.startswith("sensor/cmd/"):
             return self._command(resource.removeprefix("sensor/cmd/"), request)
         if request.method not in ("GET", "HEAD"):
-            raise RefusedError(f"{resource} cannot be changed", HTTPStatus.METHOD_NOT_ALLOWED)
+            raise RequestRefusedError(
+                f"{resource} cannot be changed", HTTPStatus.METHOD_NOT_ALLOWED
+            )
         return Answer(self._document(resource))
 
     def changes_state(self, method: str, path: str) -> bool:
-        """Return True if a request may change what the sensor does, as most commands by GET do."""
+        """Return whether a request may change the state, as most commands do even with GET."""
         command = path.rstrip("/").removeprefix(f"{_ROOT}sensor/cmd/")
         is_command = command != path.rstrip("/") and command != "get_config_param"
         return is_command or super().changes_state(method, path)
 
     def _document(self, resource: str) -> Any:
-        """Return a document that clients read."""
+        """Return a document that clients can read."""
         whole = {**self._metadata, "config_params": self._active}
         sensor = whole["sensor_info"]
         if resource == "sensor/metadata":
@@ -97,7 +106,7 @@ class OusterApi(HttpService):
         documents: dict[str, Any] = {
             "system/firmware": {"fw": sensor["image_rev"], "commit_pending": False},
             "system/network": {
-                "carrier": True,
+                "platform": True,
                 "duplex": "full",
                 "ethaddr": "02:00:00:00:00:01",
                 "hostname": f"os-{sensor['prod_sn']}",
@@ -111,7 +120,7 @@ class OusterApi(HttpService):
             "sensor/alerts": {"active": [], "log": []},
         }
         if resource not in documents:
-            raise RefusedError(f"there is no {resource}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no {resource}", HTTPStatus.NOT_FOUND)
         return documents[resource]
 
     def _user(self, request: Request) -> Answer:
@@ -119,7 +128,7 @@ class OusterApi(HttpService):
         if request.method == "PUT":
             text = _json(request.body)
             if not isinstance(text, str):
-                raise RefusedError("user data must be text")
+                raise RequestRefusedError("user data must be text")
             self._user_data = text
             return Answer(status=HTTPStatus.NO_CONTENT)
         if request.method == "DELETE":
@@ -130,26 +139,28 @@ class OusterApi(HttpService):
         return Answer(self._user_data)
 
     def _config(self, request: Request) -> Answer:
-        """Return or change the configuration, as of firmware 3.1."""
+        """Return or change the configuration, as in firmware 3.1."""
         options = {name: values[-1].lower() for name, values in parse_qs(request.query).items()}
         if request.method in ("GET", "HEAD"):
             return Answer(self._staged if options.get("staging") == "true" else self._active)
         if request.method == "DELETE":
-            raise RefusedError("the configuration cannot be deleted", HTTPStatus.METHOD_NOT_ALLOWED)
+            raise RequestRefusedError(
+                "the configuration cannot be deleted", HTTPStatus.METHOD_NOT_ALLOWED
+            )
         self._stage(_json(request.body) if request.body else {}, request.peer)
         if options.get("reinit", "true") == "true":
             self._apply()
         return Answer(status=HTTPStatus.NO_CONTENT)
 
     def _command(self, command: str, request: Request) -> Answer:
-        """Carry out a command, as of firmware 3.0 and before."""
+        """Execute a command, as in firmware 3.0 and earlier."""
         arguments = parse_qs(request.query).get("args", [""])[-1]
         if command == "get_config_param":
             if arguments not in ("active", "staged"):
-                raise RefusedError("args must be active or staged")
+                raise RequestRefusedError("args must be active or staged")
             return Answer(self._active if arguments == "active" else self._staged)
         if command == "set_config_param":
-            name, _, value = arguments.partition(" ")  # parse_qs has read + as a space
+            name, _, value = arguments.partition(" ")  # parse_qs decodes + as a space
             values = _json(value.encode()) if value.startswith(("{", '"')) else _loose(value)
             self._stage(values if name == "." else {name: values}, request.peer)
             return Answer("set_config_param")
@@ -158,16 +169,16 @@ class OusterApi(HttpService):
         elif command == "reinitialize":
             self._apply()
         elif command != "save_config_params":
-            raise RefusedError(f"there is no command {command}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no command {command}", HTTPStatus.NOT_FOUND)
         return Answer({})
 
     def _stage(self, values: Any, peer: str) -> None:
         """Change the staged configuration.
 
-        Raises RefusedError for what cannot be set.
+        Raises RequestRefusedError if a parameter cannot be set.
         """
         if not isinstance(values, dict):
-            raise RefusedError("the body must be a JSON object of parameters")
+            raise RequestRefusedError("the body must be a JSON object of parameters")
         staged = dict(self._staged)
         for name, value in values.items():
             if name == "udp_dest":
@@ -177,15 +188,15 @@ class OusterApi(HttpService):
             elif name == "operating_mode" and value in _MODES:
                 staged[name] = value
             elif name not in staged:
-                raise RefusedError(f"there is no parameter {name}")
+                raise RequestRefusedError(f"there is no parameter {name}")
             elif value != staged[name]:
-                raise RefusedError(
+                raise RequestRefusedError(
                     f"{name} is {staged[name]} in this simulated sensor. Set it in the scenario"
                 )
         self._staged = staged
 
     def _apply(self) -> None:
-        """Let the staged configuration be active: packets go where it says."""
+        """Activate the staged configuration, and send packets where it specifies."""
         self._active = self._staged
         numbers = [self._active[name] for name in _PORTS]
         if self._active["operating_mode"] == "STANDBY":
@@ -196,18 +207,15 @@ class OusterApi(HttpService):
 
 
 def _json(body: bytes) -> Any:
-    """Return the data of JSON.
-
-    Raises RefusedError for other bytes.
-    """
+    """Parse JSON, or raise RequestRefusedError if it is invalid."""
     try:
         return json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise RefusedError("the body is not valid JSON") from error
+        raise RequestRefusedError("the body is not valid JSON") from error
 
 
 def _loose(value: str) -> Any:
-    """Return the value of an argument: a number, true, false, or text without quotes."""
+    """Parse an argument as a number, true or false, or return it as text."""
     try:
         return json.loads(value)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Loops over pixels and checksums of Ouster's packets: see ouster.py."""
+"""Compiled loops over pixels and checksums of Ouster packets, see ouster.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -12,25 +12,26 @@ from raybeam.compiled import compiled
 
 from ..base.arrays import UInts64
 
-# Layouts of a pixel, in words of 32 bits, the lowest bits first; sizes in bits are in brackets.
+# Layouts of a pixel in 32-bit words, lowest bits first; sizes in bits are in brackets.
 SINGLE, DUAL, LOW_RATE = range(3)
-# SINGLE    range [to 20] | reflectivity [8], 8 unused, signal [16] | near infrared [16]
-# DUAL      range [19], reflectivity [8 from 24] | the same of the second return
+# SINGLE    range [up to 20] | reflectivity [8], 8 unused, signal [16] | near infrared [16]
+# DUAL      range [19], reflectivity [8 from 24] | the same for the second return
 #           | signal [16], signal of the second return [16] | near infrared [16]
 # LOW_RATE  range [15], reflectivity [8 from 16], near infrared [8]
 
-_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # polynomial of ECMA-182, the lowest bit first
+_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # ECMA-182 polynomial, lowest bit first
 _ALL_BITS = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 _BYTE = np.uint64(255)
 
 
 @compiled()
 def write_pixels(returns, valid, layout, units, pixels):
-    """Write the returns of columns to `pixels` (packets, 16, c, words), uint32, which are zeros.
+    """Write the returns of columns to `pixels`.
 
-    `returns` are `ReturnImages`, `units` is a `RangeUnits`; only `valid` columns (packets, 16) are
-    written. Of two returns, the one with the stronger signal is first, the nearer if signals are
-    equal.
+    `pixels` (packets, 16, c, words) is a uint32 array that the caller has filled with zeros.
+    `returns` is a `ReturnImages`, and `units` a `RangeUnits`. Only `valid` columns (packets, 16)
+    are written. If there are two returns, the one with the stronger signal is first, or the nearer
+    one if the signals are equal.
     """
     range_m = returns.range_m
     planes, count, channels = range_m.shape
@@ -49,7 +50,7 @@ def write_pixels(returns, valid, layout, units, pixels):
                 plane = first ^ k
                 meters = range_m[plane, n, c]
                 number = np.rint((meters * 1000.0 + units.offset_mm) / units.unit_mm)
-                if not (meters > 0 and number <= units.max_number):  # no return is 0 or NaN
+                if not (meters > 0 and number <= units.max_number):  # also False for NaN
                     continue
                 distance = np.uint32(number)
                 reflectivity = np.uint32(returns.reflectivity[plane, n, c])
@@ -67,7 +68,7 @@ def write_pixels(returns, valid, layout, units, pixels):
 
 @cache
 def remainders() -> UInts64:
-    """Return the remainders of a byte that 0 to 7 bytes of zeros follow: (8, 256)."""
+    """Return the CRC remainders (8, 256) of a byte followed by 0 to 7 zero bytes."""
     tables = np.zeros((8, 256), np.uint64)
     remainder = np.arange(256, dtype=np.uint64)
     for _ in range(8):
@@ -82,10 +83,10 @@ def remainders() -> UInts64:
 
 @compiled()
 def checksums(words, tables, sums):
-    """Write CRC-64 (ECMA-182) of packets `words` (n, k), uint64, little endian, to `sums` (n,).
+    """Write the CRC-64 (ECMA-182) of each packet in `words` (n, k) to `sums` (n,).
 
-    Eight bytes at a time («slicing by eight», Kounavis and Berry 2005), with the `tables` of
-    `remainders`.
+    `words` are little-endian uint64. Eight bytes are processed at a time ("slicing by eight",
+    Kounavis and Berry 2005) with the `tables` from `remainders`.
     """
     for row in range(words.shape[0]):
         crc = _ALL_BITS

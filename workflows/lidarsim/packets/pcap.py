@@ -1,4 +1,4 @@
-"""Writes datagrams as pcap files: Ethernet, IPv4 and UDP, stamps in microseconds."""
+"""Write datagrams as pcap files with Ethernet, IPv4 and UDP headers and times in microseconds."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from ..base.arrays import Bytes, Indices, Ints
 from .capture import CapturedDatagram
 from .encoders import Datagrams
 
-# Magic number of little-endian files with microseconds, version 2.4, longest frame, Ethernet.
+# Little-endian magic number for microseconds, version 2.4, maximum frame size, Ethernet.
 _FILE_HEADER = pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1)
-_RECORD_BYTES = 16  # header of a frame in the file
+_RECORD_BYTES = 16  # size of a frame's header in the file
 _IP_OFFSET = _RECORD_BYTES + 14  # Ethernet header
 _UDP_OFFSET = _IP_OFFSET + 20
 _PAYLOAD_OFFSET = _UDP_OFFSET + 8
 _TIME_TO_LIVE = 64
 _UDP = 17
 _IPV4_BROADCAST = "255.255.255.255"
-# Locally administered, as no maker's device has sent the frames.
+# Locally administered addresses, because the frames do not come from a real device.
 _SOURCE_MAC = bytes.fromhex("020000000001")
 _DESTINATION_MAC = bytes.fromhex("020000000002")
 _BROADCAST_MAC = b"\xff" * 6
 
 
 class PcapWriter:
-    """Writes frames of datagrams into a binary file, in the order of their times in each call.
+    """Writes frames of datagrams to a binary file, sorted by time within each call.
 
-    `address` is the sensor's, `destination` the receiver's. `start_ns` is the time 0 of the
-    datagrams, nanoseconds since 1970. Equal datagrams give equal bytes.
+    `address` is the address of the sensor, and `destination` the address of the receiver.
+    `start_ns` is time 0 of the datagrams, in nanoseconds since 1970. The output depends only on the
+    arguments.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class PcapWriter:
         file.write(_FILE_HEADER)
 
     def write(self, groups: Sequence[Datagrams]) -> None:
-        """Write the datagrams of all groups in the order of their times.
+        """Write the datagrams of all groups, sorted by time.
 
         Raises OSError on failure.
         """
@@ -67,7 +68,7 @@ class PcapWriter:
         self._file.write(content.data)
 
     def _frames(self, group: Datagrams) -> Bytes:
-        """Return the frames of datagrams with their headers in the file: (n, bytes)."""
+        """Return the frames of datagrams including their file headers, as an array (n, bytes)."""
         count, size = group.payloads.shape
         frames = np.zeros((count, _PAYLOAD_OFFSET + size), np.uint8)
         frames[:, _PAYLOAD_OFFSET:] = group.payloads
@@ -82,29 +83,29 @@ class PcapWriter:
         return frames
 
     def _ip_header(self, size: int) -> bytes:
-        """Return the IPv4 header of a datagram of `size` bytes, which is not fragmented."""
+        """Return the IPv4 header of an unfragmented datagram of `size` bytes."""
         head = pack(">BBHHHBB", 0x45, 0, 28 + size, 0, 0x4000, _TIME_TO_LIVE, _UDP)
         words = np.frombuffer(head + self._addresses, ">u2").astype(np.int64)
         checksum = int(_complement(words.sum(keepdims=True))[0])
         return head + pack(">H", checksum) + self._addresses
 
     def _udp_header(self, group: Datagrams, size: int) -> bytes:
-        """Return the UDP header of a datagram, without its checksum."""
+        """Return the UDP header of a datagram without its checksum."""
         return pack(">HHHH", group.source_port or group.port, group.port, 8 + size, 0)
 
     def _udp_checksums(self, segments: Bytes) -> Bytes:
-        """Return the checksums of UDP segments (n, bytes), as big-endian bytes (n, 2)."""
+        """Return the checksums of UDP segments (n, bytes) as big-endian bytes (n, 2)."""
         count, size = segments.shape
         padded = np.pad(segments, ((0, 0), (0, size % 2)))
         words = padded.view(">u2").sum(axis=1, dtype=np.int64)
         pseudo_header = np.frombuffer(self._addresses + pack(">HH", _UDP, size), ">u2")
         checksums = _complement(words + pseudo_header.sum(dtype=np.int64))
-        checksums[checksums == 0] = 0xFFFF  # 0 means that there is no checksum
+        checksums[checksums == 0] = 0xFFFF  # 0 would mean that there is no checksum
         return checksums.astype(">u2").view(np.uint8).reshape(count, 2)
 
 
 def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> None:
-    """Write captured datagrams as a plain pcap file, without checksums, to all receivers.
+    """Write captured datagrams as a plain pcap file, broadcast and without checksums.
 
     Raises OSError on failure.
     """
@@ -120,7 +121,7 @@ def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> No
 
 
 def _complement(sums: Ints | Indices) -> Ints:
-    """Return the checksums of sums (n,) of 16-bit words: their ones' complement (RFC 1071)."""
+    """Return the ones' complement checksums (RFC 1071) of sums (n,) of 16-bit words."""
     folded = np.asarray(sums, np.int64)
     for _ in range(3):
         folded = (folded & 0xFFFF) + (folded >> 16)

@@ -1,8 +1,8 @@
-"""Packets of RoboSense: RS-LiDAR-16 and RS-Helios, measurements (MSOP) and device data (DIFOP).
+"""RoboSense packets: measurements (MSOP) and device data (DIFOP) of RS-LiDAR-16 and RS-Helios.
 
 Sources: user manuals of the RS-LiDAR-16 and the RS-Helios-5515 (packets, return modes, appendix on
-times); rs_driver 1.5.19, decoder_RS16.hpp, decoder_RSHELIOS.hpp, chan_angles.hpp and
-basic_attr.hpp. All numbers are big-endian, except for temperatures.
+times); decoder_RS16.hpp, decoder_RSHELIOS.hpp, chan_angles.hpp and basic_attr.hpp in rs_driver
+1.5.19. All numbers are big-endian, except for temperatures.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ DIFOP_INTERVAL_NS = 100_000_000
 _BLOCKS = 12  # blocks per packet
 _BLOCK_LASERS = 32
 _BLOCK_FLAG = 0xFFEE
-_AZIMUTHS = 36_000  # azimuths in a revolution
+_AZIMUTHS = 36_000  # azimuth units per revolution
 _MAX_UNITS = 65_535
 _MSOP_TAIL = 0x00FF
 _DIFOP_TAIL = 0x0FF0
 _DIFOP_ID = bytes.fromhex("a5ff005a11115555")
-_HELIOS_PROTOCOL = 1  # the latest version
-# Of the sensor, which the simulator does not model: 40 °C in units of 1/16 °C. The two bytes have
-# the lower 5 bits in bits 3 to 7 of the first byte, the higher 7 bits in the second.
+_HELIOS_PROTOCOL = 1  # latest version
+# Temperature of the sensor, which the simulator does not model: 40 °C in units of 1/16 °C. The
+# lower 5 bits are bits 3 to 7 of the first byte, and the higher 7 bits are in the second byte.
 _TEMPERATURE = (40 * 16 % 32 << 3, 40 * 16 // 32)
 _MAC = bytes.fromhex("020000000001")
-_PTP = 2  # source of the time
+_PTP = 2  # time source
 _SYNCHRONIZED = 1
 _FIRST_YEAR = 2000  # year 0 of dates
 _LAST_YEAR = 2255
@@ -53,7 +53,7 @@ _SIGNED_ANGLE = [("negative", "u1"), ("centidegrees", ">u2")]
 
 
 def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return a type of `size` bytes with fields {name: (offset, type)}, otherwise 0."""
+    """Return a dtype of `size` bytes with fields {name: (offset, dtype)}."""
     offsets, formats = zip(*fields.values(), strict=True)
     return np.dtype(
         {"names": list(fields), "offsets": offsets, "formats": formats, "itemsize": size}
@@ -61,7 +61,7 @@ def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[
 
 
 def _msop_packet(time: DTypeLike, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return the type of a packet of measurements, with fields of the model's header."""
+    """Return the dtype of a measurement packet, with the given fields in its header."""
     return _placed(1248, {
         **fields,
         "time": (20, time),
@@ -72,7 +72,7 @@ def _msop_packet(time: DTypeLike, fields: Mapping[str, tuple[int, DTypeLike]]) -
 
 
 def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return the type of a packet of device data, with fields of the model."""
+    """Return the dtype of a device data packet, with the given model-specific fields."""
     return _placed(1248, {
         "id": (0, ("u1", 8)),
         "rpm": (8, ">u2"),
@@ -89,21 +89,21 @@ def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.vo
 
 
 @dataclass(frozen=True)
-class Model:
-    """Layout of a model's packets, with the figures that readers assume."""
+class RobosenseModel:
+    """Packet layout of a model, and the values that readers assume."""
 
     lasers: int
     unit_m: float
     type_code: int  # code in the header
-    header: bytes  # identification of a packet of measurements
-    modes: Mapping[str, int]  # {mode of returns: its code in device data}
+    header: bytes  # identifies a measurement packet
+    modes: Mapping[str, int]  # {return mode: code in device data}
     msop: np.dtype[np.void]
     difop: np.dtype[np.void]
 
 
-# By the names of LidarType in rs_driver. Positions are bytes.
+# Keys are names of LidarType in rs_driver. Positions are in bytes.
 MODELS = {
-    "RS16": Model(
+    "RS16": RobosenseModel(
         lasers=16,
         unit_m=0.005,
         type_code=1,
@@ -112,10 +112,10 @@ MODELS = {
         msop=_msop_packet(np.dtype(_DATE), {"id": (0, ("u1", 8)), "type_code": (30, "u1")}),
         difop=_difop_packet({
             "time": (303, np.dtype(_DATE)),
-            "elevations": (1165, ("u1", (16, 3))),  # without signs, in 0.0001 degrees
+            "elevations": (1165, ("u1", (16, 3))),  # unsigned, in 0.0001 degrees
         }),
     ),
-    "RSHELIOS": Model(
+    "RSHELIOS": RobosenseModel(
         lasers=32,
         unit_m=0.0025,
         type_code=6,
@@ -137,12 +137,12 @@ MODELS = {
 
 
 class RobosenseEncoder(PacketEncoder):
-    """Packets of measurements and of device data, both of 1,248 bytes.
+    """Encodes measurement packets and device data packets, both of 1,248 bytes.
 
-    Device data come before the first measurements and then ten times a second: readers wait for
-    their angles. In the mode dual, each block, or with 16 lasers each half of a block, of
-    strongest returns is followed by last returns, or by second strongest returns where the last
-    return is the strongest; an only return is in both.
+    Device data is sent before the first measurements and then ten times per second, because readers
+    wait for the angles in it. In dual mode, each block of strongest returns is followed by a block
+    of last returns, or of second strongest returns where the last return is the strongest. With 16
+    lasers, this applies to half blocks. A single return is in both.
     """
 
     identifiers = ("model",)
@@ -161,11 +161,11 @@ class RobosenseEncoder(PacketEncoder):
         self._firings = _BLOCKS * _BLOCK_LASERS // (self._model.lasers * self._planes)
         self._carry = CarryOver(self._firings)
         self._next_difop_ns: int | None = None
-        # Of two returns, the signals tell which is the strongest.
+        # In dual mode, the signals determine which return is the strongest.
         self.columns = ("reflectivity", "signal") if source.mode == "dual" else ("reflectivity",)
 
     def _check_source(self) -> None:
-        """Raise LidarError unless a sensor of the model could be the source."""
+        """Raise LidarError if the source does not match a sensor of the model."""
         source = self.source
         model = self._model
         if source.mode not in model.modes:
@@ -187,7 +187,7 @@ class RobosenseEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the packets that the shots of a sweep fill, and device data until then."""
+        """Return the packets that are complete after the shots of a sweep, and device data."""
         filling = self._carry.whole_packets(shots)
         if not len(filling):
             return []
@@ -196,11 +196,11 @@ class RobosenseEncoder(PacketEncoder):
         return [self._difop(filling, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends no packet before its blocks are full."""
+        """Return no packets, because the sensor sends only packets whose blocks are full."""
         return []
 
     def _msop(self, shots: Shots) -> Datagrams:
-        """Return the packets of measurements of shots that fill packets."""
+        """Return the measurement packets of shots that fill packets."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), self._model.msop)
         packets["id"] = np.frombuffer(self._model.header, np.uint8)
@@ -215,9 +215,9 @@ class RobosenseEncoder(PacketEncoder):
         return Datagrams(_as_bytes(packets), due_ns, self.ports["msop"])
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots into blocks (n, 12) of `_BLOCK`."""
+        """Write azimuths and returns of shots to blocks (n, 12) of `_BLOCK`."""
         units = np.rint(shots.range_m / self._model.unit_m)
-        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype(np.uint16)
         reflectivities = shots.columns["reflectivity"] * fits
         order = self._planes_in_order(shots)
@@ -230,7 +230,7 @@ class RobosenseEncoder(PacketEncoder):
         blocks["azimuth"] = azimuths.reshape(len(blocks), self._firings)[:, firing]
 
     def _planes_in_order(self, shots: Shots) -> Ints:
-        """Return the number of the return in each plane of a packet: (planes, n, lasers)."""
+        """Return the return number (planes, n, lasers) that is stored in each plane of a packet."""
         first = np.zeros((1, *shots.range_m.shape[1:]), np.int64)
         if self._planes == 1:
             return first
@@ -241,7 +241,7 @@ class RobosenseEncoder(PacketEncoder):
         return np.concatenate([first, shots.returned[1:2] ^ first])
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
-        """Return device data that are due up to a time, beginning when the shots start."""
+        """Return the device data due up to a time, starting with the first shots."""
         if self._next_difop_ns is None:
             self._next_difop_ns = int(shots.starts_ns[0])
         due_ns = np.arange(self._next_difop_ns, until_ns + 1, DIFOP_INTERVAL_NS)
@@ -253,7 +253,7 @@ class RobosenseEncoder(PacketEncoder):
         return Datagrams(_as_bytes(packets), due_ns, self.ports["difop"])
 
     def _device_data(self) -> Records:
-        """Return the device data of the sensor without a time: (1,)."""
+        """Return a device data packet of the sensor without a time, as an array of length 1."""
         packets = np.zeros(1, self._model.difop)
         packets["id"] = np.frombuffer(_DIFOP_ID, np.uint8)
         packets["rpm"] = round(60 * self.source.sensor.head.rate_hz)  # type: ignore[attr-defined]
@@ -285,11 +285,11 @@ class RobosenseEncoder(PacketEncoder):
         return packets
 
     def _elevations_deg(self) -> Floats:
-        """Return the elevations of the lasers, degrees: (lasers,)."""
+        """Return the elevations of the lasers in degrees."""
         return np.degrees(self.source.sensor.beams.elevation[self.source.settings.channels])
 
     def _azimuths_deg(self) -> Floats:
-        """Return azimuths of the lasers, ccw from the head's when they fire: (lasers,)."""
+        """Return the azimuths of the lasers relative to the head, counterclockwise, in degrees."""
         beams = self.source.sensor.beams
         head_turn = self.source.sensor.head.radians_per_ns * beams.time_ns  # type: ignore[attr-defined]
         degrees: Floats = np.degrees(beams.azimuth - head_turn)[self.source.settings.channels]
@@ -297,7 +297,7 @@ class RobosenseEncoder(PacketEncoder):
 
 
 def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
-    """Write times (n,), nanoseconds since 1970, as records of `_DATE` or `_SECONDS`."""
+    """Write times (n,) in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
     micros = np.maximum(since_1970_ns + 500, 0) // 1000
     seconds, microseconds = np.divmod(micros, 1_000_000)
     if times.dtype == np.dtype(_SECONDS):
@@ -323,7 +323,7 @@ def _as_bytes(packets: Records) -> Bytes:
 
 
 class RobosenseDecoder(PacketDecoder):
-    """Refuses packets of RoboSense, which no package of the index reads as sweeps."""
+    """Rejects RoboSense packets, because no Python package on PyPI reads them as sweeps."""
 
     refusal = (
         "RoboSense packets, which are not supported. Convert them to .pcd with rs_driver, or "

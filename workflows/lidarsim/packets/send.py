@@ -1,4 +1,4 @@
-"""Sends datagrams at their times from a separate process, and checks where they may go."""
+"""Send datagrams at their due times from a separate process, and check receiver addresses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .sender_process import DATAGRAM, END, HEADER, ROUTE
 from .service import Destination, is_single_receiver
 
 LOOPBACK = "127.0.0.1"
-_SHOWN_LETTERS = 60  # letters of an address that is refused
+_SHOWN_LETTERS = 60  # number of characters of an invalid address that are shown
 _RECORD = np.dtype(
     [
         ("kind", "<u2"),
@@ -37,26 +37,26 @@ _RECORD = np.dtype(
         ("due_ns", "<i8"),
     ]
 )
-_ENDS_WITHIN_S = 2.0  # limit for the process after SIGTERM
+_ENDS_WITHIN_S = 2.0  # time limit for the process to exit after SIGTERM
 
 
 @dataclass(frozen=True)
 class Lateness:
-    """What was sent, and how late after the schedule."""
+    """Number of datagrams that were sent, and a histogram of their lateness."""
 
     sent: int = 0
     limits_ms: tuple[float, ...] = ()  # upper limits of the bins
-    counts: tuple[int, ...] = ()  # number of datagrams in each bin, and of later datagrams
+    counts: tuple[int, ...] = ()  # number of datagrams in each bin, and beyond the last bin
     latest_ms: float = 0.0
-    failures: Mapping[str, int] = field(default_factory=dict)  # {error: datagrams not sent}
+    failures: Mapping[str, int] = field(default_factory=dict)  # {error: number of datagrams}
 
     def share_within(self, limit_ms: float) -> float:
-        """Return the share of datagrams that were at most as late as a limit of the bins."""
+        """Return the share of datagrams that were at most as late as a bin limit."""
         stop = self.limits_ms.index(limit_ms) + 1
         return sum(self.counts[:stop]) / max(1, self.sent)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
+        """Return the values as JSON-serializable data."""
         bins = {f"<= {limit:g} ms": count for limit, count in zip(self.limits_ms, self.counts)}  # noqa: B905 - counts are one more
         bins["later"] = self.counts[-1] if self.counts else 0
         return {
@@ -81,21 +81,21 @@ class Lateness:
 
 
 class Sender:
-    """Sends datagrams of sensors, by number, at their times: a context manager.
+    """Context manager that sends datagrams of numbered sensors at their due times.
 
-    The process ends with the context, and when this process ends in any other way.
+    The sender process ends with the context, or when the current process ends for any reason.
 
     Parameters
     ----------
     note
-        Prints a note for the user.
+        Function that shows a message to the user.
     """
 
     def __init__(self, note: Callable[[str], None] = lambda words: None) -> None:
         self._note = note
         self._process: subprocess.Popen[bytes] | None = None
-        self._lock = threading.Lock()  # services redirect from separate threads
-        self._reported = b""  # start of a line that has not fully arrived
+        self._lock = threading.Lock()  # because services redirect from separate threads
+        self._reported = b""  # beginning of a line that has not completely arrived
         self._lateness = Lateness()
 
     def __enter__(self) -> Self:
@@ -104,10 +104,10 @@ class Sender:
             [sys.executable, "-I", "-S", str(script)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C in a terminal must not end it before this process
+            start_new_session=True,  # so that Ctrl-C in a terminal does not end it too early
         )
         assert self._process.stdout is not None
-        os.read(self._process.stdout.fileno(), 1 << 16)  # it is ready: starting takes 0.1 s
+        os.read(self._process.stdout.fileno(), 1 << 16)  # wait until it is ready, about 0.1 s
         os.set_blocking(self._process.stdout.fileno(), False)
         return self
 
@@ -120,9 +120,9 @@ class Sender:
         self._process = None
 
     def redirect(self, sensor: int, destination: Destination, source: str = "") -> None:
-        """Send the later datagrams of a sensor to a destination.
+        """Send all further datagrams of a sensor to a new destination.
 
-        `source` is the address of this machine that they come from; empty for any.
+        `source` is the address of this machine to send from, or empty for any address.
         """
         values = {"host": destination.host, "ports": destination.ports, "source": source}
         body = json.dumps(values).encode()
@@ -131,9 +131,10 @@ class Sender:
     def send(
         self, sensor: int, groups: Sequence[Datagrams], deadlines_ns: Callable[[Ints], Ints]
     ) -> None:
-        """Hand datagrams over, which are sent at `deadlines_ns(due_ns)` by `time.monotonic_ns`.
+        """Pass datagrams to the process, which sends each at `deadlines_ns(due_ns)`.
 
-        Waits while very many datagrams wait for their times. LidarError if the process has ended.
+        Deadlines are times of `time.monotonic_ns`. The call blocks while too many datagrams are
+        pending. Raises LidarError if the process has ended.
         """
         groups = [group for group in groups if len(group)]
         self._hear()
@@ -153,14 +154,11 @@ class Sender:
 
     @property
     def lateness(self) -> Lateness:
-        """How late datagrams were, known after the end."""
+        """Lateness of the datagrams, which is known once the process has ended."""
         return self._lateness
 
     def _write(self, content: bytes | memoryview) -> None:
-        """Write to the process.
-
-        Raises LidarError if it has ended.
-        """
+        """Write to the process, or raise LidarError if it has ended."""
         assert self._process is not None
         file = self._process.stdin
         assert file is not None
@@ -174,7 +172,7 @@ class Sender:
             ) from error
 
     def _hear(self) -> None:
-        """Note what the process reports, without waiting."""
+        """Read what the process has reported, without blocking."""
         assert self._process is not None
         file = self._process.stdout
         assert file is not None
@@ -198,7 +196,7 @@ class Sender:
             )
 
     def _wait(self, timeout_s: float | None = _ENDS_WITHIN_S) -> None:
-        """Wait for the end of the process, which is killed if it takes too long."""
+        """Wait until the process ends, and kill it if this takes too long."""
         assert self._process is not None
         process = self._process
         if process.stdin is None or process.stdin.closed:
@@ -214,14 +212,14 @@ class Sender:
 
 
 def _close(file: IO[bytes] | None) -> None:
-    """Close a pipe, whose buffered bytes have no reader any more."""
+    """Close a pipe whose buffered bytes may have no reader."""
     assert file is not None
     with suppress(BrokenPipeError):
         file.close()
 
 
 def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
-    """Return datagrams with the headers of their records: (n, bytes)."""
+    """Return datagrams preceded by their record headers, as an array (n, bytes)."""
     count, size = group.payloads.shape
     headers = np.zeros(count, _RECORD)
     headers["kind"] = DATAGRAM
@@ -234,7 +232,7 @@ def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
 
 
 def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
-    """Return the records (n, bytes) of all groups as one array, in the order of their times."""
+    """Return the records of all groups as one flat array, sorted by time."""
     if len(records) == 1:
         return np.ascontiguousarray(records[0]).reshape(-1)
     sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in records])
@@ -251,18 +249,18 @@ def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
 
 
 @dataclass(frozen=True)
-class Address:
-    """An address that a user gives: HOST or HOST:PORT, of IPv4."""
+class ReceiverAddress:
+    """An IPv4 address that a user specifies as HOST or HOST:PORT."""
 
     host: str  # numeric address
     port: int | None = None
-    name: str = field(default="", compare=False)  # the host as the user gives it, unless numbers
+    name: str = field(default="", compare=False)  # host name as specified, if it is not numeric
 
     @classmethod
-    def parse(cls, text: str) -> Address:
-        """Return the address of one receiver of IPv4.
+    def parse(cls, text: str) -> ReceiverAddress:
+        """Parse the IPv4 address of a single receiver.
 
-        Raises LidarError for other text and addresses.
+        Raises LidarError if the text is not such an address.
         """
         host, separator, number = text.rpartition(":")
         if not separator:
@@ -293,7 +291,7 @@ class Address:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether the address is of this machine alone."""
+        """Whether the address belongs to the loopback interface."""
         return IPv4Address(self.host).is_loopback
 
     def __str__(self) -> str:
@@ -309,9 +307,9 @@ def _is_ipv6(text: str) -> bool:
 
 
 def _resolved(host: str, text: str) -> IPv4Address:
-    """Return the IPv4 address of a name.
+    """Return the IPv4 address of a host name.
 
-    Raises LidarError if the name has none.
+    Raises LidarError if there is none.
     """
     try:
         entries = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
@@ -321,8 +319,8 @@ def _resolved(host: str, text: str) -> IPv4Address:
     return IPv4Address(entries[0][4][0])
 
 
-def check_reachable(address: Address) -> None:
-    """Raise LidarError if no datagrams can be sent to an address, such as without a network."""
+def check_reachable(address: ReceiverAddress) -> None:
+    """Raise LidarError if no datagrams can be sent to an address, for example without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address.host, address.port or 9))

@@ -1,14 +1,15 @@
-"""The process that sends datagrams at their times: reads records from stdin, and reports on stdout.
+"""Process that sends datagrams at their due times, with records on stdin and reports on stdout.
 
-Run as a script by `send.Sender`. It imports nothing but the standard library, so that it starts in
-milliseconds, and shares no lock with the process that casts: a thread beside the casting was 8 to
-300 ms late.
+`send.Sender` runs this file as a script. It imports only the standard library, so that it starts
+within milliseconds. It is a separate process, because a thread in the ray-casting process would
+share its lock and was 8 to 300 ms late.
 
-Each record begins with `HEADER`: its kind, the number of the sensor, the port, the port that it
-comes from (0 for any), the size of the content, and a time. A record DATAGRAM is sent at its time
-by the clock of `time.monotonic_ns`; its content is the payload. A record ROUTE says where later
-datagrams of a sensor go, as JSON. After the record END the process sends what is left; without END,
-the end of stdin ends the process at once, as the process that casts is gone.
+Each record begins with `HEADER`: its kind, the number of the sensor, the destination port, the
+source port (0 for any), the size of the content, and a time. A DATAGRAM record contains a payload
+that is sent at its time on the clock of `time.monotonic_ns`. A ROUTE record contains JSON that
+states where further datagrams of a sensor are sent. After an END record, the process sends the
+pending datagrams and exits. If stdin ends without END, the ray-casting process has died, and the
+sender exits at once.
 """
 
 from __future__ import annotations
@@ -28,33 +29,33 @@ from typing import Any, NoReturn
 
 HEADER = Struct("<HHHHIq")  # kind, sensor, port, source port, size, time
 DATAGRAM, ROUTE, END = range(3)
-# Upper limits of lateness, milliseconds; later datagrams are in a last bin.
+# Upper limits of lateness bins in milliseconds; a last bin counts all later datagrams.
 BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# A sensor whose datagrams are late catches up at most this much faster, so that the receiver, whose
-# buffers hold only some datagrams, loses none.
+# Largest speed-up at which late datagrams of a sensor are sent, so that the receiver, whose buffers
+# hold only a few datagrams, does not lose any.
 _CATCH_UP = 2
-_READ_BYTES = 1 << 16  # at a time, between datagrams
+_READ_BYTES = 1 << 16  # number of bytes read at a time between datagrams
 _MAX_WAITING_BYTES = 256 << 20
 _NICENESS = -10
 
 
 class Stop(Exception):  # noqa: N818 - not an error
-    """SIGTERM: no further datagrams are sent."""
+    """Raised on SIGTERM, after which no further datagrams are sent."""
 
 
 class Route:
-    """Where the datagrams of a sensor go, and when the last of them was sent."""
+    """Where the datagrams of a sensor are sent, and when the last one was sent."""
 
     def __init__(self) -> None:
         self.host = ""
         self.ports: dict[int, int] = {}  # {port of a datagram: port of the host}; 0: not sent
-        self._source = ""  # address that datagrams come from; empty for any
+        self._source = ""  # source address; empty for any
         self._sockets: dict[int, socket.socket] = {}  # {source port: socket}
         self._due_ns = 0
         self._sent_ns = 0
 
     def change(self, values: dict[str, Any]) -> None:
-        """Change where the datagrams go, and where they come from."""
+        """Change the destination and the source address of the datagrams."""
         self.host = values["host"]
         self.ports = {int(port): number for port, number in values["ports"].items()}
         if values["source"] != self._source:
@@ -64,24 +65,24 @@ class Route:
             self._source = values["source"]
 
     def open_from(self, port: int) -> socket.socket:
-        """Return the socket that sends from a port, 0 for any, opened before its first use."""
+        """Return the socket for a source port, where 0 means any; it is opened on first use."""
         if port not in self._sockets:
             self._sockets[port] = _open_socket(self._source, port)
         return self._sockets[port]
 
     def earliest_ns(self, due_ns: int) -> int:
-        """Return when a datagram may be sent: at its time, or later if the last was late."""
+        """Return when a datagram may be sent: when it is due, or later if the last one was late."""
         return max(due_ns, self._sent_ns + (due_ns - self._due_ns) // _CATCH_UP)
 
     def mark_sent(self, due_ns: int) -> int:
-        """Take note that a datagram is sent now, and return by how much it is late, nanoseconds."""
+        """Record that a datagram is sent now, and return its lateness in nanoseconds."""
         self._due_ns = due_ns
         self._sent_ns = time.monotonic_ns()
         return self._sent_ns - due_ns
 
 
 def _open_socket(source: str, port: int) -> socket.socket:
-    """Return a socket that sends from an address and port, or from any if they cannot be had."""
+    """Return a socket bound to a source address and port, or to any if they are unavailable."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     for number in (port, 0) if source else (port,):
         with suppress(OSError):
@@ -90,23 +91,24 @@ def _open_socket(source: str, port: int) -> socket.socket:
     return opened
 
 
-class Outbox:
-    """Datagrams that wait for their times, and the record of what was sent."""
+class SendQueue:
+    """Datagrams that wait for their due times, and statistics of those that were sent."""
 
     def __init__(self) -> None:
-        self.waiting: list[tuple[int, int, int, int, int, bytes]] = []  # a heap by time and order
+        # A heap sorted by due time and order of arrival.
+        self.waiting: list[tuple[int, int, int, int, int, bytes]] = []
         self.waiting_bytes = 0
         self.routes: dict[int, Route] = {}
         self.ended = False
-        self._count = 0  # number of datagrams so far
+        self._count = 0  # number of datagrams received so far
         self._late = [0] * (len(BINS_MS) + 1)
         self._max_late_ns = 0
         self._sent = 0
-        self._failures: dict[str, int] = {}  # {error: datagrams that were not sent}
-        self._rest = b""  # start of a record that has not fully arrived
+        self._failures: dict[str, int] = {}  # {error: number of datagrams that were not sent}
+        self._rest = b""  # beginning of a record that has not completely arrived
 
-    def take(self, content: bytes) -> None:
-        """Take the records of further bytes of stdin."""
+    def parse_records(self, content: bytes) -> None:
+        """Parse the records in further bytes from stdin."""
         content = self._rest + content
         start = 0
         while len(content) - start >= HEADER.size:
@@ -128,7 +130,7 @@ class Outbox:
         self._rest = content[start:]
 
     def next_ns(self) -> int | None:
-        """Return when the next datagram is sent, or None if none waits."""
+        """Return when the next datagram will be sent, or None if none is pending."""
         if not self.waiting:
             return None
         due_ns, _, sensor, *_ = self.waiting[0]
@@ -157,7 +159,7 @@ class Outbox:
         self._late[bisect_left(BINS_MS, late_ms)] += 1
 
     def summary(self) -> dict[str, Any]:
-        """Return what was sent, how late, and what was not, as plain data for JSON."""
+        """Return the statistics as JSON-serializable data."""
         return {
             "sent": self._sent,
             "lateness_ms": [*BINS_MS],
@@ -177,32 +179,32 @@ def report(values: dict[str, Any]) -> None:
 
 
 def raise_priority() -> None:
-    """Run before other processes when a datagram is due, if this process may: it mostly sleeps.
+    """Raise the priority of this mostly idle process, if permitted, so that it sends on time.
 
-    With ten busy processes on two cores, 0.02 % of the datagrams were later than 5 ms by real-time
-    scheduling, 4 % by a niceness of -10, and 13 % without.
+    With ten busy processes on two cores, 0.02 % of the datagrams were more than 5 ms late with
+    real-time scheduling, 4 % with a niceness of -10, and 13 % without either.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except (OSError, AttributeError):  # no rights, or not Linux
+    except (OSError, AttributeError):  # not permitted, or not on Linux
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
 
 
-def serve(outbox: Outbox) -> None:
-    """Send datagrams at their times, until all are sent after END."""
-    while not outbox.ended or outbox.waiting:
-        next_ns = outbox.next_ns()
+def serve(queue: SendQueue) -> None:
+    """Send datagrams at their due times until all are sent after END."""
+    while not queue.ended or queue.waiting:
+        next_ns = queue.next_ns()
         wait_s = None if next_ns is None else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
-        is_full = outbox.ended or outbox.waiting_bytes > _MAX_WAITING_BYTES
+        is_full = queue.ended or queue.waiting_bytes > _MAX_WAITING_BYTES
         readable, _, _ = select.select([] if is_full else [0], [], [], wait_s)
         if next_ns is not None and time.monotonic_ns() >= next_ns:
-            outbox.send_next()
+            queue.send_next()
         elif readable:
             content = os.read(0, _READ_BYTES)
             if not content:
                 sys.exit(1)
-            outbox.take(content)
+            queue.parse_records(content)
 
 
 def main() -> None:
@@ -214,11 +216,11 @@ def main() -> None:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     raise_priority()
-    outbox = Outbox()
+    queue = SendQueue()
     report({"ready": True})
     with suppress(Stop):
-        serve(outbox)
-    report(outbox.summary())
+        serve(queue)
+    report(queue.summary())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Services: what answers a maker's software on the side of a live sensor."""
+"""Base class of services that answer a manufacturer's software for a live sensor."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _ANY_PORT = 9
 
 @dataclass(frozen=True)
 class Destination:
-    """Where the datagrams of a live sensor go."""
+    """Where the datagrams of a live sensor are sent."""
 
     host: str  # IPv4 address
-    # {port of `Datagrams`: port of the host}: other ports stay; datagrams to port 0 are not sent.
+    # {port of `Datagrams`: port of the host}. Other ports do not change; port 0 is not sent.
     ports: Mapping[int, int] = field(default_factory=dict)
 
 
 def is_single_receiver(address: IPv4Address) -> bool:
-    """Return True unless an address is unspecified, multicast or broadcast.
+    """Return False if an address is unspecified, a multicast address or a broadcast address.
 
-    The system knows the broadcast addresses of this machine's networks: it connects no socket to
-    them that has not asked for broadcasts.
+    The operating system knows the broadcast addresses of the local networks. It refuses to connect
+    sockets to them unless broadcasting has been enabled.
     """
     if address.is_unspecified or address.is_multicast or address == _BROADCAST:
         return False
@@ -35,43 +35,44 @@ def is_single_receiver(address: IPv4Address) -> bool:
             probe.connect((str(address), _ANY_PORT))
         except PermissionError:
             return False
-        except OSError:  # such as no network, which may come
+        except OSError:  # for example because there is no network yet
             return True
     return True
 
 
 class Service(ABC):
-    """Answers a maker's software, on separate threads: a context manager.
+    """Context manager that answers a manufacturer's software on separate threads.
 
-    Software that never ends a request, or sends what is not understood, must not stop the sensor:
-    a service bounds its threads, and the sizes and times of requests.
+    Clients that never complete a request or send invalid data must not stop the sensor, so a
+    service limits its threads and the size and duration of requests.
 
     Parameters
     ----------
     destination
-        Where the datagrams go at first.
+        Initial destination of the datagrams.
     send_to
-        Sends the datagrams elsewhere from now on; threads may call it.
+        Function that redirects the datagrams. It must be thread-safe.
     """
 
     def __init__(self, destination: Destination, send_to: Callable[[Destination], None]) -> None:
         self.destination = destination
         self.send_to = send_to
-        # Names of this service in requests, besides the machine's names; set before the start.
+        # Further names of this service in requests, besides the machine's names; set before the
+        # start.
         self.names: frozenset[str] = frozenset()
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """What a user needs to reach the service, for the line that says that it is ready."""
+        """What a user needs to know to reach the service, shown when it is ready."""
 
     @abstractmethod
     def __enter__(self) -> Self:
-        """Listen.
+        """Start to listen.
 
         Raises LidarError if the address cannot be used.
         """
 
     @abstractmethod
     def __exit__(self, *error: object) -> None:
-        """Close the address, and end all threads."""
+        """Stop listening, and end all threads."""

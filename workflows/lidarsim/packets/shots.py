@@ -1,4 +1,4 @@
-"""Shots of a sensor in its maker's order of lasers, with and without returns."""
+"""Shots of a sensor in the manufacturer's laser order, with and without returns."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from ..sweeps.sweeps import Sweeps
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """Firings of a sensor: n firings of c lasers in the maker's order, each with up to r returns.
+    """n firings of c lasers in the manufacturer's order, each with up to r returns.
 
-    Returns of a pulse are in the order of the cloud, by range; an only return is the first.
+    The returns of a pulse have the same order as in the cloud, by range. A single return is the
+    first.
     """
 
-    firings: Ints  # (n,): numbers since the start of the station
-    starts_ns: Ints  # (n,): start of each firing, nanoseconds since the survey's start
-    stamps_ns: Ints  # (n,): the same by the sensor's clock, with its jumps
-    azimuths: Floats  # (n,): of the head, radians counter-clockwise from the sensor's x axis
-    dropped: Bools  # (n,): whether the firing is in a packet that is lost on its way
-    range_m: Floats32  # (r, n, c): distance from the beam's origin; NaN without a return
-    columns: Mapping[str, AnyArray]  # {column of the cloud: (r, n, c)}; 0 without a return
+    firings: Ints  # (n,): firing numbers since the start of the station
+    starts_ns: Ints  # (n,): start of each firing, nanoseconds since the start of the survey
+    stamps_ns: Ints  # (n,): the same on the sensor's clock, including its jumps
+    azimuths: Floats  # (n,): head azimuth, radians counterclockwise from the sensor's x axis
+    dropped: Bools  # (n,): whether the firing is in a packet that is lost
+    range_m: Floats32  # (r, n, c): distance from the beam origin; NaN without a return
+    columns: Mapping[str, AnyArray]  # {cloud column: (r, n, c)}; 0 without a return
 
     def __len__(self) -> int:
         return len(self.firings)
@@ -42,12 +43,12 @@ class Shots:
 
     @property
     def returned(self) -> Bools:
-        """Whether each shot has a return of each number: (r, n, c)."""
+        """Whether each shot has a return with each number. Shape (r, n, c)."""
         return ~np.isnan(self.range_m)
 
     @classmethod
-    def joined(cls, tables: list[Shots]) -> Shots:
-        """Concatenate one or more parts with firings, which have the same columns."""
+    def concatenate(cls, tables: list[Shots]) -> Shots:
+        """Concatenate one or more parts, which must have the same columns."""
         if len(tables) == 1:
             return tables[0]
         columns = {
@@ -64,15 +65,16 @@ class Shots:
     def from_points(
         cls, sweeps: Sweeps, sweep: int, points: Cloud, columns: Iterable[str] = ()
     ) -> Shots:
-        """Return the shots of a sweep, from all returns of the sweep in order, `points`.
+        """Return the shots of a sweep.
 
-        `columns` are names of columns that the shots have beside the range.
+        `points` are all returns of the sweep in order. `columns` are names of columns to store in
+        addition to the range.
 
         Raises
         ------
         LidarError
-            If the sensor has no packets, the points lack a column or are not in order, or the rays
-            of the survey are unknown.
+            If the sensor has no packet format, the points lack a column or are not in order, or the
+            rays of the survey are unknown.
         """
         names = tuple(columns)
         settings_of(fired_of(sweeps).sensors[sweeps.sensor[sweep]])
@@ -87,9 +89,9 @@ class Shots:
 
     @classmethod
     def from_image(cls, image: Image, points: Cloud, columns: Iterable[str] = ()) -> Shots:
-        """Return the shots of the points of an image, without faults.
+        """Return the shots of the points in an image, without faults.
 
-        LidarError if the sensor has no packets, or the points lack a column.
+        Raises LidarError if the sensor has no packet format, or if the points lack a column.
         """
         sensor = image.sensor
         lasers = settings_of(sensor).lasers
@@ -100,7 +102,7 @@ class Shots:
         shot = (image.plane * shape[1] + image.column) * shape[2] + lasers[image.row]
 
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
-            """Return values (n,) of points as an array (r, n, c)."""
+            """Return point values (n,) as an array (r, n, c)."""
             filled = np.full(shape, missing, values.dtype)
             filled.reshape(-1)[shot] = values
             return filled
@@ -117,8 +119,8 @@ class Shots:
             columns={name: in_laser_order(points[name], 0) for name in names},
         )
 
-    def later(self, shift_ns: int) -> Shots:
-        """Return the shots with later times and stamps, as of a survey that is repeated."""
+    def shifted(self, shift_ns: int) -> Shots:
+        """Return the shots with all times shifted, as in a survey that is repeated."""
         if not shift_ns:
             return self
         return replace(
@@ -132,7 +134,7 @@ _OF_FIRINGS = tuple(
 
 
 def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bools:
-    """Return whether firings (n,) of a sweep are in packets that are lost on their way."""
+    """Return whether firings (n,) of a sweep are in packets that are lost."""
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
@@ -145,7 +147,7 @@ def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bool
 
 
 def check_columns(cloud_columns: Collection[str], names: Iterable[str]) -> None:
-    """Raise LidarError if a cloud with some columns lacks columns that packets hold."""
+    """Raise LidarError if the cloud lacks a column that the packet format requires."""
     if missing := [name for name in ("ray", "range", *names) if name not in cloud_columns]:
         lacks = ", ".join(missing)
         raise LidarError(
@@ -155,9 +157,9 @@ def check_columns(cloud_columns: Collection[str], names: Iterable[str]) -> None:
 
 
 def settings_of(sensor: Sensor) -> PacketSettings:
-    """Return the packets of a sensor.
+    """Return the packet settings of a sensor.
 
-    Raises LidarError, with models that have some, without packets.
+    Raises LidarError, listing models with a packet format, if the sensor has none.
     """
     if sensor.packets is None:
         names = ", ".join(name.rpartition("/")[2] for name in with_packets())
@@ -166,11 +168,11 @@ def settings_of(sensor: Sensor) -> PacketSettings:
 
 
 def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
-    """Return the last and the strongest returns of the mode dual: two arrays (n, c).
+    """Return the last and the strongest returns for dual mode, as two arrays (n, c).
 
-    `values` (r, n, c) are in the order of `Shots`, `returned` (r, n, c) whether a return is sent.
-    Where the last return is the strongest, the second array has the second strongest; an only
-    return is in both.
+    `values` (r, n, c) are in the order of `Shots`, and `returned` (r, n, c) states whether each
+    return is sent. Where the last return is the strongest, the second array has the second
+    strongest return. A single return is in both arrays.
     """
     if len(values) == 1:
         return [values[0], values[0]]
@@ -178,33 +180,33 @@ def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
 
 
 class CarryOver:
-    """Firings that fill no packet yet: a revolution is not a whole number of packets."""
+    """Firings that do not fill a packet yet, because a revolution is not a multiple of packets."""
 
     def __init__(self, firings_per_packet: int) -> None:
         self.firings_per_packet = firings_per_packet
         self._rest: Shots | None = None
 
     def whole_packets(self, shots: Shots) -> Shots:
-        """Add firings, return all firings that fill packets, perhaps none, and keep the rest.
+        """Add firings, return all firings that fill packets, and keep the rest.
 
-        At a new station the sensor starts anew: the rest of the last station is never sent.
+        The result may be empty. Firings that remain at the end of a station are discarded.
         """
         if len(shots) and shots.firings[0] == 0:
             self._rest = None
-        joined = shots if self._rest is None else Shots.joined([self._rest, shots])
+        joined = shots if self._rest is None else Shots.concatenate([self._rest, shots])
         count = len(joined) // self.firings_per_packet * self.firings_per_packet
         self._rest = joined[count:]
         return joined[:count]
 
     def rest(self) -> Shots | None:
-        """Return firings that fill no packet, and forget them, or None before the first sweep."""
+        """Remove and return the firings left over, or None before the first sweep."""
         rest = self._rest
         self._rest = None
         return rest
 
 
 def with_packets() -> tuple[str, ...]:
-    """Return the names of the models of the package that have packets, in order."""
+    """Return the names of the built-in models that have a packet format, in order."""
     from ..base.model_names import model_names
     from ..sensor.models import read_model
 

@@ -1,12 +1,12 @@
-"""Packets of single sweeps, for programs that move the sensor themselves."""
+"""Encode single sweeps as packets, for programs that move the sensor themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from ..base.checks import check_fits
 from ..base.errors import LidarError
-from ..base.validation import checked
 from ..columns.cloud import Cloud
 from ..motion.trajectory import CENTER
 from ..sensor import Returns, Sensor
@@ -57,7 +57,6 @@ class Packets:
     (75, 1206) 2368 [100859904 102187008]
     """
 
-    @checked
     def __init__(
         self,
         sensor: Sensor | Mounted,
@@ -82,7 +81,7 @@ class Packets:
         self._prepare(survey)
 
     @classmethod
-    def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
+    def for_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
         """Create an encoder for the sensor of a scanner.
 
         `start` has the same meaning as in `Packets`.
@@ -91,7 +90,7 @@ class Packets:
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 
     def _prepare(self, survey: Survey) -> None:
-        """Make the encoder of the sensor of a survey."""
+        """Create the encoder for the sensor of a survey."""
         carried = survey.carried[0]
         self._sensor = carried.sensor
         self._returns = 2 if survey.returns_each[0].mode in TWO_RETURNS else 1
@@ -115,9 +114,8 @@ class Packets:
         """Names of the columns that a cloud must contain to be encoded."""
         return ("ray", "range", *self.encoder.columns)
 
-    @checked
     def encode(
-        self, sweep: Cloud, *, number: SweepNumber | None = None, start_s: StartSeconds = None
+        self, sweep: Cloud, *, number: int | None = None, start_s: float | None = None
     ) -> list[Datagrams]:
         """Encode a sweep as datagrams, in one group per port.
 
@@ -137,6 +135,8 @@ class Packets:
             If the cloud lacks a column, or if it belongs to another sweep.
         """
         number = self._next_number if number is None else number
+        check_fits("number", number, SweepNumber)
+        check_fits("start_s", start_s, StartSeconds)
         steps = self._sensor.steps_of_revolution(number)
         check_columns(sweep.columns, self.encoder.columns)
         scans = sweep["scan"]

@@ -1,4 +1,4 @@
-"""Services over TCP, such as HTTP, on a thread with an event loop."""
+"""Base class of TCP services such as HTTP, which run on a thread with an event loop."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from typing import ClassVar, Self
 from ..base.errors import LidarError
 from .service import Destination, Service
 
-_BACKLOG = 128  # connections that wait to be accepted
+_BACKLOG = 128  # number of connections that can wait to be accepted
 
 
 class TcpService(Service):
-    """Serves connections on a thread, and drops all open connections at the end of the context.
+    """Serves TCP connections on a thread until the end of the context.
 
-    Beyond `max_connections`, the oldest connection gives way to the newest: clients that open
-    connections and do not end their requests keep nobody else from being answered.
+    If there are more than `max_connections`, the oldest connection is closed. Clients that keep
+    connections open without completing a request therefore cannot block other clients.
 
     Parameters
     ----------
     address
-        HOST:PORT to listen at; HOST alone for the usual port, or for a free port if the usual port
-        cannot be had.
+        HOST:PORT to listen on. If only HOST is given, the usual port is used, or a free port if the
+        usual port is unavailable.
     destination, send_to
-        As of `Service`.
+        As in `Service`.
     """
 
-    name: ClassVar[str]  # what is served, for messages
+    name: ClassVar[str]  # name of the service in messages
     usual_port: ClassVar[int]
-    example_port: ClassVar[int]  # port in advice
+    example_port: ClassVar[int]  # port that is suggested in error messages
     max_connections: ClassVar[int]
-    buffer_bytes: ClassVar[int] = 1 << 16  # buffer of a connection
+    buffer_bytes: ClassVar[int] = 1 << 16  # buffer size of a connection
 
     def __init__(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
@@ -48,7 +48,7 @@ class TcpService(Service):
         self._loop: asyncio.AbstractEventLoop
         self._thread: threading.Thread
         self._server: asyncio.Server
-        self._connections: dict[asyncio.Task[None], None] = {}  # tasks that serve, oldest first
+        self._connections: dict[asyncio.Task[None], None] = {}  # serving tasks, oldest first
 
     @abstractmethod
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -56,9 +56,9 @@ class TcpService(Service):
 
     @contextmanager
     def counted(self) -> Iterator[Callable[[], None]]:
-        """Count the connection of the current task, and close the oldest if there are too many.
+        """Register the connection of the current task, and close the oldest if there are too many.
 
-        Yields a function that makes the connection the newest.
+        Yields a function that marks the connection as the newest.
         """
         task = asyncio.current_task()
         assert task is not None
@@ -96,7 +96,7 @@ class TcpService(Service):
         self._loop.close()
 
     def _listening_socket(self) -> socket.socket:
-        """Return a socket at the address.
+        """Return a socket bound to the address.
 
         Raises LidarError if the address cannot be used.
         """

@@ -1,7 +1,7 @@
-"""Packets of Velodyne: VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and VLS-128.
+"""Velodyne packets: VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and VLS-128.
 
 Sources: user manuals of the VLP-16 (63-9243), VLP-32C and VLS-128; HDL-32E packet structure and
-timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
+timing (63-9277); packet_decoder.cpp in valgur/velodyne_decoder.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ DATA_PORT = 2368
 _BLOCKS = 12  # blocks per packet
 _BLOCK_LASERS = 32
 _CHANNELS = (16, 32, 128)
-_FLAGS = np.array([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF], "<u2")  # flags from laser 0, 32, 64, 96 on
+_FLAGS = np.array([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF], "<u2")  # for lasers from 0, 32, 64 and 96
 _UNUSED = 0xFFFF  # flag of blocks without lasers
 _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
-_AZIMUTHS = 36_000  # azimuths in a revolution
+_AZIMUTHS = 36_000  # azimuth units per revolution
 _MAX_UNITS = 65_535
 _HOUR_US = 3_600_000_000
-_FLAG_BYTES = tuple(flag.tobytes() for flag in _FLAGS)  # first bytes of a packet
-# Laser of the VLS-128 whose time is the packet's: the first of the fourth group of eight.
+_FLAG_BYTES = tuple(flag.tobytes() for flag in _FLAGS)  # possible first bytes of a packet
+# Laser of the VLS-128 whose time is the packet's time: the first of the fourth group of eight.
 _STAMPED_LASER_OF_128 = 24
 
 _RETURN = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
@@ -45,12 +45,12 @@ _PACKET = np.dtype(
 
 
 class VelodyneEncoder(PacketEncoder):
-    """Data packets of 1,206 bytes, and position packets of 512.
+    """Encodes data packets of 1,206 bytes and position packets of 512 bytes.
 
-    Azimuths are the head's at the first firing of each block, clockwise from the sensor's
-    x axis. In the mode dual, each block of last returns is followed by a block of strongest
-    returns, or of second strongest where the last return is the strongest; an only return is in
-    both.
+    The azimuth of a block is the azimuth of the head at the block's first firing, clockwise from
+    the sensor's x axis. In dual mode, each block of last returns is followed by a block of
+    strongest returns, or of second strongest returns where the last return is the strongest. A
+    single return is in both blocks.
     """
 
     identifiers = ("product", "unit_m")
@@ -68,26 +68,26 @@ class VelodyneEncoder(PacketEncoder):
         self._unit_m = self.decimal("unit_m")
         self._product = self.number("product")
         self._planes = 2 if source.mode == "dual" else 1
-        # The VLS-128 leaves four blocks of a packet in the mode dual without lasers.
+        # In dual mode, the VLS-128 leaves four blocks of each packet without lasers.
         self._firings = _BLOCKS * _BLOCK_LASERS // (channels * self._planes)
         self._port = self.port("data", DATA_PORT)
         self._carry = CarryOver(self._firings)
         self._positions = PositionPackets(source, self.port("position", POSITION_PORT))
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that the shots of a sweep fill, and the position packets."""
+        """Return the data packets completed by the shots of a sweep, and position packets."""
         whole = self._carry.whole_packets(shots)
         if not len(whole):
             return []
         data = self._data(whole)
         last = slice(self._firings - 1, None, self._firings)
         stamps_ns = whole.stamps_ns[last] + self.firing_interval_ns
-        positions = self._positions.beside(data.due_ns, stamps_ns)
+        positions = self._positions.following(data.due_ns, stamps_ns)
         dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
         return [data.without(np.asarray(dropped)), positions]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends no packet before its blocks are full."""
+        """Return no packets, because the sensor sends only packets whose blocks are full."""
         return []
 
     def service(
@@ -120,7 +120,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return stamps of packets whose first firings start at `first_ns` (n,): (n,)."""
+        """Return timestamps in µs of packets whose first firings start at `first_ns` (n,)."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
@@ -130,11 +130,11 @@ class VelodyneEncoder(PacketEncoder):
         return (stamps_ns + 500) // 1000 % _HOUR_US
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write flags, azimuths and returns of shots into blocks (n, 12) of `_BLOCK`."""
+        """Write flags, azimuths and returns of shots to blocks (n, 12) of `_BLOCK`."""
         channels = shots.range_m.shape[2]
         used = self._firings * channels * self._planes // _BLOCK_LASERS
         units = np.rint(shots.range_m / self._unit_m)
-        fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
+        fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype("<u2")
         reflectivities = shots.columns["reflectivity"] * fits
         shape = len(blocks), -1, _BLOCK_LASERS
@@ -149,14 +149,14 @@ class VelodyneEncoder(PacketEncoder):
         by_firing = azimuths.reshape(len(blocks), self._firings)
         firing = np.arange(used) // self._planes * _BLOCK_LASERS // channels
         blocks["azimuth"][:, :used] = by_firing[:, firing]
-        blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers take the last block's
+        blocks["azimuth"][:, used:] = by_firing[:, -1:]  # readers use the azimuth of the last block
 
 
 class VelodyneDecoder(PacketDecoder):
-    """Reads the packets of a Velodyne, which name the model of the sensor, by velodyne_decoder.
+    """Reads Velodyne packets, which identify the sensor model, with velodyne_decoder.
 
-    Several units in a file are several sensors: `ADDRESS:PORT`, the address of the unit and the
-    port of the receiver.
+    If a file contains several units, each is a sensor named `ADDRESS:PORT` after the address of the
+    unit and the port of the receiver.
     """
 
     intensity = "intensity"
@@ -173,11 +173,11 @@ class VelodyneDecoder(PacketDecoder):
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram is a data packet; position packets have no marks."""
+        """Return whether a datagram is a data packet. Position packets cannot be recognized."""
         return len(payload) == _PACKET.itemsize and payload[:2] in _FLAG_BYTES
 
     def sweeps(self, sensor: int) -> Iterable[_Sweep]:
-        """Yield the sweeps, as velodyne_decoder returns them."""
+        """Yield the sweeps in the form that velodyne_decoder returns."""
         decoder: Any = import_module("velodyne_decoder")
         config = decoder.Config(timestamp_first_packet=True)
         if self._is_hdl64e(sensor):
@@ -200,20 +200,20 @@ class VelodyneDecoder(PacketDecoder):
         return float(1e9 * sweep.stamp.host)
 
     def _packets(self, sensor: int | None = None) -> Iterator[CapturedDatagram]:
-        """Yield the data packets of a sensor, or of all."""
+        """Yield the data packets of one sensor, or of all sensors."""
         for datagram in self._capture.datagrams():
             is_wanted = sensor is None or _unit_of(datagram) == self._units[sensor]
             if is_wanted and self.recognizes(datagram.payload):
                 yield datagram
 
     def _is_hdl64e(self, sensor: int) -> bool:
-        """Return whether the last two bytes change, with which an HDL-64E spells its state."""
+        """Return whether the last two bytes vary, in which an HDL-64E transmits its state."""
         return len({packet.payload[-2:] for packet in islice(self._packets(sensor), 5)}) > 1
 
     def _hdl64e(self, sensor: int) -> tuple[Any, Any]:
-        """Return model and calibration that an HDL-64E sends along with its packets.
+        """Return the model and calibration that an HDL-64E transmits with its packets.
 
-        Raises ValueError if they are not complete.
+        Raises ValueError if they are incomplete.
         """
         decoder: Any = import_module("velodyne_decoder")
         reader: Any = import_module("velodyne_decoder.hdl64e")
@@ -227,12 +227,12 @@ class VelodyneDecoder(PacketDecoder):
 
 
 class _Sweep(NamedTuple):
-    """A revolution, as velodyne_decoder returns it."""
+    """A revolution in the form that velodyne_decoder returns."""
 
-    stamp: Any  # with the times `host` and `device`, seconds
+    stamp: Any  # has the times `host` and `device` in seconds
     points: AnyArray  # structured
 
 
 def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
-    """Return what tells a unit from others: its address and the port of the receiver."""
+    """Return the address of a unit and its receiver's port, which identify the unit."""
     return datagram.source, datagram.port

@@ -1,8 +1,8 @@
-"""The web interface of a live Velodyne: its state, and where its packets go.
+"""Web interface of a live Velodyne sensor, which reports its state and sets the receiver.
 
-Sources: user manual of the VLP-16 (63-9243), «Web Interface» and «Sensor Control with curl»;
-the drivers that read it (Autoware's velodyne_monitor and nebula). What can be set is the receiver,
-and whether the laser is on; the simulated sensor does not change otherwise.
+Sources: user manual of the VLP-16 (63-9243), sections "Web Interface" and "Sensor Control with
+curl"; drivers that use the interface (Autoware's velodyne_monitor and nebula). Clients can only set
+the receiver and switch the laser; other properties of the simulated sensor cannot be changed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,14 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from ..base.ports import port_number
-from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
+from .http_service import (
+    Answer,
+    HttpService,
+    Request,
+    RequestRefusedError,
+    receiver_of,
+    receiver_port,
+)
 from .service import Destination
 
 _PORTS = ("dport", "tport")  # ports of data and position packets
@@ -22,7 +29,7 @@ _PORTS = ("dport", "tport")  # ports of data and position packets
 
 @dataclass(frozen=True)
 class VelodyneState:
-    """What the web interface says of a sensor."""
+    """Properties of a sensor that the web interface reports."""
 
     model: str
     serial: str
@@ -32,14 +39,14 @@ class VelodyneState:
 
 
 class VelodyneApi(HttpService):
-    """Answers `cgi/status.json` and the like, and sets the receiver by `cgi/setting/host`.
+    """Answers `cgi/status.json` and similar requests, and sets the receiver by `cgi/setting/host`.
 
     Parameters
     ----------
     address, destination, send_to
-        As of `HttpService`.
+        As in `HttpService`.
     state
-        What the interface says.
+        Properties that the interface reports.
     ports
         Ports of the data and position packets.
     """
@@ -63,9 +70,9 @@ class VelodyneApi(HttpService):
         self._laser = "On"
 
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request.
+        """Return the response to a request.
 
-        Raises RefusedError for what the sensor does not have.
+        Raises RequestRefusedError if the sensor does not provide the requested resource.
         """
         documents: dict[str, Callable[[], Mapping[str, Any]]] = {
             "/cgi/info.json": self._info,
@@ -76,14 +83,14 @@ class VelodyneApi(HttpService):
         if request.method in ("GET", "HEAD") and request.path in documents:
             return Answer(documents[request.path]())
         if request.method != "POST" or not request.path.startswith("/cgi/"):
-            raise RefusedError(f"there is no {request.path}", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"there is no {request.path}", HTTPStatus.NOT_FOUND)
         values = dict(parse_qsl(request.body.decode("latin-1"), keep_blank_values=True))
         if request.path == "/cgi/setting/host":
             self._set_receiver(values)
         elif request.path == "/cgi/setting":
             self._set(values)
         elif request.path != "/cgi/save":
-            raise RefusedError(f"{request.path} cannot be set", HTTPStatus.NOT_FOUND)
+            raise RequestRefusedError(f"{request.path} cannot be set", HTTPStatus.NOT_FOUND)
         return Answer(status=HTTPStatus.NO_CONTENT)
 
     def _info(self) -> Mapping[str, Any]:
@@ -122,15 +129,15 @@ class VelodyneApi(HttpService):
             elif name in ports:
                 ports[name] = receiver_port(name, port_number(value))
             else:
-                raise RefusedError(f"the host has no {name}")
+                raise RequestRefusedError(f"the host has no {name}")
         self._host = host
         self._host_ports = ports
         self._apply()
 
     def _set(self, values: Mapping[str, str]) -> None:
-        """Switch the laser.
+        """Switch the laser on or off.
 
-        Raises RefusedError for what cannot be set.
+        Raises RequestRefusedError if another setting would change.
         """
         current = {"returns": self._state.return_mode, "rpm": str(self._state.rpm)}
         laser = self._laser
@@ -138,9 +145,9 @@ class VelodyneApi(HttpService):
             if name == "laser" and value.title() in ("On", "Off"):
                 laser = value.title()
             elif name not in current:
-                raise RefusedError(f"there is no setting {name}")
+                raise RequestRefusedError(f"there is no setting {name}")
             elif value != current[name]:
-                raise RefusedError(
+                raise RequestRefusedError(
                     f"{name} is {current[name]} in this simulated sensor. Set it in the scenario"
                 )
         if laser != self._laser:
@@ -148,7 +155,7 @@ class VelodyneApi(HttpService):
             self._apply()
 
     def _apply(self) -> None:
-        """Send the packets to the receiver, or nowhere without a laser."""
+        """Send the packets to the receiver, or stop sending if the laser is off."""
         numbers = [0, 0] if self._laser == "Off" else [*self._host_ports.values()]
         ports = dict(zip(self._ports, numbers, strict=True))
         self.destination = Destination(self._host, ports)

@@ -1,7 +1,7 @@
-"""Position packets of Velodyne: the time of each second as a GPRMC sentence of NMEA 0183.
+"""Velodyne position packets, which report the time of each second as an NMEA 0183 GPRMC sentence.
 
-Sources: user manual of the VLP-16 (63-9243), 9.3.3, with the ratio of data to position packets;
-valgur/velodyne_decoder, telemetry_packet.cpp.
+Sources: user manual of the VLP-16 (63-9243), section 9.3.3, with the ratio of data to position
+packets; telemetry_packet.cpp in valgur/velodyne_decoder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..sweeps.instruments import GNSS_FILE
 from .encoders import Datagrams, PacketSource
 
 POSITION_PORT = 8308
-_DATA_PACKETS = 14  # data packets for each position packet
+_DATA_PACKETS = 14  # number of data packets per position packet
 _HOUR_US = 3_600_000_000
 _SECOND_NS = 1_000_000_000
 _SENTENCE_BYTES = 306
@@ -29,12 +29,12 @@ _POSITION = np.dtype({
     "itemsize": 512,
 })  # fmt: skip
 _LOCKED = 2  # state of the pulse per second
-_DEGREE_M = 111_195.0  # a degree of a great circle
+_DEGREE_M = 111_195.0  # length of one degree of a great circle
 _KNOT_M_S = 1852 / 3600
 
 
 class Fix(NamedTuple):
-    """Position and motion that a receiver states."""
+    """Position and motion that a GNSS receiver reports."""
 
     latitude_deg: float
     longitude_deg: float
@@ -43,24 +43,24 @@ class Fix(NamedTuple):
 
 
 class PositionPackets:
-    """Position packets beside the data packets of a sensor, one for every 14.
+    """Position packets between the data packets of a sensor, one after every 14.
 
-    The sentence belongs to the last full second, with the fix of the carrier's GNSS receiver where
-    its latitudes are known, else without a fix. Of a survey without a start, which no receiver has
-    told the time, sentence and state of the pulse per second are empty.
+    Each sentence belongs to the last full second. It contains the fix of the platform's GNSS
+    receiver if latitudes are known, otherwise no fix. If the survey has no start time, the clock is
+    not synchronized, and the sentence and the state of the pulse per second are empty.
     """
 
     def __init__(self, source: PacketSource, port: int) -> None:
         self._source = source
         self._port = port
-        self._count = 0  # data packets so far
-        self._fixes = _Fixes.of_source(source)
-        self._sentences: dict[int, bytes] = {}  # {second since 1970: its sentence}
+        self._count = 0  # number of data packets so far
+        self._fixes = _Fixes.from_source(source)
+        self._sentences: dict[int, bytes] = {}  # {second since 1970: sentence}
 
-    def beside(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
-        """Return the position packets that follow data packets, sent at `due_ns` (n,).
+    def following(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
+        """Return the position packets that follow data packets sent at `due_ns` (n,).
 
-        `stamps_ns` (n,) are the same times by the sensor's clock.
+        `stamps_ns` (n,) are the same times on the sensor's clock.
         """
         numbers = self._count + np.arange(1, len(due_ns) + 1)
         self._count += len(due_ns)
@@ -75,7 +75,7 @@ class PositionPackets:
         return Datagrams(_as_bytes(packets), due_ns[follows], self._port)
 
     def _sentence(self, second: int) -> bytes:
-        """Return the sentence of a second since 1970."""
+        """Return the sentence for a second since 1970."""
         if second not in self._sentences:
             since_start_ns = second * _SECOND_NS - self._source.start_ns
             fix = None if self._fixes is None else self._fixes.at(since_start_ns)
@@ -84,15 +84,15 @@ class PositionPackets:
 
 
 class _Fixes(NamedTuple):
-    """Fixes of a GNSS receiver, in the order of their times."""
+    """Fixes of a GNSS receiver in chronological order."""
 
-    times_ns: Ints  # (n,): since the survey's start
+    times_ns: Ints  # (n,): since the start of the survey
     latitudes_deg: Floats  # (n,)
     longitudes_deg: Floats  # (n,)
 
     @classmethod
-    def of_source(cls, source: PacketSource) -> _Fixes | None:
-        """Return the fixes of the carrier, or None if it has none with latitudes."""
+    def from_source(cls, source: PacketSource) -> _Fixes | None:
+        """Return the fixes of the platform, or None if it has none with latitudes."""
         instruments = source.instruments
         rows = [] if instruments is None else list(instruments.rows(GNSS_FILE))
         if not rows or len(rows[0]) < 6:
@@ -119,9 +119,9 @@ class _Fixes(NamedTuple):
 
 
 def gprmc(second: int, fix: Fix | None) -> bytes:
-    r"""Return the GPRMC sentence of a second since 1970, UTC.
+    r"""Return the GPRMC sentence for a second since 1970 (UTC).
 
-    Without a fix its status is V.
+    Without a fix, the status in the sentence is V.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def gprmc(second: int, fix: Fix | None) -> bytes:
 
 
 def _angle(angle_deg: float, digits: int) -> str:
-    """Return an angle as degrees, with some digits, and minutes of NMEA."""
+    """Return an angle in the NMEA format of degrees, with `digits` digits, and minutes."""
     whole, rest = divmod(round(abs(angle_deg) * 60 * 100_000), 60 * 100_000)
     return f"{whole:0{digits}d}{rest / 100_000:08.5f}"
 

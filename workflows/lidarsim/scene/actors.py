@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats, Indices
+from ..base.checks import check_fields, check_fits
 from ..base.elementary import interp
 from ..base.errors import LidarError, prefixed
-from ..base.validation import checked, checked_fields
-from ..base.vectors import length, products, turned
+from ..base.value_texts import one_line
+from ..base.vectors import dot, norm, rotate
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
     CENTER,
@@ -21,6 +22,7 @@ from ..motion.trajectory import (
     Stations,
     Track,
     Trajectory,
+    check_trajectory_type,
     full_poses,
     presence_ns,
 )
@@ -46,7 +48,6 @@ class ActorSamples(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Actor:
     """An object that moves during a survey.
 
@@ -77,7 +78,11 @@ class Actor:
     offset_s: float = 0.0
     spray: bool = True
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
+        check_trajectory_type("trajectory", self.trajectory)
         if self.mesh.voxels is not None:
             raise LidarError(
                 f"{self.name!r} contains voxels, which cannot move. List it in scene.files or "
@@ -133,7 +138,7 @@ class Actor:
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
             vertices = animation.vertices_at(self.played(np.array([time_ns]))[0])[0][0]
-        vertices = turned(vertices, None if rotations is None else rotations[0])
+        vertices = rotate(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Pictures, which call this, do not show masks.
@@ -188,10 +193,10 @@ class Actor:
             )
         positions, rotations = trajectory.poses(0, times_ns.clip(*presence_ns(trajectory)))
         steps = np.diff(positions, axis=0)
-        steps_m = length(steps)
+        steps_m = norm(steps)
         faces_travel = isinstance(trajectory, Track) and trajectory.quaternions is None
         if rotations is not None and not faces_travel:
-            backward = products(steps.T, rotations[:-1, :, 0].T) < 0
+            backward = dot(steps.T, rotations[:-1, :, 0].T) < 0
             steps_m = np.where(backward, -steps_m, steps_m)
         return times_ns, np.append(0.0, np.cumsum(steps_m))
 
@@ -308,7 +313,6 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     return SceneMesh(name, *parts, colors=colors, animation=animation, materials=materials)
 
 
-@checked
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
     """Create a box mesh whose origin is the center of its bottom face.
 
@@ -324,6 +328,7 @@ def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
     >>> box("Car", (4.5, 1.8, 1.5)).bounds.tolist()
     [[-2.25, -0.9, 0.0], [2.25, 0.9, 1.5]]
     """
+    check_fits("size_m", size_m, tuple[float, float, float])
     corners = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     sides = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     faces = [[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides]

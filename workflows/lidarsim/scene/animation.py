@@ -8,9 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from ..base.arrays import Floats, Indices
+from ..base.checks import as_array, check_fields
 from ..base.errors import LidarError
-from ..base.validation import as_array, checked_fields
-from ..base.vectors import turned
+from ..base.value_texts import one_line
+from ..base.vectors import rotate
 
 RATE_HZ = 60.0  # least rate of baked poses
 # Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.
@@ -18,7 +19,6 @@ MAX_PICTURED_VERTICES = 500_000
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Animation:
     """Poses of a mesh, evenly spaced, between which its vertices move straight.
 
@@ -49,7 +49,10 @@ class Animation:
     speed_m_s: float | None = None
     repeat: bool = True
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         poses = as_array("vertices of an animation", self.vertices)
         object.__setattr__(self, "vertices", np.ascontiguousarray(poses))
         shape = np.shape(self.vertices)
@@ -105,5 +108,5 @@ class Animation:
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:
         """Return the animation with all vertices at p -> linear @ p + offset."""
-        points = turned(self.vertices.reshape(-1, 3), linear) + offset
+        points = rotate(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

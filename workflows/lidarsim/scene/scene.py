@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices, Ints32
+from ..base.checks import as_array, check_fields, check_list
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
-from ..base.signatures import shown_readably, with_fields_of
-from ..base.validation import as_array, checked, checked_fields
 from ..base.value_texts import shown
 from ..base.vectors import hypot
 from ..base.words import listed, plural
@@ -27,7 +26,6 @@ from ..motion.trajectory import Track
 from .actors import Actor
 from .colors import GRAY, Colors, are_indices, join_colors
 from .face_materials import ObjectMaterials
-from .files.mesh_options import MeshOptions
 from .files.meshfile import Objects, load_objects, warn
 from .object_names import SameNames, resolve_same_names, unique_names
 from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
@@ -42,7 +40,6 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Scene:
     """A scene, which consists of triangles that belong to named objects.
 
@@ -123,6 +120,7 @@ class Scene:
         return table_of(rows.items()) + picture_of(self)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         vertices = points_array("the scene", self.vertices)
         faces = np.ascontiguousarray(as_array("faces", self.faces, np.int32))
         owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
@@ -164,7 +162,6 @@ class Scene:
         return cls.from_meshes(seed_objects())
 
     @classmethod
-    @with_fields_of(MeshOptions, without=("animation",))
     def load(
         cls,
         path: str | Path,
@@ -235,7 +232,6 @@ class Scene:
         return cls.from_objects(objects._replace(static=tuple(static)))
 
     @classmethod
-    @shown_readably
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
         """Create a scene from the objects of mesh files.
 
@@ -256,7 +252,6 @@ class Scene:
         return scene.with_actors(actors) if actors else scene
 
     @classmethod
-    @checked
     def from_meshes(cls, meshes: Iterable[SceneMesh | SceneInstance]) -> Scene:
         """Create a scene with one object per mesh.
 
@@ -272,6 +267,7 @@ class Scene:
             If there are no meshes, or if the number of vertices or triangles exceeds the range of
             32-bit integers.
         """
+        check_list("meshes", meshes)
         objects = list(meshes)
         _check_objects(objects)
         split = _split_by_kind(objects)

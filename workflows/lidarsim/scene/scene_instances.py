@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32
+from ..base.checks import check_fields
 from ..base.elementary import decade
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
-from ..base.vectors import applied, determinant, inverse, matmul, rank
+from ..base.value_texts import one_line
+from ..base.vectors import determinant, inverse, matmul, matvec, rank
 from ..motion.trajectory import Pose
 from .colors import Colors
 from .face_materials import FaceMaterials
@@ -29,7 +30,6 @@ BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class SceneInstance:
     """A mesh that is placed in the world.
 
@@ -57,7 +57,10 @@ class SceneInstance:
     transform: ArrayLike | Transform | Pose
     name: str = ""
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         transform = self.transform
         if isinstance(transform, Pose):
             transform = Transform(transform.rotation_matrix, np.array(transform.position))
@@ -105,7 +108,7 @@ class SceneInstance:
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
         """Return an instance with another name, transformed by p -> linear @ p + offset."""
-        position = applied(linear, self.matrix[:3, 3]) + offset
+        position = matvec(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
     def flat(self) -> SceneMesh:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
+from ..base.checks import as_array, check_fields
 from ..base.errors import LidarError
-from ..base.validation import as_array, checked_fields
-from ..base.vectors import determinant, length, matmul, rank, turned
+from ..base.value_texts import one_line
+from ..base.vectors import determinant, matmul, norm, rank, rotate
 from .animation import Animation
 from .colors import Colors
 from .face_materials import FaceMaterials
@@ -63,7 +64,6 @@ class Voxels:
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class SceneMesh:
     """Triangle mesh of an object in world coordinates.
 
@@ -103,7 +103,10 @@ class SceneMesh:
     animation: Animation | None = None
     materials: FaceMaterials | None = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
@@ -166,7 +169,7 @@ class SceneMesh:
             colors = colors and colors.mirrored()
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
-        vertices = turned(self.vertices, linear) + offset
+        vertices = rotate(self.vertices, linear) + offset
         return SceneMesh(
             name=name,
             vertices=vertices,
@@ -265,5 +268,5 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 def triangle_areas(corners: AnyFloats) -> Floats:
     """Return the areas (n,) of triangles from their corners (n, 3, 3)."""
     sides = corners[:, 1:] - corners[:, :1]
-    doubled = length(np.cross(sides[:, 0], sides[:, 1]))
+    doubled = norm(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(doubled / 2, np.float64)

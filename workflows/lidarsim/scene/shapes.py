@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats, Ints
 from ..base.elementary import cos, interp, sin, sin_cos
-from ..base.vectors import length
+from ..base.vectors import norm
 from .scene_mesh import SceneMesh
 
 SEED_RADIUS_M = 2.0
@@ -146,6 +146,6 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
 def resample(line: ArrayLike, count: int) -> Floats:
     """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
     points = np.asarray(line, dtype=np.float64)
-    distances = np.concatenate([[0.0], np.cumsum(length(np.diff(points, axis=0)))])
+    distances = np.concatenate([[0.0], np.cumsum(norm(np.diff(points, axis=0)))])
     even_distances = np.linspace(0.0, distances[-1], count)
     return np.stack([interp(even_distances, distances, column) for column in points.T], axis=1)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
+from ..base.checks import as_array
 from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarError
-from ..base.validation import as_array
-from ..base.vectors import applied, length, matmul, rank
+from ..base.vectors import matmul, matvec, norm, rank
 from ..motion.trajectory import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
@@ -36,12 +36,12 @@ def affine(linear: Floats, offset: Floats) -> Floats:
 def inverted(matrix: Floats) -> Floats:
     """Return the inverse (4, 4) of the matrix (4, 4) of a pose."""
     back = matrix[:3, :3].T
-    return affine(back, -applied(back, matrix[:3, 3]))
+    return affine(back, -matvec(back, matrix[:3, 3]))
 
 
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
     """Return the rotation (3, 3) about an axis that is not zero (Rodrigues 1840)."""
-    cross = np.cross(np.eye(3), np.array(axis) / length(np.array(axis, np.float64)))
+    cross = np.cross(np.eye(3), np.array(axis) / norm(np.array(axis, np.float64)))
     sine, cosine = sin_cos_of(math.radians(degrees))
     rotation: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
     return np.eye(3) + rotation

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
+from ..base.checks import as_array, check_fields, check_number
 from ..base.declared import about
 from ..base.elementary import cos, sin_cos
 from ..base.errors import LidarError
-from ..base.signatures import ReadableSignature
-from ..base.validation import as_array, checked, checked_fields
+from ..base.value_texts import one_line
 
 MAX_CHANNELS = 65_535  # limit of the type of the column
 
@@ -47,8 +47,6 @@ class Beams:
         If the lengths differ, a value is not finite, or there are no beams or too many beams.
     """
 
-    __signature__ = ReadableSignature()
-
     elevation: Floats
     azimuth: Floats = field(default_factory=lambda: np.zeros(0))
     time_ns: Floats = field(default_factory=lambda: np.zeros(0))
@@ -74,12 +72,12 @@ class Beams:
         return f"<Beams: {len(self)}, {min_deg:.4g} to {max_deg:.4g} deg>"
 
     @classmethod
-    @checked
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
         """Create beams that are evenly spaced over a vertical field of view, including both ends.
 
         The field of view is centered on the horizon. A single beam points straight forward.
         """
+        check_number("layers", layers, whole=True, ge=1, le=MAX_CHANNELS)
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
@@ -128,7 +126,6 @@ Duty = Annotated[float, Field(gt=0, le=1)]
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Spin:
     """A head that rotates at a constant rate.
 
@@ -164,7 +161,10 @@ class Spin:
     clockwise: bool = False
     zero_deg: float = 0.0
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if self._firings_per_step < 1:
             raise LidarError(
                 f"step_deg is {self.step_deg}, which is less than the angle between two firings "
@@ -255,7 +255,6 @@ class Spin:
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Mirror(Spin):
     """A mirror that sweeps the beams over a line, to and fro or in a single direction.
 
@@ -267,6 +266,11 @@ class Mirror(Spin):
     width_deg: Width = 60.0  # length of a line
     # Share of each cycle while the sensor fires: a polygon's facets sweep more than the line.
     duty: Duty = 1.0
+
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def times_ns(self, firings: Ints) -> Floats:
         """Return the starts of firings (k,), nanoseconds since the mirror started: (k,)."""

@@ -17,8 +17,8 @@ from ..base.errors import converted
 from ..base.textfile import read_text
 from ..base.words import did_you_mean_each, joined, printable
 from ..base.yamlfile import load_yaml
-from ..sensor_files.comma_rows import rows_of
-from ..sensor_files.fired_rays import FiredRays
+from ..sensor_files.comma_rows import parse_rows
+from ..sensor_files.fired_rays import RayList
 from ..sensor_files.format_table import read_rays
 from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
@@ -241,9 +241,9 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     return np.asarray(origin_mm, np.float64)
 
 
-def _calibration_of(name: str, rays: FiredRays) -> Calibration:
+def _calibration_of(name: str, rays: RayList) -> Calibration:
     """Return the rays of a file of a sensor as a calibration, with their times."""
-    rays = rays.timed()
+    rays = rays.with_times()
     assert rays.times_ns is not None  # timed rays have times
     shot_ns = rays.times_ns.astype(np.float64)
     interval_ns = float(shot_ns[-1]) / max(len(rays) - 1, 1) or 1e9 / rays.rate_hz / len(rays)
@@ -293,7 +293,7 @@ def _table(name: str, text: str) -> Calibration:
             )
         if duplicate := next((word for word in header if header.count(word) > 1), None):
             raise ValueError(f"the column {duplicate!r} occurs twice")
-        columns = dict(zip(header, rows_of(text, 1, len(header)).T, strict=True))
+        columns = dict(zip(header, parse_rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
             np.radians(columns["elevation_deg"]),
@@ -308,7 +308,7 @@ def _table(name: str, text: str) -> Calibration:
         raise ValueError(
             f"the format of its first line, {','.join(header)[:60]!r}, is unknown"
         ) from None
-    elevation, azimuth = np.radians(rows_of(text, 0, 2)).T
+    elevation, azimuth = np.radians(parse_rows(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
 
 
@@ -322,7 +322,7 @@ def _hesai(name: str, text: str) -> Calibration:
             f"the line after {_HESAI_MARK} must be Channel,Elevation,Azimuth, but is "
             f"{printable(header, 60)!r}"
         )
-    rows = rows_of(_HESAI_CHECKSUM.sub("", text), skip, 3)
+    rows = parse_rows(_HESAI_CHECKSUM.sub("", text), skip, 3)
     if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
         raise ValueError(f"its channels must be 1 to {len(rows)}, each exactly once and in order")
     elevation, azimuth = np.radians(rows[:, 1:]).T

@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Ints
+from ..base.checks import check_fits, check_type
 from ..base.errors import LidarError, MissingFileError
-from ..base.validation import checked
 from ..base.words import rounded
-from ..sensor_files.fired_rays import FRAME_HZ, FiredRays, Light
+from ..sensor_files.fired_rays import FRAME_HZ, Light, RayList
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
 from .optics import Optics
 from .ray_sensors import PrismSensor
@@ -42,18 +42,17 @@ class SensorFile(NamedTuple):
 
     path: Path
     format: str
-    rays: FiredRays
+    rays: RayList
     left_out: tuple[str, ...]
 
 
-@checked
 def export_sensor(
     sensor: Any,
     path: str | Path,
     *,
     format: str | None = None,  # noqa: A002 - the name of the option
-    seconds: Seconds | None = None,
-    revolutions: Revolutions | None = None,
+    seconds: float | None = None,
+    revolutions: int | None = None,
 ) -> SensorFile:
     """Export the rays or the optics of a sensor to a file for another program.
 
@@ -91,16 +90,14 @@ def export_sensor(
     """
     path = Path(path)
     row = format_of(path, format)
-    if not isinstance(sensor, Sensor):
-        raise LidarError(
-            f"sensor must be a Sensor, but is a {type(sensor).__name__}. Load one with "
-            "load_sensor(MODEL)."
-        )
+    check_type("sensor", sensor, Sensor, advice=" Load one with load_sensor(MODEL).")
+    check_fits("seconds", seconds, Seconds | None)
+    check_fits("revolutions", revolutions, Revolutions | None)
     if not path.parent.is_dir():
         raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     write = row.function("write")
     if row.describes:
-        rays = FiredRays(np.zeros((0, 3)))
+        rays = RayList(np.zeros((0, 3)))
         duration_s = _duration_ns(sensor, seconds, revolutions) / 1e9
         left_out = write(path, sensor, duration_s, _left_out(sensor, row))
     else:
@@ -117,7 +114,7 @@ def export_sensor(
 
 def fired_rays(
     sensor: Sensor, *, seconds: float | None = None, revolutions: int | None = None
-) -> FiredRays:
+) -> RayList:
     """Return the rays of a sensor's first firings, in the order of their times.
 
     Firings are whole: the last firing starts before the end of the duration. The duration is
@@ -136,7 +133,7 @@ def fired_rays(
     times_ns = times_ns[order] - min(0, times_ns.min())
     origins = sensor.origins(firings)
     channels = np.tile(np.arange(sensor.channels), count)
-    return FiredRays(
+    return RayList(
         directions=sensor.directions(firings).reshape(-1, 3)[order],
         times_ns=times_ns,
         channels=channels[order],

@@ -21,7 +21,7 @@ import numpy as np
 from ..base.arrays import Floats
 from ..base.errors import LidarError
 from ..base.words import rounded
-from ..sensor_files.complete_files import remark, write_text_of
+from ..sensor_files.complete_files import write_complete_text, xml_comment
 from .beams import Beams, Mirror, Spin
 from .noise import Noise
 from .ray_sensors import ListedSensor, PrismSensor
@@ -104,17 +104,17 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
     name = re.sub(r"[^\w.-]+", "_", sensor.model).strip("_.").lower() or "lidar"
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        f"<!-- {remark(sensor.model)}. Axes of the platform: {AXES}. -->",
-        *(f"<!-- Not in this file: {remark(clause)}. -->" for clause in lost),
-        f'<!-- In a survey, set scanner="{remark(path.name)}#{name}", and in each leg',
-        f'     <scannerSettings template="{remark(path.name)}#{name}"/>. -->',
+        f"<!-- {xml_comment(sensor.model)}. Axes of the platform: {AXES}. -->",
+        *(f"<!-- Not in this file: {xml_comment(clause)}. -->" for clause in lost),
+        f'<!-- In a survey, set scanner="{xml_comment(path.name)}#{name}", and in each leg',
+        f'     <scannerSettings template="{xml_comment(path.name)}#{name}"/>. -->',
         "<document>",
         *_scanner_lines(name, sensor, scanner),
         f'  <scannerSettings id="{name}" active="true" pulseFreq_hz="{scanner.pulse_hz}"'
         f"{_attributes(scanner.settings)}/>",
         "</document>",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return lost
 
 

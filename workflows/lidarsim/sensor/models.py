@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..base.arrays import Floats, Ints
+from ..base.checks import check_fits
 from ..base.declared import UnitShare
 from ..base.elementary import log1p, sin_cos
 from ..base.error_sentences import sentences
@@ -22,16 +23,15 @@ from ..base.errors import LidarError, converted
 from ..base.input_files import read_input_text
 from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..base.plugins import Plugin, find_plugin
-from ..base.validation import checked
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
-from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
+from .beams import Beams, Duty, Mirror, MirrorMotion, Spin, Width
 from .calibrations import Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .packet_settings import Identifier, PacketSettings, laser_order
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
-from .sensor import LineSensor, MaxRange, MinRange, Sensor
+from .sensor import LineSensor, Sensor
 
 MODEL_FILES = (".yaml", ".yml")
 Sheet = Literal["ideal", "datasheet"]
@@ -411,16 +411,15 @@ def shown_noise(noise: Noise) -> str:
     return ", ".join(shown)
 
 
-@checked
 def load_sensor(
     model: str | Path | None = None,
     *,
     calibration: str | Path | None = None,
     columns: int | None = None,
-    rate_hz: Rate | None = None,
-    step_deg: Step = 10.0,
-    min_range_m: MinRange | None = None,
-    max_range_m: MaxRange | None = None,
+    rate_hz: float | None = None,
+    step_deg: float = 10.0,
+    min_range_m: float | None = None,
+    max_range_m: float | None = None,
     performance: Sheet | None = None,
 ) -> Sensor:
     """Load a sensor from a sensor model, from the calibration of a unit, or from both.
@@ -461,6 +460,7 @@ def load_sensor(
     >>> sensor.name, sensor.channels, round(sensor.head.firings_per_turn, 3)
     ('Velodyne VLP-16', 16, 1808.449)
     """
+    check_fits("performance", performance, Sheet | None)
     unit = None if calibration is None else read_calibration(Path(calibration))
     if model is not None:
         sensor_model = read_model(model)

@@ -9,10 +9,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from ..base.checks import check_fields
 from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
 from ..base.errors import LidarError
 from ..base.random_numbers import named_seed
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..media.materials import at_right_angles
 
 # Detection threshold for signal plus noise, in standard deviations.
@@ -27,7 +28,6 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Noise:
     """Noise model of a sensor: range and angle errors, lost returns, and false alarms.
 
@@ -150,7 +150,10 @@ class Noise:
         AngleDeg, about("phase of the azimuth error in degrees at azimuth 0")
     ] = 0.0
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if np.ndim(self.channel_bias_m):
             biases = tuple(np.asarray(self.channel_bias_m, np.float64).tolist())
             object.__setattr__(self, "channel_bias_m", biases)

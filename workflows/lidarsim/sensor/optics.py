@@ -10,10 +10,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from ..base.declared import about, allowed
+from ..base.checks import check_fields
+from ..base.declared import FileSection, about, allowed
 from ..base.elementary_scalars import log_of
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from ..base.vectors import hypot
 from ..base.words import rounded
 from .disc import SUBRAYS, Beam, Profile
@@ -43,8 +44,7 @@ Precision = Annotated[float, Field(ge=1e-6, le=1000)]
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Optics:
+class Optics(FileSection):
     """Optical parameters and range resolution of a sensor."""
 
     wavelength_nm: Annotated[
@@ -73,13 +73,15 @@ class Optics:
         about("scale of the column `reflectivity`; Velodyne's if unknown"),
     ] = "velodyne"
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Returns:
     """Sub-rays of each beam, and the returns that the sensor reports for each pulse.
 
@@ -159,7 +161,10 @@ class Returns:
         ),
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 

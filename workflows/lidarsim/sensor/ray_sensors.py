@@ -11,16 +11,16 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
+from ..base.checks import check_fields
 from ..base.elementary import sin_cos
 from ..base.elementary_scalars import sin_cos_of
 from ..base.errors import LidarError
-from ..base.validation import checked_fields
+from ..base.value_texts import one_line
 from .beams import Beams
 from .sensor import Sensor
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Prism:
     """A wedge prism that turns about x."""
 
@@ -30,9 +30,13 @@ class Prism:
     phase_deg: float = 0.0  # angle of its thin edge at time 0, from y to z
     inclined_first: bool = False  # light enters through the inclined face, else the flat face
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True)
-@checked_fields
 class TurningMirror:
     """A plane mirror behind prisms, which turns about the axis of the prisms and looks up."""
 
@@ -40,8 +44,13 @@ class TurningMirror:
     rpm: float  # revolutions a minute about the axis, from x to y of the sensor
     phase_deg: float = 0.0  # azimuth of its normal at time 0, from x to y
 
+    __repr__ = one_line
 
-@dataclass(frozen=True, eq=False)
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class PrismSensor(Sensor):
     """Beams along x through wedge prisms that turn about x at different rates.
 
@@ -149,7 +158,7 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     return refracted
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ListedSensor(Sensor):
     """A sensor with a list of rays, as in a maker's file: each firing is the next ray of the list.
 

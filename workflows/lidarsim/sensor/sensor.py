@@ -13,14 +13,15 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
+from ..base.checks import check_fields, check_fits
 from ..base.declared import about
 from ..base.elementary import arcsin, arctan2, sin_cos
 from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
-from ..base.validation import checked, checked_fields
-from ..base.vectors import turned
+from ..base.value_texts import one_line
+from ..base.vectors import rotate
 from ..base.words import rounded
-from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
+from .beams import MAX_CHANNELS, Beams, Head, Mirror, Spin
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
 from .packet_settings import Identifier, PacketSettings
@@ -54,7 +55,6 @@ MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
 
 @dataclass(frozen=True, eq=False)
-@checked_fields
 class Sensor:
     """A lidar sensor, which consists of beams and a head that moves them.
 
@@ -110,7 +110,10 @@ class Sensor:
     packets: PacketSettings | None = field(default=None, kw_only=True, compare=False)
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         if not self.max_range_m > self.min_range_m:
             raise LidarError(
                 f"max_range_m must be greater than min_range_m, but is {self.max_range_m}."
@@ -178,18 +181,17 @@ class Sensor:
         return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod
-    @checked
     def grid(
         cls,
-        rays_per_revolution: RaysPerRevolution = 1000,
-        layers: Layers = 40,
-        vertical_fov_deg: Fov = 60.0,
-        step_deg: Step = 10.0,
-        min_range_m: MinRange = 0.0,
-        max_range_m: MaxRange = float("inf"),
-        rate_hz: Rate = 10.0,
+        rays_per_revolution: int = 1000,
+        layers: int = 40,
+        vertical_fov_deg: float = 60.0,
+        step_deg: float = 10.0,
+        min_range_m: float = 0.0,
+        max_range_m: float = float("inf"),
+        rate_hz: float = 10.0,
         *,
-        horizontal_fov_deg: Sector = 360.0,
+        horizontal_fov_deg: float = 360.0,
     ) -> Sensor:
         """Create a spinning sensor with evenly spaced azimuths and elevations.
 
@@ -223,6 +225,10 @@ class Sensor:
             If a value is out of range, several layers have a field of view of 0, or a time step
             contains no firings.
         """
+        check_fits("rays_per_revolution", rays_per_revolution, RaysPerRevolution)
+        check_fits("layers", layers, Layers)
+        check_fits("vertical_fov_deg", vertical_fov_deg, Fov)
+        check_fits("horizontal_fov_deg", horizontal_fov_deg, Sector)
         if layers > 1 and vertical_fov_deg == 0:
             raise LidarError(
                 f"vertical_fov_deg is 0, so all {layers:,} layers would be identical. Set layers "
@@ -387,7 +393,7 @@ class Sensor:
         rotated[..., 2] = z
         if self.axes is None:
             return rotated
-        return turned(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
+        return rotate(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the start times of several firings in nanoseconds since the start of the station.
@@ -410,7 +416,7 @@ class Sensor:
         return float(self.beams.time_ns.min())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LineSensor(Sensor):
     """A sensor whose head rotates about its x axis: azimuth 0 is down, 90 degrees to the left.
 

@@ -1,1 +1,1 @@
-"""Files with the rays of sensors, for other programs and from other programs."""
+"""Exchange files that list the rays of sensors or describe their scan patterns."""

@@ -1,4 +1,4 @@
-"""Rows of numbers that commas separate."""
+"""Parse rows of comma-separated numbers."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 from ..base.arrays import Floats
 
 
-def rows_of(text: str, skip: int, columns: int) -> Floats:
-    """Return the numbers of the lines after a header of `skip` lines, (n, columns).
+def parse_rows(text: str, skip: int, columns: int) -> Floats:
+    """Return the numbers in the lines after a header, with shape (n, columns).
+
+    `skip` is the number of header lines.
 
     Raises
     ------
     ValueError
-        If there are no such lines, or a number is not finite; the message names the line.
+        If there are no such lines, or if a number is not finite. The message names the line.
     """
     if not any(line.strip() for line in text.splitlines()[skip:]):
         raise ValueError(f"it has no lines of {columns} numbers")

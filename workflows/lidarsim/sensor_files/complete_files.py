@@ -1,4 +1,4 @@
-"""Files of sensors are written completely or not at all."""
+"""Write sensor files so that they are either complete or do not exist."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..base.storage import Storage
 
 
 @contextmanager
-def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that appears after the body.
+def open_complete(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing that appears only when the context ends without an error.
 
     Raises LidarError if the file cannot be written.
     """
@@ -24,15 +24,15 @@ def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
         yield file
 
 
-def write_text_of(path: Path, text: str) -> None:
-    """Write a text in UTF-8.
+def write_complete_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8.
 
     Raises LidarError if the file cannot be written.
     """
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         file.write(text.encode())
 
 
-def remark(text: str) -> str:
-    """Return a text for a comment of XML, which must not have two hyphens in a row."""
+def xml_comment(text: str) -> str:
+    """Return a text for an XML comment, which must not contain two consecutive hyphens."""
     return text.replace("--", "- -").rstrip("-")

@@ -1,4 +1,4 @@
-"""Rays of a sensor in the order of firing, as files of sensors hold them."""
+"""Rays of a sensor in firing order, as stored in sensor files."""
 
 from __future__ import annotations
 
@@ -10,49 +10,51 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..base.elementary import arctan2, sin_cos
 
-# Conventions of rays, which files state in their headers.
+# Conventions for rays, which are stated in file headers.
 AXES = "x forward, y left, z up"
 AZIMUTH = "from x, counter-clockwise seen from above, within half a turn"
 ELEVATION = "above the xy plane"
 TIME = "nanoseconds since the start of the list"
-FRAME_HZ = 10.0  # of lists that state neither times nor a rate
+FRAME_HZ = 10.0  # assumed for lists that state neither times nor a rate
 
 
 class Light(NamedTuple):
-    """Light of a sensor."""
+    """Optical properties of a sensor's light."""
 
     wavelength_nm: float
     pulse_ns: float
-    # Full angles across and up, at 1/e² of the maximum; None if unknown.
+    # Full horizontal and vertical angles at 1/e² of the maximum; None if unknown.
     divergence_mrad: tuple[float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
-class FiredRays:
-    """Rays of a sensor, in the sensor frame: x forward, y left, z up.
+class RayList:
+    """Rays of a sensor, in the sensor frame with x forward, y left and z up.
 
     Attributes
     ----------
     directions
-        float64 (n, 3): unit directions in the order of firing.
+        float64 array (n, 3) of unit directions in firing order.
     times_ns
-        int64 (n,): times of firing since the start of the list, nanoseconds; None if unknown.
+        int64 array (n,) of firing times in nanoseconds since the start of the list, or None if
+        unknown.
     channels
-        int64 (n,): channel of each ray; 0 is the lowest.
+        int64 array (n,) with the channel of each ray; 0 is the lowest channel.
     origins
-        float64 (n, 3): starts of the rays, meters; None if all start at the sensor's center.
+        float64 array (n, 3) of ray origins in meters, or None if all rays start at the sensor's
+        center.
     cycle_ns
-        Duration of the list, after which it may be repeated, nanoseconds; None if unknown.
+        Duration of the list in nanoseconds, after which it can be repeated, or None if unknown.
     rate_hz
-        Revolutions, lines or frames a second.
+        Number of revolutions, lines or frames per second.
     range_m
-        Shortest and longest range, meters; the longest may be infinite.
+        Minimum and maximum range in meters. The maximum may be infinite.
     name
         Name of the sensor.
     repeats
-        Whether the sensor itself repeats these rays, except for parts of a firing.
+        Whether the sensor itself repeats these rays exactly, apart from incomplete firings.
     light
-        Light of the sensor; None if unknown.
+        Optical properties of the light, or None if unknown.
     """
 
     directions: Floats
@@ -75,23 +77,23 @@ class FiredRays:
 
     @property
     def azimuths_deg(self) -> Floats:
-        """Azimuths (n,), degrees, counter-clockwise from x, within ±180."""
+        """Azimuths (n,) in degrees within ±180, counterclockwise from x."""
         x, y, _ = self.directions.T
         return np.degrees(arctan2(y, x))
 
     @property
     def elevations_deg(self) -> Floats:
-        """Elevations (n,), degrees above the xy plane."""
+        """Elevations (n,) in degrees above the xy plane."""
         x, y, z = self.directions.T
         return np.degrees(arctan2(z, np.sqrt(x * x + y * y)))
 
     @property
     def origins_or_center(self) -> Floats:
-        """Starts of the rays (n, 3), meters, or zeros if all start at the sensor's center."""
+        """Origins of the rays (n, 3) in meters, which are zero if all start at the center."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
-    def timed(self) -> FiredRays:
-        """Return the rays with times: without stated times, evenly spread over a frame."""
+    def with_times(self) -> RayList:
+        """Return the rays with times, which are spread evenly over a frame if they are unknown."""
         if self.times_ns is not None:
             return self
         cycle_ns = self.cycle_ns or 1e9 / self.rate_hz
@@ -100,7 +102,7 @@ class FiredRays:
 
 
 def directions_of(azimuths_deg: Floats, elevations_deg: Floats) -> Floats:
-    """Return the unit directions (n, 3) of azimuths and elevations (n,), degrees."""
+    """Return the unit directions (n, 3) for azimuths and elevations (n,) in degrees."""
     up, level = sin_cos(np.radians(elevations_deg))
     sin, cos = sin_cos(np.radians(azimuths_deg))
     return np.column_stack([level * cos, level * sin, up])

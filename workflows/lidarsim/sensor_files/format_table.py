@@ -1,6 +1,6 @@
-"""The table of files of sensors: the module of each format, its endings, and what it holds.
+"""Table of the sensor file formats, with their modules, extensions and supported properties.
 
-It is quick to import: help of the command reads it.
+This module must be quick to import, because command-line help reads it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ..base.extras import need
 from ..base.words import did_you_mean
 
 if TYPE_CHECKING:
-    from .fired_rays import FiredRays
+    from .fired_rays import RayList
 
-# What a format may hold of a sensor besides directions. {name: words for what it does not hold}
+# Properties besides directions that a format can store. {name: phrase for a missing property}
 PROPERTIES = {
     "times": "times of the rays",
     "channels": "channels",
@@ -34,30 +34,31 @@ PROPERTIES = {
 
 @dataclass(frozen=True)
 class SensorFormat:
-    """A format of files of sensors.
+    """A sensor file format.
 
     Parameters
     ----------
     name
-        Name of the format, as in ``--as``.
+        Name of the format, as used with ``--as``.
     endings
-        Endings of its files, such as ``.csv``.
+        File name extensions, such as ``.csv``.
     module
-        Dotted name of the module of the format. `write(path, rays, left_out)` there writes rays,
-        and returns all that the file does not hold of the sensor, a clause each, `left_out` by
-        `PROPERTIES` first; `read(path)` returns `FiredRays`, or None for a file of
-        another format. If the format `describes`, it is
-        `write(path, sensor, duration_s, left_out)`, for a duration of the pattern in seconds.
+        Dotted name of the module that implements the format. Its function
+        `write(path, rays, left_out)` writes rays and returns phrases for everything that the file
+        does not store, starting with `left_out`, which come from `PROPERTIES`. Its function
+        `read(path)` returns `RayList`, or None if the file has another format. If `describes` is
+        set, the function is `write(path, sensor, duration_s, left_out)` instead, for a pattern that
+        lasts `duration_s` seconds.
     words
-        Description in a few words.
+        Short description.
     holds
-        Names in `PROPERTIES` of what the format holds.
+        Names in `PROPERTIES` that the format stores.
     by_ending
-        Whether the ending alone chooses the format; else ``--as`` does.
+        Whether the extension alone selects the format. Otherwise ``--as`` is required.
     reads
-        Whether there is a function `read`.
+        Whether the module has a function `read`.
     describes
-        Whether the file describes the sensor's optics, and does not list its rays.
+        Whether the file describes the sensor's optics instead of listing its rays.
     packages, extra
         Import packages that the module needs, and the extra that installs them.
     """
@@ -74,7 +75,7 @@ class SensorFormat:
     extra: str = ""
 
     def function(self, name: str) -> Any:
-        """Import the module and return its function of a name.
+        """Import the module and return one of its functions.
 
         Raises LidarError if a package that the module needs is not installed.
         """
@@ -86,7 +87,7 @@ class SensorFormat:
 def _row(
     name: str, endings: str, words: str, holds: Sequence[str] = (), **options: Any
 ) -> SensorFormat:
-    """Return a row of the table whose module stands beside this module."""
+    """Return a row of the table for a module in this package."""
     module = options.pop("module", name)
     return SensorFormat(
         name,
@@ -140,7 +141,7 @@ FORMATS: tuple[SensorFormat, ...] = (
         by_ending=True,
         reads=False,
     ),
-    SensorFormat(  # its module needs the sensor, which stands above this package
+    SensorFormat(  # in another package, because its module needs the sensor classes
         "helios",
         (".xml",),
         "lidarsim.sensor.helios_scanner",
@@ -169,12 +170,12 @@ _BY_NAME = {row.name: row for row in FORMATS}
 
 
 def format_of(path: Path, name: str | None) -> SensorFormat:
-    """Return the format of a file that is to be written, by its name or by the ending.
+    """Return the format in which to write a file, selected by name or by extension.
 
     Raises
     ------
     LidarError
-        If there is no such format, or the file has another ending than the format.
+        If there is no such format, or the extension does not match it.
     """
     ending = path.suffix.lower()
     if name is not None and name not in _BY_NAME:
@@ -196,7 +197,7 @@ def format_of(path: Path, name: str | None) -> SensorFormat:
 
 
 def _choices(ending: str) -> str:
-    """Return a sentence on the formats of an ending, or on all endings."""
+    """Return advice that lists the formats for an extension, or all extensions."""
     names = [row.name for row in FORMATS if ending in row.endings]
     if names:
         return f"Select a format with {' or '.join(f'--as {name}' for name in names)}."
@@ -206,21 +207,21 @@ def _choices(ending: str) -> str:
     )
 
 
-def read_rays(path: Path) -> FiredRays | None:
-    """Return the rays of a file by its ending, or None for the ending of an unread format.
+def read_rays(path: Path) -> RayList | None:
+    """Return the rays in a file, or None if no format that can be read has its extension.
 
     Raises
     ------
     ValueError
-        If the file has none of the formats of its ending.
+        If the file has none of the formats with its extension.
     LidarError
-        If a package is missing, or the file is larger than the memory.
+        If a package is missing, or the file exceeds the memory limit.
     OSError
         If the file cannot be read.
     """
     rows = [row for row in FORMATS if row.reads and path.suffix.lower() in row.endings]
     for row in rows:
-        rays: FiredRays | None = row.function("read")(path)
+        rays: RayList | None = row.function("read")(path)
         if rays is not None:
             return rays
     return None

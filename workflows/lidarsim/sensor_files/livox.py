@@ -1,7 +1,8 @@
-"""Livox's lists of rays (.csv): Time/s, Azimuth/deg, Zenith/deg.
+"""Livox ray lists (.csv) with the columns Time/s, Azimuth/deg and Zenith/deg.
 
-The plug-in livox_laser_simulation for Gazebo and its descendants read them. The zenith angle is
-counted from the z axis, the azimuth counter-clockwise from x; times may only number the rows.
+The Gazebo plug-in livox_laser_simulation and its descendants read this format. The zenith angle is
+measured from the z axis, and the azimuth counterclockwise from x. In some files, the times are only
+row numbers.
 """
 
 from __future__ import annotations
@@ -12,62 +13,62 @@ from pathlib import Path
 import numpy as np
 
 from ..base.textfile import read_text
-from .comma_rows import rows_of
-from .complete_files import write_text_of
-from .fired_rays import FiredRays, directions_of
+from .comma_rows import parse_rows
+from .complete_files import write_complete_text
+from .fired_rays import RayList, directions_of
 
 HEADER = "Time/s,Azimuth/deg,Zenith/deg"
 _DECIMALS = 9
 _SECOND_NS = 1_000_000_000
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays in the order of firing.
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
+    """Write rays in firing order.
 
-    The format has no remarks.
+    The format has no comments, so missing properties are only returned.
     """
-    times_ns = rays.timed().times_ns
-    assert times_ns is not None  # of timed rays
-    azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # no -0.0
+    times_ns = rays.with_times().times_ns
+    assert times_ns is not None  # `with_times` sets the times
+    azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # + 0.0 avoids -0.0
     zeniths = np.round(90 - rays.elevations_deg, _DECIMALS)
     rows = zip(times_ns.tolist(), azimuths.tolist(), zeniths.tolist(), strict=True)
     lines = [
         f"{time_ns // _SECOND_NS}.{time_ns % _SECOND_NS:09d},{azimuth!r},{zenith!r}"
         for time_ns, azimuth, zenith in rows
     ]
-    write_text_of(path, "\n".join([HEADER, *lines]) + "\n")
+    write_complete_text(path, "\n".join([HEADER, *lines]) + "\n")
     return left_out
 
 
 def is_livox(text: str) -> bool:
-    """Return True if a text has the header of Livox's lists."""
+    """Return whether a text has the header of a Livox ray list."""
     words = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
     return words == HEADER.lower().split(",")
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a Livox scan pattern, or return None if the file has another format."""
     text = read_text(path)
     return rays_of_text(text) if is_livox(text) else None
 
 
-def rays_of_text(text: str) -> FiredRays:
-    """Return the rays of a list, with times unless these only number the rows.
+def rays_of_text(text: str) -> RayList:
+    """Return the rays in a list, without times if these are only row numbers.
 
     Raises
     ------
     ValueError
-        If numbers are missing or not finite, or times go back.
+        If numbers are missing or not finite, or if times decrease.
     """
-    times_s, azimuths_deg, zeniths_deg = rows_of(text, 1, 3).T
+    times_s, azimuths_deg, zeniths_deg = parse_rows(text, 1, 3).T
     backward_rows = np.flatnonzero(np.diff(times_s) < 0)
     if len(backward_rows):
         raise ValueError(f"times decrease in line {backward_rows[0] + 3}")
     directions = directions_of(azimuths_deg, 90 - zeniths_deg)
     if times_s[-1] == times_s[0] or (np.diff(times_s) == 1).all():
-        return FiredRays(directions)
+        return RayList(directions)
     times_ns = np.rint(times_s * _SECOND_NS).astype(np.int64)
-    # The first beam of a firing may leave after its start, and before the start of the next firing.
-    # A list that starts later has the times of a clock.
+    # The first beam of a firing may be fired after its start, but before the start of the next
+    # firing. If a list starts later than that, its times come from a clock.
     is_clock = times_ns[0] < 0 or times_ns[0] > np.diff(times_ns).max()
-    return FiredRays(directions, times_ns - times_ns[0] if is_clock else times_ns)
+    return RayList(directions, times_ns - times_ns[0] if is_clock else times_ns)

@@ -1,6 +1,6 @@
-"""Rays as rangefinders of MuJoCo (.xml): a body with a site for each ray.
+"""MuJoCo rangefinders (.xml): a body with a site and a rangefinder for each ray.
 
-A rangefinder measures along the z axis of its site, at each step of the simulation:
+A rangefinder measures along the z axis of its site in each simulation step, see
 https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
 """
 
@@ -13,13 +13,13 @@ from xml.sax.saxutils import quoteattr
 
 from ..base.arrays import Floats
 from ..base.errors import LidarError
-from .complete_files import remark, write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text, xml_comment
+from .fired_rays import AXES, RayList
 
-MAX_SITES = 10_000  # MuJoCo casts the rangefinders of each step one by one
+MAX_SITES = 10_000  # limited because MuJoCo casts the rangefinders of each step one by one
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a model whose body `lidar` has a site and a rangefinder for each ray.
 
     Raises
@@ -47,7 +47,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     lines = [
         f"<mujoco model={quoteattr(rays.name)}>",
         f"  <!-- Axes of the body lidar: {AXES}. Sites are in firing order. -->",
-        *(f"  <!-- Not in this file: {remark(clause)}. -->" for clause in left_out),
+        *(f"  <!-- Not in this file: {xml_comment(clause)}. -->" for clause in left_out),
         "  <worldbody>",
         '    <body name="lidar">',
         *sites,
@@ -58,10 +58,10 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "  </sensor>",
         "</mujoco>",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
 def _numbers(vector: Floats) -> str:
-    """Return a vector (3,) as an attribute has it."""
+    """Return a vector (3,) in the form of an XML attribute."""
     return " ".join(map(repr, vector.tolist()))

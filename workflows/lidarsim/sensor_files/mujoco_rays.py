@@ -1,10 +1,11 @@
-"""Angles of rays for MuJoCo-LiDAR: arrays `theta` and `phi`, as its scan patterns are.
+"""Angle arrays `theta` and `phi` for MuJoCo-LiDAR, in the form of its scan patterns.
 
-An .npz holds the arrays. A Python file (.py) needs NumPy only, and returns the arrays of a frame.
+An .npz file contains the arrays. A Python file (.py) returns the arrays of a frame; it needs only
+NumPy.
 
-`theta` is the azimuth, counter-clockwise from x, and `phi` the elevation above the xy plane, both
-in radians, in the frame of a site: x forward, y left, z up. MuJoCo-LiDAR casts all rays of a call
-at once; the times beside the angles are for programs that cast rays in parts.
+`theta` is the azimuth, counterclockwise from x, and `phi` the elevation above the xy plane. Both
+are in radians in the frame of a site, with x forward, y left and z up. MuJoCo-LiDAR casts all rays
+of a call at once; the times in the file are for programs that cast rays in parts.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .complete_files import write_bytes_of, write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import open_complete, write_complete_text
+from .fired_rays import AXES, RayList
 from .python_file import array_code, python_text, times_code
 from .ray_header import TIME_COLUMN, check_names, columns_of, header_of, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
@@ -40,13 +41,13 @@ def times_ns(frame=0):
 _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write angles and times of rays, with a header or as a Python file."""
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
+    """Write angles and times of rays as an .npz file with a header, or as a Python file."""
     if path.suffix.lower() == _PYTHON:
-        write_text_of(path, _python_text(rays.timed(), left_out))
+        write_complete_text(path, _python_text(rays.with_times(), left_out))
         return left_out
     header = np.array(json.dumps(header_of(rays, left_out, azimuth="theta", elevation="phi")))
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(
             file,
             allow_pickle=False,
@@ -57,8 +58,8 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     return left_out
 
 
-def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
-    """Return the text of a Python file of rays with times."""
+def _python_text(rays: RayList, left_out: Sequence[str]) -> str:
+    """Return the content of a Python file for rays that have times."""
     arrays = {
         "_THETA": array_code(np.radians(rays.azimuths_deg), "<f8"),
         "_PHI": array_code(np.radians(rays.elevations_deg), "<f8"),
@@ -68,7 +69,7 @@ def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
     return python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays)
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from the arrays `theta` and `phi`.
 
     The result is None for a Python file, and for a file that contains neither of these arrays.

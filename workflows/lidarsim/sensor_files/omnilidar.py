@@ -1,10 +1,10 @@
-"""Rays as an OmniLidar prim of Isaac Sim and Omniverse (.usda).
+"""OmniLidar prims for Isaac Sim and Omniverse (.usda).
 
-Attributes by the extension omni.sensors.nv.lidar ("Setting Lidar Attributes") and the schemas
-OmniSensorGenericLidarCoreAPI and OmniSensorGenericLidarCoreEmitterStateAPI. The pattern suits a
-solid-state lidar: each scan fires one emitter state, a list of azimuths, elevations and times.
-Several states follow each other scan by scan, so that a pattern need not repeat with each scan. A
-rotary pattern would round times and azimuths to ticks of a whole number of hertz.
+The attributes are those of the extension omni.sensors.nv.lidar ("Setting Lidar Attributes") and of
+the schemas OmniSensorGenericLidarCoreAPI and OmniSensorGenericLidarCoreEmitterStateAPI. The prim is
+a solid-state lidar, in which each scan fires one emitter state, a list of azimuths, elevations and
+times. Successive scans use successive states, so a pattern does not have to repeat with each scan.
+A rotary lidar would round times and azimuths to the ticks of an integer frequency.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ import numpy as np
 
 from ..base.arrays import AnyArray, Ints
 from ..base.errors import LidarError
-from .complete_files import write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text
+from .fired_rays import AXES, RayList
 
 CORE = "omni:sensor:Core:"
 STATE = f"{CORE}emitterState:"
-MAX_STATES = 999  # whose names have three digits
-MIN_RATE_HZ = 1  # scanRateBaseHz is a whole number
-_PER_LINE = 500  # characters of a line of an array
+MAX_STATES = 999  # state names have three digits
+MIN_RATE_HZ = 1  # scanRateBaseHz is an integer
+_PER_LINE = 500  # characters per line of an array
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a stage with an OmniLidar prim.
 
     Raises
@@ -58,18 +58,18 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         *(line for number, frame in enumerate(frames, 1) for line in _state(rays, number, frame)),
         "}",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
-def _remark(rays: FiredRays, left_out: Sequence[str]) -> str:
-    """Return the remark of the file: the sensor, its axes, and what the file does not hold."""
+def _remark(rays: RayList, left_out: Sequence[str]) -> str:
+    """Return the comment in the file: the sensor, its axes, and missing properties."""
     lacks = f" Not in this file: {'; '.join(left_out)}." if left_out else ""
     return f"{rays.name}. Axes: {AXES}; azimuths from x, counter-clockwise.{lacks}"
 
 
 def _schemas(states: int) -> Iterator[str]:
-    """Yield the schemas of a prim with some emitter states."""
+    """Yield the API schemas of a prim with the given number of emitter states."""
     yield '"OmniSensorGenericLidarCoreAPI"'
     for number in range(1, states + 1):
         yield f'"OmniSensorGenericLidarCoreEmitterStateAPI:{_state_name(number)}"'
@@ -80,16 +80,16 @@ def _state_name(number: int) -> str:
     return f"s{number:03d}"
 
 
-def _frames(rays: FiredRays) -> list[Ints]:
-    """Return the indices of the rays of each scan.
+def _frames(rays: RayList) -> list[Ints]:
+    """Return the indices of the rays in each scan.
 
     Raises
     ------
     LidarError
-        If the scans have different numbers of rays, or are more than `MAX_STATES`.
+        If scans have different numbers of rays, or there are more than `MAX_STATES` scans.
     """
-    rays = rays.timed()
-    assert rays.times_ns is not None and rays.cycle_ns is not None  # of timed rays
+    rays = rays.with_times()
+    assert rays.times_ns is not None and rays.cycle_ns is not None  # `with_times` sets both
     count = max(round(rays.cycle_ns * rays.rate_hz / 1e9), 1)
     if count > MAX_STATES:
         raise LidarError(
@@ -107,8 +107,8 @@ def _frames(rays: FiredRays) -> list[Ints]:
     return frames
 
 
-def _settings(rays: FiredRays, frames: Sequence[Ints]) -> Iterator[str]:
-    """Yield the attributes of the sensor as a whole."""
+def _settings(rays: RayList, frames: Sequence[Ints]) -> Iterator[str]:
+    """Yield the attributes that apply to the whole sensor."""
     rate = f"{rays.rate_hz:.0f}"
     min_range_m, max_range_m = rays.range_m
     channels = int(rays.channels.max()) + 1
@@ -118,10 +118,10 @@ def _settings(rays: FiredRays, frames: Sequence[Ints]) -> Iterator[str]:
     yield f"float omni:sensor:tickRate = {rate}"
     yield f'token {CORE}scanType = "SOLID_STATE"'
     yield f"uint {CORE}scanRateBaseHz = {rate}"
-    yield f"uint {CORE}reportRateBaseHz = {rate}"  # of Isaac Sim 5
-    yield f"uint {CORE}patternFiringRateHz = {rate}"  # its name in Isaac Sim 6
+    yield f"uint {CORE}reportRateBaseHz = {rate}"  # name in Isaac Sim 5
+    yield f"uint {CORE}patternFiringRateHz = {rate}"  # name in Isaac Sim 6
     yield f"uint {CORE}numberOfEmitters = {emitters}"
-    # A detector for each emitter: detectors of several emitters would merge their returns.
+    # One detector per emitter, because a shared detector would merge the returns of its emitters.
     yield f"uint {CORE}numberOfChannels = {emitters}"
     yield f"uint {CORE}emitterStateCount = {len(frames)}"
     yield f"uint {CORE}stateResolutionStep = 1"
@@ -134,10 +134,10 @@ def _settings(rays: FiredRays, frames: Sequence[Ints]) -> Iterator[str]:
         yield f"float {CORE}waveLengthNm = {rays.light.wavelength_nm:.9g}"
 
 
-def _state(rays: FiredRays, number: int, frame: Ints) -> Iterator[str]:
-    """Yield the attributes of an emitter state: the rays of a scan."""
-    timed = rays.timed()
-    assert timed.times_ns is not None  # of timed rays
+def _state(rays: RayList, number: int, frame: Ints) -> Iterator[str]:
+    """Yield the attributes of an emitter state, which has the rays of one scan."""
+    timed = rays.with_times()
+    assert timed.times_ns is not None  # `with_times` sets the times
     start_ns = round((number - 1) * 1e9 / rays.rate_hz)
     yield from _array(number, "float[]", "azimuthDeg", rays.azimuths_deg[frame])
     yield from _array(number, "float[]", "elevationDeg", rays.elevations_deg[frame])
@@ -147,9 +147,9 @@ def _state(rays: FiredRays, number: int, frame: Ints) -> Iterator[str]:
 
 
 def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]:
-    """Yield the lines of an attribute with an array.
+    """Yield the lines of an array attribute.
 
-    Angles have the digits of float32.
+    Angles are written with the digits of float32.
     """
     yield f"    {kind} {STATE}{_state_name(number)}:{name} = ["
     if kind == "float[]":
@@ -167,5 +167,5 @@ def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]
 
 
 def _text(text: str) -> str:
-    """Return a text as a string of USD holds it, between quotes."""
+    """Escape a text for a quoted USD string."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")

@@ -1,4 +1,4 @@
-"""Python files (.py) that hold arrays of rays, frame by frame, and need NumPy only."""
+"""Python files (.py) that contain ray arrays by frame and need only NumPy."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from math import isfinite
 import numpy as np
 
 from ..base.arrays import AnyArray
-from .fired_rays import FiredRays
+from .fired_rays import RayList
 
-_WIDTH = 96  # letters of a line of packed numbers
+_WIDTH = 96  # characters per line of packed numbers
 
 _TEXT = '''"""{title}
 
@@ -50,29 +50,29 @@ _ARRAY = '''_unpacked(
 
 
 def python_text(
-    rays: FiredRays,
+    rays: RayList,
     title: str,
     words: str,
     left_out: Sequence[str],
     functions: str,
     arrays: dict[str, str],
 ) -> str:
-    """Return the text of a Python file.
+    """Return the content of a Python file.
 
     Parameters
     ----------
     rays
-        Rays with times.
+        Rays that have times.
     title, words
-        The docstring of the file, before what the file does not hold.
+        Title and text of the file's docstring, which also lists missing properties.
     left_out
-        What the file does not hold, a clause each.
+        Phrases for properties that the file does not store.
     functions
-        Code of its functions, which find the rays of frame k between _BOUNDS[k] and _BOUNDS[k + 1].
+        Code of functions that return the rays of frame k, from _BOUNDS[k] to _BOUNDS[k + 1].
     arrays
-        Expressions of its arrays. {name: code}
+        Expressions for the arrays in the file. {name: code}
     """
-    assert rays.times_ns is not None and rays.cycle_ns is not None  # of timed rays
+    assert rays.times_ns is not None and rays.cycle_ns is not None  # the caller sets both
     frames = max(round(rays.cycle_ns * rays.rate_hz / 1e9), 1)
     starts_ns = np.rint(np.arange(1, frames) * (1e9 / rays.rate_hz))
     bounds = [0, *np.searchsorted(rays.times_ns, starts_ns).tolist(), len(rays)]
@@ -93,14 +93,14 @@ def python_text(
 
 
 def array_code(values: AnyArray, dtype: str) -> str:
-    """Return an expression of an array (n, ...), which it makes flat, in a type of NumPy."""
+    """Return an expression that evaluates to an array with the given dtype, flattened."""
     content = np.ascontiguousarray(values.astype(dtype)).tobytes()
     packed = base64.b64encode(zlib.compress(content, 9)).decode()
     return _ARRAY.format(packed="\n".join(textwrap.wrap(packed, _WIDTH)), dtype=dtype)
 
 
-def times_code(rays: FiredRays) -> str:
-    """Return an expression of the times (n,) of rays with times, int64 nanoseconds."""
-    assert rays.times_ns is not None  # of timed rays
+def times_code(rays: RayList) -> str:
+    """Return an expression that evaluates to the int64 times of rays in nanoseconds."""
+    assert rays.times_ns is not None  # the caller sets the times
     steps_code = array_code(np.diff(rays.times_ns, prepend=0), "<i8")
     return f"np.cumsum({steps_code})"

@@ -1,4 +1,4 @@
-"""Rays as a comma-separated table (.csv), with the header in remarks before the columns."""
+"""Rays as a comma-separated table (.csv), with a header in comment lines before the columns."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.time_units import SECONDS
 from ..columns.column_names import ALIASES, TIMES
-from .complete_files import write_text_of
-from .fired_rays import FiredRays
+from .complete_files import write_complete_text
+from .fired_rays import RayList
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
 
-_DECIMALS = 9  # of angles; directions have all digits
+_DECIMALS = 9  # of angles; directions are written with all digits
 _TIMES = (*TIMES, "offset", "stamp", "fire_time")
 QUANTITIES = (
     Quantity("time_s", _TIMES, SECONDS, None),
@@ -30,41 +30,41 @@ QUANTITIES = (
 )
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays as a table with a header in remarks."""
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
+    """Write rays as a table with a header in comment lines."""
     columns: dict[str, Any] = columns_of(rays)
     for name in ("azimuth_deg", "elevation_deg"):
-        columns[name] = np.round(columns[name], _DECIMALS) + 0.0  # no -0.0
+        columns[name] = np.round(columns[name], _DECIMALS) + 0.0  # + 0.0 avoids -0.0
     remarks = [
         f"# {name}: {json.dumps(value)}" for name, value in header_of(rays, left_out).items()
     ]
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [*remarks, ",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows)]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
 def is_ray_table(text: str) -> bool:
-    """Return True if a text is a table of rays: a column has times of single rays by this name."""
+    """Return whether a text is a ray table, which has a time column with a distinct name."""
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     return TIME_COLUMN in next(lines, "").split(",")
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a text table, as described in `rays_of_text`."""
     return rays_of_text(read_text(path))
 
 
-def rays_of_text(text: str) -> FiredRays:
-    """Return the rays of a table with azimuths and elevations, or directions.
+def rays_of_text(text: str) -> RayList:
+    """Return the rays in a table with azimuths and elevations, or with directions.
 
-    Names and units of columns may have other spellings, such as «Azimuth [rad]». Times of tables of
-    other programs are counted from the first ray.
+    Column names and units may have other spellings, such as "Azimuth [rad]". Times in tables of
+    other programs are measured from the first ray.
 
     Raises
     ------
     ValueError
-        If a column is missing or not known, or a cell holds no finite number.
+        If a column is missing or unknown, or a value is not a finite number.
     """
     columns = read_table(text, QUANTITIES)
     header = _header(text)
@@ -75,9 +75,9 @@ def rays_of_text(text: str) -> FiredRays:
 
 
 def _header(text: str) -> dict[str, Any]:
-    """Return the header in the remarks at the start of a text.
+    """Return the header in the comment lines at the start of a text.
 
-    Other remarks are left out.
+    Other comments are ignored.
     """
     header = {}
     for line in text.splitlines():

@@ -1,4 +1,4 @@
-"""The header of files of rays: name, ranges, rate and conventions, as plain values."""
+"""Header of ray files: name, ranges, rate and conventions, as plain values."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..base.errors import reason_of
 from ..base.words import printable
-from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, FiredRays, directions_of
+from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, RayList, directions_of
 
 KIND = "rays of a sensor"
-# Names of the columns of a table; directions count, and the angles say the same in degrees.
+# Column names of a table. Directions take precedence; the angles repeat them in degrees.
 TIME_COLUMN = "time_offset_ns"
 DIRECTION = ("direction_x", "direction_y", "direction_z")
 ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")
@@ -23,18 +23,16 @@ COLUMNS = (TIME_COLUMN, "channel", "azimuth_deg", "elevation_deg", *DIRECTION, *
 
 
 def header_of(
-    rays: FiredRays,
+    rays: RayList,
     left_out: Sequence[str],
     *,
     azimuth: str = "azimuth_deg",
     elevation: str = "elevation_deg",
 ) -> dict[str, Any]:
-    """Return the header of rays.
+    """Return the header of a ray file as plain values, with None for an infinite range.
 
-    An infinite range is None.
-
-    `left_out` says what the file does not hold of the sensor; `azimuth` and `elevation` are the
-    names of the columns, which have radians unless the names end in _deg.
+    `left_out` are phrases for properties that the file does not store. `azimuth` and `elevation`
+    are the names of the angle columns, which are in radians unless the names end in _deg.
     """
     min_range_m, max_range_m = rays.range_m
     return {
@@ -54,14 +52,14 @@ def header_of(
 
 
 def _unit(name: str) -> str:
-    """Return the unit of a column of angles."""
+    """Return the unit of an angle column."""
     return "degrees" if name.endswith("_deg") else "radians"
 
 
 def parsed_header(text: str | bytes) -> dict[str, Any]:
-    """Return the header that a file has as JSON.
+    """Parse the JSON header of a file.
 
-    Raises ValueError if it is not JSON, or not an object.
+    Raises ValueError if it is not a JSON object.
     """
     try:
         header = json.loads(text)
@@ -72,26 +70,26 @@ def parsed_header(text: str | bytes) -> dict[str, Any]:
     return header
 
 
-def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
-    """Return the columns `COLUMNS` of rays."""
-    timed = rays.timed()
-    assert timed.times_ns is not None  # of timed rays
+def columns_of(rays: RayList) -> dict[str, Floats | Ints]:
+    """Return the columns in `COLUMNS` for rays."""
+    timed = rays.with_times()
+    assert timed.times_ns is not None  # `with_times` sets the times
     angles = (rays.azimuths_deg, rays.elevations_deg)
     vectors = (*rays.directions.T, *rays.origins_or_center.T)
     values = (timed.times_ns, rays.channels, *angles, *vectors)
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
-    """Return the rays of columns and a header.
+def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> RayList:
+    """Create rays from columns and a header.
 
-    Columns are listed in `COLUMNS`: directions or both angles are required.
+    The columns are those in `COLUMNS`, of which either the directions or both angles are required.
 
     Raises
     ------
     ValueError
-        If columns are missing, have different lengths, or hold numbers that are not finite; or if
-        the header has impossible figures.
+        If columns are missing, have different lengths, or contain numbers that are not finite, or
+        if a value in the header is invalid.
     """
     lengths = {name: np.shape(values) for name, values in columns.items()}
     if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
@@ -117,7 +115,7 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     channels = np.asarray(columns.get("channel", np.zeros(len(directions))), np.int64)
     max_range_m = header.get("max_range_m")
     cycle_ns = header.get("cycle_ns")
-    rays = FiredRays(
+    rays = RayList(
         directions=directions,
         times_ns=times_ns,
         channels=channels,
@@ -136,9 +134,9 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
 
 
 def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
-    """Raise ValueError if a file has arrays or columns that are not known.
+    """Raise ValueError if a file has unknown arrays or columns.
 
-    `kind` says which.
+    `kind` is "arrays" or "columns", for the message.
     """
     if unknown := [name for name in names if name not in known]:
         shown = ", ".join(map(printable, unknown[:5]))
@@ -146,19 +144,19 @@ def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
 
 
 def check_numbers(name: str, dtype: np.dtype[Any]) -> None:
-    """Raise ValueError unless a column has real numbers."""
+    """Raise ValueError unless a column contains real numbers."""
     if dtype.kind not in "biuf":
         raise not_numbers(name, dtype)
 
 
 def not_numbers(name: str, kind: object) -> ValueError:
-    """Return the error of a column without real numbers."""
+    """Return the error for a column that does not contain real numbers."""
     shown = printable(str(kind), 60)
     return ValueError(f"its column {name} must contain real numbers, but has the type {shown}")
 
 
-def check_times(rays: FiredRays) -> None:
-    """Raise ValueError if the times of rays go back, or the list ends before its last ray."""
+def check_times(rays: RayList) -> None:
+    """Raise ValueError if times decrease, or if the cycle ends before the last ray."""
     times_ns = rays.times_ns
     if times_ns is None:
         return
@@ -175,11 +173,10 @@ def check_times(rays: FiredRays) -> None:
 
 
 def _directions(columns: Mapping[str, Any]) -> Floats:
-    """Return the unit directions of columns, from vectors or else from angles.
+    """Return the unit directions from vector columns, or otherwise from angle columns.
 
-    Raises ValueError without directions.
-
-    Vectors are scaled to length 1 unless they have it to twelve digits.
+    Vectors are normalized unless their length is 1 to twelve digits. Raises ValueError if there are
+    neither vectors nor angles.
     """
     if all(name in columns for name in DIRECTION):
         vectors = np.column_stack([np.asarray(columns[name], np.float64) for name in DIRECTION])
@@ -200,9 +197,9 @@ def _directions(columns: Mapping[str, Any]) -> Floats:
 
 
 def _number(header: Mapping[str, Any], name: str) -> float:
-    """Return a number of a header that is not negative.
+    """Return a nonnegative number from a header.
 
-    Raises ValueError for another value.
+    Raises ValueError if the value is invalid.
     """
     value = header[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < inf:
@@ -211,14 +208,14 @@ def _number(header: Mapping[str, Any], name: str) -> float:
 
 
 def _shown(value: Any) -> str:
-    """Return a value of a header in a line."""
+    """Return a header value in a form that fits on one line."""
     return printable(repr(value), 60)
 
 
 def _positive(header: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    """Return a figure of a header above 0.
+    """Return a positive number from a header.
 
-    Raises ValueError for another value.
+    Raises ValueError if the value is invalid.
     """
     value = header.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < inf:

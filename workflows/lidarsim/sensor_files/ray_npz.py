@@ -1,4 +1,4 @@
-"""Rays as arrays of NumPy (.npz): a one-dimensional array for each column, and a header in JSON."""
+"""Rays as NumPy arrays (.npz): a one-dimensional array for each column, and a JSON header."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from ..base.allowance import Allowance
 from ..base.input_files import check_input
-from .complete_files import write_bytes_of
-from .fired_rays import FiredRays
+from .complete_files import open_complete
+from .fired_rays import RayList
 from .ray_header import (
     COLUMNS,
     check_names,
@@ -25,18 +25,18 @@ from .ray_header import (
 )
 
 HEADER = "header"
-_ENCRYPTED = 1  # flag of a file in an archive
+_ENCRYPTED = 1  # flag of an archive member
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays with a header."""
     arrays = {HEADER: np.array(json.dumps(header_of(rays, left_out))), **columns_of(rays)}
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
     return left_out
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from an .npz file, or return None if its arrays have another format.
 
     Raises
@@ -57,20 +57,20 @@ def read(path: Path) -> FiredRays | None:
 def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
     """Remove the header from arrays and return it.
 
-    Raises ValueError if the arrays are not of a file of rays.
+    Raises ValueError if the header is not a JSON object.
     """
     return parsed_header(str(arrays.pop(HEADER, "{}")))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays of an .npz by name.
+    """Return the arrays in an .npz file by name.
 
     Raises
     ------
     ValueError
-        If the file is not an .npz or is encrypted, or an array is not of numbers.
+        If the file is not an .npz file or is encrypted, or an array is not numeric.
     LidarError
-        If the arrays are larger than the memory.
+        If the arrays exceed the memory limit.
     OSError
         If the file cannot be read.
     """

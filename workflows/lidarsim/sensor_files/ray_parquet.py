@@ -1,4 +1,4 @@
-"""Rays as a table of Parquet, with the header in the metadata of its schema."""
+"""Rays as a Parquet table, with the header in the schema metadata."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 from ..base.allowance import Allowance
 from ..base.errors import message_of
 from ..base.input_files import check_input, open_input
-from .complete_files import write_bytes_of
-from .fired_rays import FiredRays
+from .complete_files import open_complete
+from .fired_rays import RayList
 from .ray_header import (
     COLUMNS,
     check_names,
@@ -28,20 +28,20 @@ _HEADER = b"lidarpool"
 _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write rays as a table.
 
-    The metadata of the schema have the header as JSON.
+    The header is stored as JSON in the schema metadata.
     """
     table = pa.table(columns_of(rays)).replace_schema_metadata(
         {_HEADER: json.dumps(header_of(rays, left_out)).encode()}
     )
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         pq.write_table(table, file)
     return left_out
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from a Parquet table.
 
     Raises
@@ -68,9 +68,9 @@ def read(path: Path) -> FiredRays | None:
 
 
 def _bytes_of(metadata: pq.FileMetaData) -> int:
-    """Return the memory of all columns, each number in 8 bytes, or of the pages if that is larger.
+    """Return the memory of all columns at 8 bytes per number, or of the pages if that is larger.
 
-    A column of equal values takes some bytes for any number of rows.
+    The pages alone do not suffice, because a column of equal values occupies only a few bytes.
     """
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))

@@ -1,7 +1,8 @@
-"""Rays as the inputs of nodes of RobotecGPULidar (.npz).
+"""Rays as inputs of RobotecGPULidar nodes (.npz).
 
-By its header api/core.h: a ray is a matrix (3, 4) that takes the z axis to the direction of the ray
-and zero to its start; ring ids are int32, time offsets float32 milliseconds, ranges two float32.
+According to its header api/core.h, a ray is a matrix (3, 4) that maps the z axis to the direction
+of the ray and the zero vector to its origin. Ring ids are int32, time offsets are float32
+milliseconds, and ranges are pairs of float32.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from ..base.arrays import Floats
-from .complete_files import write_bytes_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import open_complete
+from .fired_rays import AXES, RayList
 from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of
 from .ray_npz import HEADER, header_in, read_arrays
 
 _NAMES = ("rays", "ring_ids", "time_offsets", "ranges")
-_STEEP = 0.9  # z component above which a ray is taken as vertical
+_STEEP = 0.9  # z component above which a ray is treated as vertical
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write arrays, each the input of the node that is named after it."""
-    times_ns = rays.timed().times_ns
-    assert times_ns is not None  # of timed rays
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
+    """Write arrays, each of which is the input of the node with its name."""
+    times_ns = rays.with_times().times_ns
+    assert times_ns is not None  # `with_times` sets the times
     header = {
         "sensor": rays.name,
         "axes": AXES,
@@ -39,7 +40,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "cycle_ns": rays.cycle_ns,
         "not_in_this_file": list(left_out),
     }
-    with write_bytes_of(path) as file:
+    with open_complete(path) as file:
         np.savez_compressed(
             file,
             allow_pickle=False,
@@ -52,10 +53,10 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     return left_out
 
 
-def _matrices(rays: FiredRays) -> Floats:
-    """Return matrices (n, 3, 4) that take the z axis to the rays.
+def _matrices(rays: RayList) -> Floats:
+    """Return matrices (n, 3, 4) that map the z axis to the rays.
 
-    Their x axes are level and to the right of the rays, or -y for vertical rays.
+    Their x axes are horizontal and point to the right of the rays, or to -y for vertical rays.
     """
     ahead = rays.directions
     up = np.where(np.abs(ahead[:, 2:]) > _STEEP, [[1.0, 0, 0]], [[0.0, 0, 1]])
@@ -64,7 +65,7 @@ def _matrices(rays: FiredRays) -> Floats:
     return np.stack([right, np.cross(ahead, right), ahead, rays.origins_or_center], axis=2)
 
 
-def read(path: Path) -> FiredRays | None:
+def read(path: Path) -> RayList | None:
     """Read rays from RGL arrays, or return None if the arrays have another format.
 
     Raises

@@ -1,7 +1,7 @@
-"""Sensors that are a regular grid as <gpu_lidar> of Gazebo (.sdf).
+"""Gazebo <gpu_lidar> sensors (.sdf), which must be regular grids.
 
-http://sdformat.org/spec?ver=1.9&elem=sensor: azimuths grow counter-clockwise from x, elevations
-above the xy plane, in radians, both evenly spaced with both ends included.
+See http://sdformat.org/spec?ver=1.9&elem=sensor. Azimuths increase counterclockwise from x, and
+elevations are measured above the xy plane. Both are evenly spaced, in radians, including both ends.
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ import numpy as np
 
 from ..base.arrays import Floats, Ints
 from ..base.errors import LidarError
-from .complete_files import remark, write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text, xml_comment
+from .fired_rays import AXES, RayList
 
-_SLACK_DEG = 1e-4  # from the even spacing
-_SAME_DEG = 1e-6  # angles nearer than this are equal
+_SLACK_DEG = 1e-4  # tolerance of even spacing
+_SAME_DEG = 1e-6  # angles that differ by less are treated as equal
 _ADVICE = "The formats livox, npz and csv support any rays."
 
 
 class _Angles(NamedTuple):
-    """Evenly spaced angles, both ends included, degrees."""
+    """Evenly spaced angles in degrees, including both ends."""
 
     first_deg: float
     last_deg: float
     samples: int
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a model with a sensor.
 
     Raises
     ------
     LidarError
-        If the rays are no regular grid; the message says why not.
+        If the rays do not form a regular grid. The message explains why.
     """
     horizontal, vertical = _grid(rays)
     min_range_m, max_range_m = rays.range_m
     lines = [
         '<?xml version="1.0"?>',
         '<sdf version="1.9">',
-        f"  <!-- {remark(rays.name)}. Axes: {AXES}. -->",
-        *(f"  <!-- Not in this file: {remark(clause)}. -->" for clause in left_out),
+        f"  <!-- {xml_comment(rays.name)}. Axes: {AXES}. -->",
+        *(f"  <!-- Not in this file: {xml_comment(clause)}. -->" for clause in left_out),
         '  <model name="lidar">',
         '    <link name="lidar">',
         f'      <sensor name={quoteattr(rays.name or "lidar")} type="gpu_lidar">',
@@ -64,12 +64,12 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "  </model>",
         "</sdf>",
     ]
-    write_text_of(path, "\n".join(lines) + "\n")
+    write_complete_text(path, "\n".join(lines) + "\n")
     return left_out
 
 
 def _scan(name: str, angles: _Angles) -> list[str]:
-    """Return the lines of <horizontal> or <vertical>."""
+    """Return the lines of a <horizontal> or <vertical> element."""
     limits = np.radians([angles.first_deg, angles.last_deg]).tolist()
     return [
         f"            <{name}>",
@@ -80,13 +80,13 @@ def _scan(name: str, angles: _Angles) -> list[str]:
     ]
 
 
-def _grid(rays: FiredRays) -> tuple[_Angles, _Angles]:
+def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
     """Return the azimuths and elevations of a regular grid.
 
     Raises
     ------
     LidarError
-        If the rays are no regular grid.
+        If the rays do not form a regular grid.
     """
     azimuths = _levels(np.mod(rays.azimuths_deg + _SAME_DEG / 4, 360))
     elevations = _levels(rays.elevations_deg)
@@ -100,7 +100,7 @@ def _grid(rays: FiredRays) -> tuple[_Angles, _Angles]:
             f"{_ADVICE}"
         )
     vertical = _even(rays.name, "elevations", elevations.angles_deg)
-    # A sector starts after the widest gap.
+    # A sector starts after the widest gap between azimuths.
     gaps = np.diff(azimuths.angles_deg, append=azimuths.angles_deg[0] + 360)
     start = (int(gaps.argmax()) + 1) % len(gaps)
     if np.ptp(gaps) < _SLACK_DEG:
@@ -113,14 +113,14 @@ def _grid(rays: FiredRays) -> tuple[_Angles, _Angles]:
 
 
 class _Levels(NamedTuple):
-    """Different angles, and which of these each ray has."""
+    """Distinct angles, and the index of each ray's angle."""
 
     angles_deg: Floats  # (k,), ascending
-    of_ray: Ints  # (n,): index of a ray's angle
+    of_ray: Ints  # (n,): index into `angles_deg` for each ray
 
 
 def _levels(angles_deg: Floats) -> _Levels:
-    """Return the different angles of rays (n,)."""
+    """Return the distinct angles of rays (n,)."""
     order = np.argsort(angles_deg, kind="stable")
     is_new = np.diff(angles_deg[order], prepend=-np.inf) > _SAME_DEG
     of_ray = np.empty(len(order), np.int64)
@@ -129,9 +129,9 @@ def _levels(angles_deg: Floats) -> _Levels:
 
 
 def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
-    """Return evenly spaced angles (k,) by their ends.
+    """Return the ends and number of evenly spaced angles (k,).
 
-    Raises LidarError for other angles.
+    Raises LidarError if the angles are not evenly spaced.
     """
     count = len(angles_deg)
     even_deg = np.linspace(angles_deg[0], angles_deg[-1], count)

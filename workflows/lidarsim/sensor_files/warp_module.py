@@ -1,7 +1,7 @@
-"""Rays as one Python file (.py), for programs that cast rays with Warp, such as Isaac Lab.
+"""Rays as a Python file (.py) for programs that cast rays with Warp, such as Isaac Lab.
 
-The file needs NumPy only. Its function `rays` returns origins, directions and times of a frame, in
-the sensor frame: x forward, y left, z up.
+The file needs only NumPy. Its function `rays` returns origins, directions and times of the rays in
+a frame, in the sensor frame with x forward, y left and z up.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from .complete_files import write_text_of
-from .fired_rays import AXES, FiredRays
+from .complete_files import write_complete_text
+from .fired_rays import AXES, RayList
 from .python_file import array_code, python_text, times_code
 
 _WORDS = f"""Axes: {AXES}. Directions are float32 unit vectors, origins meters, times
@@ -24,9 +24,9 @@ _FUNCTIONS = '''def rays(frame=0):
 '''
 
 
-def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
+def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
     """Write a Python file."""
-    rays = rays.timed()
+    rays = rays.with_times()
     origins = "np.zeros_like(_DIRECTIONS)"
     if rays.origins is not None:
         origins = f"{array_code(rays.origins, '<f4')}.reshape(-1, 3)"
@@ -36,5 +36,5 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "_ORIGINS": origins,
     }
     title = "Rays of {name}, written by lidarpool."
-    write_text_of(path, python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays))
+    write_complete_text(path, python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays))
     return left_out

@@ -1,4 +1,4 @@
-"""The simulator: from a scene and sensors to returns, and from returns to columns."""
+"""The lidar simulator, which casts sensor pulses into a scene and computes point columns."""
 
 from .scanner import Scanner
 

@@ -1,4 +1,4 @@
-"""Poses of bodies as users give them to `Scanner.move`: of one body or many, standing or moving."""
+"""Convert the poses that users pass to `Scanner.move` into arrays and trajectories."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ..base.value_texts import shown
 from ..motion.rotations import check_rotations
 from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, pose_of
 
-ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
+ROW_SLACK = 1e-8  # tolerance for the last row of a pose matrix
 
 
 class BodyPoses(NamedTuple):
-    """Poses of k bodies, and the trajectories of the bodies that have one."""
+    """Poses of k bodies, with the trajectories of bodies that move."""
 
-    positions: Floats  # (k, 3), meters; not used of bodies with a trajectory that moves
-    rotations: Floats  # (k, 3, 3), from the frame of the body to the scene frame; as above
-    trajectories: Sequence[Trajectory | None]  # (k,); None for a body that stands at its pose
+    positions: Floats  # (k, 3), meters; ignored for bodies that move along a trajectory
+    rotations: Floats  # (k, 3, 3), from the body frame to the scene frame; ignored likewise
+    trajectories: Sequence[Trajectory | None]  # (k,); None for a body that stays at its pose
 
     @property
     def moves(self) -> Bools:
-        """Whether each body moves during a sweep: (k,)."""
+        """Boolean array of shape (k,), True for bodies that move during a sweep."""
         return np.array([t is not None and t.moves for t in self.trajectories], np.bool_)
 
     def trajectory(self, number: int) -> Trajectory:
-        """Return the trajectory of a body, by its index."""
+        """Return the trajectory of the body with the given index."""
         trajectory = self.trajectories[number]
         if trajectory is None:
             return StaticPose(self.positions[number], self.rotations[number])
@@ -38,12 +38,20 @@ class BodyPoses(NamedTuple):
 
 
 def poses_of_body(pose: Any, times_s: ArrayLike | None) -> BodyPoses:
-    """Return the poses of one body: a pose, position, matrix or trajectory, or matrices at times.
+    """Convert the argument `pose` of `Scanner.move` for a single body.
+
+    Parameters
+    ----------
+    pose
+        A `Pose`, a position, a matrix (4, 4) or a trajectory. If `times_s` is set, an array of
+        matrices with shape (samples, 4, 4).
+    times_s
+        Times of the matrices in seconds, shape (samples,).
 
     Raises
     ------
     LidarError
-        If the pose is none of these, or mirrors or deforms.
+        If `pose` has an unsupported form, or a matrix is not a rigid transform.
     """
     if times_s is not None:
         return poses_of_bodies(_table_of(pose)[None], 1, times_s)
@@ -53,20 +61,24 @@ def poses_of_body(pose: Any, times_s: ArrayLike | None) -> BodyPoses:
 
 
 def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPoses:
-    """Return the poses of `count` bodies.
+    """Convert the argument `pose` of `Scanner.move` for several bodies.
 
     Parameters
     ----------
     poses
-        A list of poses and trajectories, positions (k, 3), or matrices (k, 4, 4); with times,
-        matrices (k, samples, 4, 4).
+        A list of poses and trajectories, an array of positions with shape (k, 3), or an array of
+        matrices with shape (k, 4, 4). If `times_s` is set, an array of matrices with shape
+        (k, samples, 4, 4).
+    count
+        Expected number of bodies.
     times_s
-        (samples,): seconds since time 0 of actors.
+        Times of the matrices in seconds since time 0 of the actors, shape (samples,).
 
     Raises
     ------
     LidarError
-        If the poses are none of these or of another number, or a matrix mirrors or deforms.
+        If `poses` has an unsupported form, the number of poses is not `count`, or a matrix is not
+        a rigid transform.
     """
     if isinstance(poses, Sequence) and times_s is None and any(map(_is_single, poses)):
         _check_count(len(poses), count)
@@ -89,10 +101,7 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
 
 
 def check_matrices(matrices: Floats) -> None:
-    """Check that matrices (k, 4, 4) are rigid transforms.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if matrices (k, 4, 4) are not rigid transforms."""
     _check_finite(matrices)
     if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
         raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
@@ -105,14 +114,14 @@ def _is_single(pose: Any) -> bool:
 
 
 def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
-    """Return the poses of a list of poses, positions and trajectories."""
+    """Convert a list whose items are poses, positions or trajectories."""
     trajectories: list[Trajectory | None] = []
     positions = []
     rotations = []
     for value in poses:
         trajectory = value if hasattr(value, "poses") else None
         if trajectory is not None and trajectory.moves:
-            pose = CENTER  # not used: only actors have such trajectories
+            pose = CENTER  # a placeholder, because the trajectory provides the poses
         else:
             pose = pose_of("pose", value) if trajectory is None else trajectory.pose(0)
         trajectories.append(trajectory)
@@ -122,7 +131,7 @@ def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
 
 
 def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPoses:
-    """Return the poses of bodies that follow matrices (k, samples, 4, 4) at times (samples,)."""
+    """Return poses of bodies that follow matrices (k, samples, 4, 4) at times (samples,)."""
     try:
         times = np.asarray(times_s, np.float64)
     except (TypeError, ValueError):
@@ -140,7 +149,7 @@ def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPos
 
 
 def _table_of(poses: Any) -> Floats:
-    """Return poses as an array of float64, or an empty one if they are not numbers."""
+    """Convert poses to a float64 array, or return an empty array if they are not numeric."""
     try:
         return np.asarray(poses, np.float64)
     except (TypeError, ValueError):
@@ -148,10 +157,7 @@ def _table_of(poses: Any) -> Floats:
 
 
 def _check_count(poses: int, names: int) -> None:
-    """Check that there is a pose for each name.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if the number of poses differs from the number of names."""
     if poses != names:
         raise LidarError(
             f"There are {names} names, but {poses} poses. Pass one pose for each name."
@@ -159,10 +165,7 @@ def _check_count(poses: int, names: int) -> None:
 
 
 def _check_finite(table: Floats) -> None:
-    """Check that numbers are finite.
-
-    Raises LidarError, with the first pose (k, ...), if not.
-    """
+    """Raise LidarError with the index of the first pose that is not finite, if there is one."""
     finite = np.isfinite(table).reshape(len(table), -1).all(axis=1)
     if not finite.all():
         first = int(finite.argmin())

@@ -1,4 +1,4 @@
-"""Estimates of the memory of a rig on a worker, and of the additional memory of casting scans."""
+"""Estimate how much memory a rig occupies on a worker, and how much casting scans requires."""
 
 from __future__ import annotations
 
@@ -21,51 +21,52 @@ from .steps.step_list import setup_of, steps_of
 
 MB = 1_000_000
 
-# Bytes, measured in `Rig.cast` and `columns_of` as the peak of tracemalloc, at a million rays that
-# all hit a sphere of 20,480 triangles: 128 beams and a single beam, a prism, static and moving,
-# with all columns and none, 1 to 19 sub-rays, a glass sphere around the sensor, with tiles and
-# NumPy, which differ by 30 MB at most (2026-11-22, Linux, NumPy 2.4). The estimate was 1.02 to 1.5
-# times the measured peak; 1.64 times if two returns of a pulse may be reported and there is one,
-# 0.8 times if there are always two. The peak of the process (VmHWM) was at most 16 % above the peak
-# of tracemalloc, and mostly below. tests/lidarsim/test_memory.py repeats a part of the measurement.
-# Steps state their memory on the same basis.
-RAY = 28  # hit of a ray
-# A ray that is not cast repeatedly: while it is computed, and afterwards.
+# Bytes, measured as the tracemalloc peak in `Rig.cast` and `columns_of` for a million rays that all
+# hit a sphere of 20,480 triangles. The measurement covered sensors with 128 beams and with a single
+# beam, a prism, static and moving platforms, all columns and none, 1 to 19 sub-rays, and a glass
+# sphere around the sensor. The "tiles" and "numpy" backends differed by at most 30 MB (2026-11-22,
+# Linux, NumPy 2.4). The estimate was 1.02 to 1.5 times the measured peak. If up to two returns may
+# be reported, it was 1.64 times the peak for pulses with one return, and 0.8 times the peak for
+# pulses with two. The process peak (VmHWM) was mostly below the tracemalloc peak, and at most
+# 16 % above it. tests/lidarsim/test_memory.py repeats a part of the measurement. The steps estimate
+# their memory on the same basis.
+RAY = 28  # bytes per ray for its hit
+# Bytes per ray that is not cast repeatedly: while it is computed, and afterwards.
 COMPUTED_RAY = 92
 COMPUTED_RAY_RETAINED = 32
-RAY_AMONG_BODIES = 70  # bytes of a ray in a scene with instances or actors
-# Pose of a firing: while it is computed, and afterwards.
+RAY_AMONG_BODIES = 70  # bytes per ray in a scene with instances or actors
+# Bytes per pose of a firing: while it is computed, and afterwards.
 POSE = 140
 POSE_RETAINED = 100
-RETURNS = 1.5  # returns of a pulse, if all or two are reported; 1.1 to 1.6 in generated woods
-RETURNS_LEAFY = 3.8  # the same, if all are reported and sub-rays meet leaves; 3.3 in a canopy
-# A point, and each byte of its columns, whose sources are float64.
+RETURNS = 1.5  # returns per pulse if all or two are reported; 1.1 to 1.6 in generated woods
+RETURNS_LEAFY = 3.8  # same if all are reported and sub-rays meet leaves; 3.3 in a canopy
+# Bytes per point, and per byte of its columns, because column sources are float64.
 POINT = 64
 POINT_BYTE = 3.2
-COLOR = 16  # bytes of a ray, if colors are reflectances
-# Copies of columns from a device: CuPy rounds page-locked memory up to powers of two, and columns
-# of several runs of scans, by station and sensor, are joined.
+COLOR = 16  # bytes per ray if reflectance comes from colors
+# Copies of the columns that come from a device: CuPy rounds page-locked memory up to a power of
+# two, and columns of several groups of scans are concatenated.
 PAGE_LOCKED = 2
 JOINED = 1
-# Descriptions, poses and small arrays.
+# Bytes for descriptions, poses and small arrays.
 SCAN = 500
 STATION = 6000
-HIT_COUNTER = 16  # bytes of a hit counter (`Scene.counters`): two counts
+HIT_COUNTER = 16  # bytes per hit counter (`Scene.counters`), for two counts
 
 # Bytes of a rig, measured on Linux.
-SCENE_TRIANGLE = 80  # bytes of a triangle, in every process that knows the scene
-# Of a triangle while a caster is built: tiles 250, NumPy 310 (2026-11-28), CUDA 360.
+SCENE_TRIANGLE = 80  # bytes per triangle, in every process that holds the scene
+# Bytes per triangle while a caster is built: tiles 250, NumPy 310 (2026-11-28), CUDA 360.
 CASTER_TRIANGLE = 360
-COLORED_TRIANGLE = 160  # bytes of a triangle with colors
-IMAGE_BYTE = 4  # bytes for each byte of an image
-INSTANCE = 2000  # bytes of an instance, in every process that knows the scene
-POSED_TRIANGLE = 40  # bytes of a triangle in each pose of an animation, in boxes of the tree
-PATTERN_RAY = 48  # bytes of a ray of a period of the head, and of its pattern
+COLORED_TRIANGLE = 160  # bytes per triangle with colors
+IMAGE_BYTE = 4  # bytes per byte of a texture image
+INSTANCE = 2000  # bytes per instance, in every process that holds the scene
+POSED_TRIANGLE = 40  # bytes per triangle and animation frame, for the boxes of the tree
+PATTERN_RAY = 48  # bytes per ray in a period of the head, including its pattern
 
 
 def rig_bytes(scene: Scene, survey: Survey) -> int:
-    """Estimate the memory of a rig, in bytes: scene, tree of the caster, patterns of rays."""
-    # Sensors that see different static objects have separate trees.
+    """Estimate the memory of a rig in bytes: the scene, its trees, and the stored ray patterns."""
+    # Sensors for which different static objects are visible have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
     images = {id(image): image.nbytes for mesh in scene.colored for image in mesh.images}
@@ -88,9 +89,9 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
 def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool = False) -> int:
     """Estimate the peak memory of casting scans and computing their columns, in bytes.
 
-    All rays are assumed to hit, and all scans to be of the sensor that needs the most memory.
-    Columns of a user's functions count like built-in columns. `on_device` says that a CUDA device
-    casts the rays; the memory of the device, some 300 MB, does not count.
+    The estimate assumes that all rays hit, and that all scans come from the sensor that needs the
+    most memory. Columns computed by user functions count like built-in columns. Set `on_device` if
+    a CUDA device casts the rays; device memory, about 300 MB, is not included.
     """
     setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
     on_device = on_device and not any(map(steps_of, setups))
@@ -99,7 +100,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
 
 
 def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
-    """Estimate the peak memory of scans of one sensor, in bytes, without hit counters."""
+    """Estimate the peak memory in bytes of scans of one sensor, without hit counters."""
     survey = setup.survey
     sensor = setup.sensor
     first, stop = sensor.firings(0)
@@ -119,8 +120,9 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
 def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -> Memory:
     """Estimate the memory of rays, poses and steps.
 
-    `retained` is the memory until columns are made, `casting` the memory of rays and poses while
-    rays are cast, and `counting` the largest memory of the steps in addition.
+    In the result, `retained` is the memory that stays in use until columns are computed, `casting`
+    is the additional memory of rays and poses during casting, and `counting` is the largest
+    additional memory of any step.
     """
     scene = setup.scene
     survey = setup.survey
@@ -148,27 +150,27 @@ def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -
 
 
 def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
-    """Estimate the memory of one reported return while columns are computed, in bytes."""
+    """Estimate the memory in bytes of one reported return while its columns are computed."""
     survey = setup.survey
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     if on_device and not needs_hits(setup.scene, survey):
         single_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
         return (PAGE_LOCKED + (0 if single_run else JOINED)) * columns
-    # As if NumPy computed all columns; columns of the device count once more.
+    # NumPy computes all columns; columns from the device count once more.
     return POINT + POINT_BYTE * columns + columns * on_device
 
 
 def _returns_per_pulse(setup: Setup) -> float:
-    """Estimate the mean number of reported returns of a pulse that hits a surface."""
+    """Estimate the mean number of reported returns for a pulse that hits a surface."""
     subrays = setup.reporting.subrays
     mode = setup.reporting.mode
-    added_by_step = [step.added(setup) for step in steps_of(setup)]
+    added_by_step = [step.added_returns(setup) for step in steps_of(setup)]
     reports_two = mode in TWO_RETURNS
     added = 0.0
     if mode == "all":
         added = sum(added_by_step)
     elif reports_two:
-        # The share of pulses that a step adds a return to, if returns are added independently.
+        # The share of pulses to which a step adds a return, if returns are added independently.
         added = sum(1 - float(exp(-count)) for count in added_by_step)
     if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added
@@ -177,10 +179,10 @@ def _returns_per_pulse(setup: Setup) -> float:
 
 
 def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: bool = False) -> int:
-    """Return the number of scans that can be cast together in `limit` bytes, at least 1.
+    """Return the number of scans that can be cast together within `limit` bytes, at least 1.
 
-    The number may exceed the scans of a small survey. The memory is estimated by `cast_bytes`,
-    without counts of hits, which are the same for any number of scans.
+    For a small survey, the result may exceed the number of its scans. The memory is estimated by
+    `cast_bytes`, without the hit counters, whose size does not depend on the number of scans.
     """
     limit += HIT_COUNTER * scene.counters
     memory_of = partial(cast_bytes, scene, survey, on_device=on_device)

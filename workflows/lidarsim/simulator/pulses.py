@@ -1,27 +1,28 @@
-"""Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
+"""Cast the pulses of one sensor, and apply the simulation steps to their hits.
 
-The way through a worker, from `intersect` of a casting task to a part's columns:
+On a worker, a casting task turns scans into columns as follows:
 
-1. `Rig.cast` groups scans of one sensor and station whose firings follow each other.
-2. `Rig.returns` finds the `Firings` of a group and the `CastPoses` of its beams.
-3. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a time, and passes
+1. `Rig.cast` groups consecutive scans that share a sensor and a station.
+2. `Rig.returns` determines the `Firings` of a group and the `CastPoses` of its beams.
+3. `PulseCaster.scan` makes a `PulseBatch` for a part of the beams at a time, and passes
    `PulseReturns` through the steps in the order of `step_list.py`:
 
    a. Steps aim the beams.
    b. `CastStep` finds the hits of all sub-rays; `CastStep.apply` lists its passes. From here on,
-      `PulseReturns` has a row for each hit.
-   c. Steps add the light of rain, spray and dirt, as further hits.
-   d. `SeparationStep` or `WaveformStep` makes returns of hits; `_mark_returns` of
-      `separation_loops.py` follows five hits of a beam. From here on, `PulseReturns` has a row for
-      each return.
-   e. Steps detect, receive, lose and choose returns.
+      `PulseReturns` has one row per hit.
+   c. Steps add light that rain, spray and dirt scatter, as further hits.
+   d. `SeparationStep` or `WaveformStep` combines hits into returns. The docstring of
+      `_mark_returns` in `separation_loops.py` has an example with five hits of one beam. From here
+      on, `PulseReturns` has one row per return.
+   e. Steps apply detection, receiver faults and losses, and select the reported returns.
 
-4. `PulseCaster` counts the returns of each scan, and keeps every n-th: `Scanned`.
-5. Steps on reported returns get all beams at once, and returns out of range are removed.
-6. `BatchPoints` holds the returns that are left, and `columns_of` makes their columns.
+4. `PulseCaster` counts the returns of each scan and keeps every n-th return (`ScannedReturns`).
+5. Steps that act on reported returns process all beams at once. Returns out of range are removed.
+6. `BatchPoints` holds the remaining returns, and `columns_of` computes their columns.
 
-If each ray can have one return only (`Setup.return_count_varies`), `SceneCaster` itself counts and
-thins out the hits, in place of 3 and 4; of the steps of 3, only steps that aim beams act. On CUDA
+If each ray can have at most one return (see `Setup.return_count_varies`), `SceneCaster` itself
+counts and thins out the hits in place of 3 and 4, and only the steps that aim beams act. On a CUDA
+device without steps, `DeviceColumns` replaces 3 to 6.
 without steps, `DeviceColumns` does 3 to 6.
 """
 
@@ -40,25 +41,26 @@ from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
-from .casting.surfaces import Surfaces, sensor_light_of
-from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
+from .casting.surfaces import SceneSurfaces, sensor_light_of
+from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, required
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
 from .steps.step_list import setup_of, steps_of
 
-CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
+CHUNK_RAYS = 1 << 17  # number of sub-rays that are cast at a time
 
 
-class Scanned(NamedTuple):
-    """Kept returns of scans, and counts of all returns."""
+class ScannedReturns(NamedTuple):
+    """Kept returns of consecutive scans, and counts of all returns."""
 
     returns: PulseReturns
-    hit_counts: Ints  # (scans,): returns of each scan, kept or not
-    tally: Ints | None  # (counters,): hits by `StoredTriangles.counter`, kept or not, on request
+    hit_counts: Ints  # (scans,): returns of each scan, including those that are not kept
+    # (counters,): all hits per hit counter (`StoredTriangles.counter`); None if not requested
+    tally: Ints | None
 
 
 class PulseCaster:
-    """Caster of the scans of a sensor, by its number in the survey, with its steps."""
+    """Casts the scans of one sensor, given by its number in the survey, and applies its steps."""
 
     def __init__(
         self,
@@ -66,22 +68,22 @@ class PulseCaster:
         caster: SceneCaster,
         scene: Scene,
         survey: Survey,
-        surfaces: Surfaces,
+        surfaces: SceneSurfaces,
     ) -> None:
         self.setup = setup = setup_of(scene, survey, sensor_number)
         self._caster = caster
         self._surfaces = surfaces
-        # Known once: copies of this caster have the same materials and the same sensor.
+        # Stored because copies of this caster have the same materials and the same sensor.
         self._return_count_varies = setup.return_count_varies
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
-    def moved(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
-        """Return the caster of the same scans of a scene with moved instances."""
+    def with_moved_instances(self, scene: Scene, surfaces: SceneSurfaces) -> PulseCaster:
+        """Return a caster for the same scans after instances of the scene have moved."""
         caster = copy(self)
         caster.setup = replace(self.setup, scene=scene)
         caster._surfaces = surfaces
-        caster.steps = [step.moved(caster.setup, surfaces) for step in self.steps]
+        caster.steps = [step.with_moved_instances(caster.setup, surfaces) for step in self.steps]
         return caster
 
     def scan(
@@ -94,26 +96,27 @@ class PulseCaster:
         firings: Firings,
         *,
         tally: bool = True,
-    ) -> Scanned:
-        """Return the returns of scans from number `scan` on, counted and thinned out.
+    ) -> ScannedReturns:
+        """Cast consecutive scans, count their returns, and keep every n-th return.
 
         Parameters
         ----------
         scan
-            Number of the first scan, a key of random numbers: of a frozen sensor, the
+            Number of the first scan, which is a key of the random numbers. For a frozen sensor, the
             number of the older scan that is sent again.
         pattern
             Rays of the beams.
         poses
             Poses of the beams.
         window
-            First row of the beams in `pattern`, and one past the last.
+            Rows of `pattern` that the beams use: the first row, and one past the last.
         scan_starts
-            (scans,): first beam of each scan, counted from 0 at the first row of the window.
+            (scans,): first beam of each scan. Beams are numbered from 0 at the first row of
+            `window`.
         firings
             Firings of the beams.
         tally
-            Whether returns from surfaces are counted by `StoredTriangles.counter`.
+            Whether to count the hits on surfaces by `StoredTriangles.counter`.
         """
         first_row = window[0]
         beam_count = window[1] - window[0]
@@ -139,7 +142,7 @@ class PulseCaster:
             chunks = [
                 self._pulses(batch(k, min(k + chunk_beams, beam_count))) for k in chunk_starts
             ]
-            scanned = self._thin_out(joined(chunks), scan_starts, tally)
+            scanned = self._thin_out(concatenate_returns(chunks), scan_starts, tally)
         else:
             scanned = self._cast_once(all_beams, scan_starts, tally)
         returns = scanned.returns
@@ -148,13 +151,13 @@ class PulseCaster:
                 returns = step.apply(returns, all_beams)
         return self._within_range(scanned._replace(returns=returns), scan_starts)
 
-    def _within_range(self, scanned: Scanned, scan_starts: Ints) -> Scanned:
-        """Remove the returns whose ranges, with noise, are outside of the sensor's range.
+    def _within_range(self, scanned: ScannedReturns, scan_starts: Ints) -> ScannedReturns:
+        """Remove the returns whose range, including noise, is outside the sensor's range limits.
 
-        If `keep_every` is 1, the counts and the numbers of the other returns are as if the removed
-        returns were undetected. If it is larger, returns have been thinned out before: only the
-        removed returns among the kept ones leave the counts, and the choice of the kept returns
-        stays.
+        If `keep_every` is 1, the removed returns are treated as undetected: counts and return
+        numbers are adjusted. If it is larger, the returns have already been thinned out. Then the
+        counts are reduced only by the removed returns among the kept ones, and the selection of
+        kept returns does not change.
         """
         returns = scanned.returns
         sensor = self.setup.sensor
@@ -174,27 +177,27 @@ class PulseCaster:
             tally = tally - np.bincount(counter, minlength=len(tally))
         start = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
         stop = np.searchsorted(returns.ray, returns.ray, "right")
-        removed_before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
+        removed_before = np.append(0, np.cumsum(~in_range))  # removed returns above each row
         number = required(returns.number) - (removed_before[:-1] - removed_before[start])
         count = required(returns.return_counts) - (removed_before[stop] - removed_before[start])
         renumbered = returns._replace(
             number=number.astype(np.uint8), return_counts=count.astype(np.uint8)
         )
-        return Scanned(renumbered.take(in_range), hit_counts, tally)
+        return ScannedReturns(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch after all steps that act before returns are thinned out."""
+        """Apply all steps that act before thinning to a batch, and return its returns."""
         returns = PulseReturns.empty()
         for step in self.steps:
             if Role.ON_REPORTED not in step.role:
                 returns = step.apply(returns, batch)
         return returns
 
-    def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> Scanned:
-        """Cast rays that have a single return each, counted and thinned out by the caster.
+    def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> ScannedReturns:
+        """Cast rays that have at most one return each; the caster counts and thins out the hits.
 
-        Energies are computed only for kept returns, and only if steps deflect beams before they are
-        cast (`Role.AIMS`); else `BatchPoints` computes energies by the reported directions.
+        Energies are computed here only if steps deflect beams before casting (`Role.AIMS`), and
+        only for kept returns. Otherwise `BatchPoints` computes them from the reported directions.
         """
         setup = self.setup
         poses = batch.poses
@@ -214,10 +217,10 @@ class PulseCaster:
         returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
         if batch.offsets is not None:
             returns = self._with_light(returns, batch)
-        return Scanned(returns, hits.hit_counts, hits.tally)
+        return ScannedReturns(returns, hits.hit_counts, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add energy, color and velocity to returns of deflected beams, by cast directions."""
+        """Add energy, color and velocity to the returns of deflected beams."""
         surfaces = self._surfaces
         setup = self.setup
         poses = batch.poses
@@ -240,9 +243,9 @@ class PulseCaster:
             points = directions * distance[:, None]
             points += origins
             color = surfaces.colors(triangle, points, times, poses.actor_trajectories)
-            del points  # which takes as much memory as the normals
+            del points  # frees as much memory as the normals need
         sensor_light = sensor_light_of(setup.survey, setup.sensor)
-        lit = surfaces.lit(
+        lit = surfaces.illuminate(
             triangle,
             directions,
             distance=distance,
@@ -253,9 +256,9 @@ class PulseCaster:
         )
         return returns._replace(energy=lit.energy, color=color, velocity=velocity)
 
-    def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> Scanned:
-        """Count the returns of each scan, and keep every n-th return of a scan."""
-        from .steps import pulse_loops  # not before: numba takes half a second to import
+    def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> ScannedReturns:
+        """Count the returns of each scan, and keep every n-th return of each scan."""
+        from .steps import pulse_loops  # imported here because numba takes half a second to import
 
         keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
@@ -279,6 +282,6 @@ class PulseCaster:
             reported=thinned.distance,
         )
         if not tally:
-            return Scanned(thinned, hit_counts, None)
+            return ScannedReturns(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
-        return Scanned(thinned, hit_counts, self._surfaces.triangles.count(triangle))
+        return ScannedReturns(thinned, hit_counts, self._surfaces.triangles.count(triangle))

@@ -1,4 +1,4 @@
-"""A rig: a scene with its ray casters, and the sensors of a survey, ready to cast."""
+"""A rig combines a scene, its ray casters and the sensors of a survey."""
 
 from __future__ import annotations
 
@@ -13,42 +13,43 @@ from raybeam import Pattern
 
 from ..base.arrays import Floats, Floats32, Integers
 from ..base.errors import LidarError
-from ..base.vectors import turned
+from ..base.vectors import rotate
 from ..motion.trajectory import Trajectory
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Sensor
 from ..survey.survey import ScanSpec, Survey
 from .casting.actor_trajectories import ActorTrajectories
-from .casting.motion import CastPoses, Clock, Firings, check_trajectory, poses_of_firings
+from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
-from .casting.surfaces import Surfaces
+from .casting.surfaces import SceneSurfaces
 from .points.batch_points import BatchPoints
 from .points.device_columns import DeviceColumns, DevicePoints
 from .pulses import PulseCaster
 from .returns import required
 
-# Most rays of a head's period that are stored, 24 bytes each. Directions repeat after a period.
+# Largest number of rays in a period of the head that are stored, at 24 bytes each. Directions
+# repeat after each period.
 PATTERN_RAYS = 20_000_000
-IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
-MAX_PATTERNS = 8  # patterns of firings that are stored for the next images
+IMAGE_RAYS = 1 << 20  # number of rays of range images that are cast at a time
+MAX_PATTERNS = 8  # number of ray patterns that are stored for the next images
 
 
 class _Rays(NamedTuple):
-    """Rays of a sensor that are computed once and cast repeatedly."""
+    """Rays of a sensor that are computed once and then cast repeatedly."""
 
-    pattern: Pattern | None  # a firing, or a period of the head; None if the rays do not repeat
-    # Whether the rays are a firing in the frame of the head, with a pose for each firing; else
-    # they are in the frame of the carrier.
+    pattern: Pattern | None  # one firing, or one period of the head; None if the rays do not repeat
+    # True if the rays are one firing in the head frame, with a pose for each firing. Otherwise they
+    # are in the platform frame.
     by_head: bool = False
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
-    """Return whether a sensor's rays are computed once and cast repeatedly, and whether by head.
+    """Return whether a sensor's rays are computed once, and whether they are cast by head.
 
-    `moves` says that the carrier moves. Rays by head are the rays of one firing in the frame of the
-    head, with a pose for each firing. Other repeated rays are the rays of a period of the head in
-    the frame of the carrier.
+    `moves` states whether the platform moves. Rays that are cast by head are the rays of one firing
+    in the head frame, with a pose for each firing. Other repeated rays are the rays of one head
+    period in the platform frame.
     """
     fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
     by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
@@ -56,9 +57,9 @@ def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
 
 
 class Rig:
-    """Scene, survey and ray caster, ready to cast scans of the survey.
+    """A scene, a survey and ray casters, ready to cast scans of the survey.
 
-    `backend`, `threads` and `device` are arguments of `RayCaster`.
+    The arguments `backend`, `threads` and `device` are passed to `RayCaster`.
     """
 
     def __init__(
@@ -79,31 +80,31 @@ class Rig:
         options: dict[str, Any],
         known_casters: Sequence[SceneCaster],
     ) -> None:
-        """Set all attributes, and build trees unless `known_casters` have the scene's trees."""
+        """Set all attributes, and build trees unless `known_casters` already have them."""
         self.scene = scene
         self.survey = survey
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
-        # The parts that scans are cast from, for other tools to look into.
-        self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        # Casters of the sensors, by their numbers.
+        # These parts are public so that other tools can inspect them.
+        self.surfaces = SceneSurfaces(scene, tuple(survey.materials), sorted(wavelengths))
+        # Casters by sensor number.
         self.scene_casters = casters_of_sensors(
             scene, survey, self.surfaces, known_casters, **options
         )
         self._prepare()
         check_trajectory(survey.path)
-        # {(number of the sensor, whether the carrier moves): rays}
+        # {(sensor number, whether the platform moves): rays}
         self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
-        # {(number of the sensor, first firing, stop of firings): rays}
+        # {(sensor number, first firing, stop of firings): rays}
         self._patterns: dict[tuple[int, int, int], Pattern] = {}
         for number in range(len(survey.carried)):
             self._rays_of_sensor(number, survey.path.moves)
 
     def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
-        """Return the rays of sensor `number` that are cast repeatedly, computed on first use.
+        """Return the rays of a sensor that are cast repeatedly, which are computed on first use.
 
-        `moves` says that the carrier moves.
+        `moves` states whether the platform moves.
         """
         rays = self._repeated_rays.get((number, moves))
         if rays is None:
@@ -120,25 +121,25 @@ class Rig:
         return rays
 
     def with_survey(self, scene: Scene, survey: Survey) -> Rig:
-        """Return a rig of a new survey of the same scene, possibly with new actors.
+        """Return a rig for a different survey of the same scene, possibly with different actors.
 
-        The tree of static bodies is shared.
+        Both rigs share the tree of the static bodies.
         """
         rig = copy(self)
         rig._assemble(scene, survey, self.options, self.scene_casters)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
-        """Return a rig with new trajectories of the actors, which shares the trees."""
+        """Return a rig in which the actors follow new trajectories; trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
         rig._actor_trajectories = ActorTrajectories.from_actors(actors)
         return rig
 
     def check_actors(self, begin_ns: float, end_ns: float) -> None:
-        """Raise LidarError unless the trajectories of all actors cover a span of time.
+        """Raise LidarError unless the trajectories of all actors cover a time interval.
 
-        The times are nanoseconds since the survey's start.
+        The interval is given in nanoseconds since the start of the survey.
         """
         moving = np.flatnonzero([trajectory.moves for trajectory in self._actor_trajectories])
         try:
@@ -146,30 +147,33 @@ class Rig:
             self._actor_trajectories.poses(np.tile(moving, 2), times)
         except LidarError:
             for number in moving:
-                self.scene.actors[number].check(begin_ns, end_ns)  # its error names the actor
+                self.scene.actors[number].check(begin_ns, end_ns)  # raises an error with the name
             raise
 
-    def moved(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
-        """Return a rig with the instances of objects `owners` (k,) at poses, as `Scene.moved` does.
+    def with_moved_instances(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
+        """Return a rig in which the instances of the objects `owners` have moved to new poses.
 
-        Objects have no duplicates; poses are positions (k, 3) and rotations (k, 3, 3). The trees
-        are shared: this rig must not cast afterwards, and no cast may be under way.
+        `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations (k, 3,
+        3), as in `Scene.moved`. The trees are shared and modified, so this rig must
+        not be used afterwards, and no cast may be in progress.
         """
         assert self.scene.instances is not None
         instance_indices, index = self.scene.instances.rows_of(owners)
         rig = copy(self)
         rig.scene = scene = self.scene.moved(instance_indices, positions[index], rotations[index])
         assert scene.instances is not None
-        rig.surfaces = surfaces = self.surfaces.moved(scene)
+        rig.surfaces = surfaces = self.surfaces.with_moved_instances(scene)
         move_instances(rig.scene_casters, surfaces, scene.instances, instance_indices)
-        rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
-        rig._device = self._device and self._device.moved(scene, surfaces)
+        rig.pulse_casters = [
+            pulses.with_moved_instances(scene, surfaces) for pulses in self.pulse_casters
+        ]
+        rig._device = self._device and self._device.with_moved_instances(scene, surfaces)
         return rig
 
     def _prepare(self) -> None:
-        """Create the casters of pulses and of columns, which know where surfaces are.
+        """Create the casters of pulses and of device columns, which depend on the surfaces.
 
-        Columns are computed on a CUDA device if it casts the rays and no sensor has steps.
+        Columns are computed on a CUDA device if the device casts the rays and no sensor has steps.
         """
         casters = self.scene_casters
         scene = self.scene
@@ -190,32 +194,32 @@ class Rig:
 
     @property
     def device_lost(self) -> bool:
-        """Whether a CUDA device answers no call of this process any more, after an error of it."""
+        """Whether the CUDA device stopped responding to this process after an error."""
         return self.scene_casters[0].caster.device_lost
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings `first` to `stop` of sensor `number`, in the carrier's frame.
+        """Return the rays of firings `first` to `stop` of a sensor, in the platform frame.
 
-        The rays are in the order of firings and beams; firings count from the station's start.
+        The rays are sorted by firing and beam. Firings are counted from the start of the station.
         """
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
         mount = carried.mount
         origins = carried.sensor.origins(firings)
-        directions = turned(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
+        directions = rotate(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
         if origins is not None:
-            origins = turned(origins.reshape(-1, 3), mount.rotation)
+            origins = rotate(origins.reshape(-1, 3), mount.rotation)
         if any(mount.position):
             origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
         return Pattern(directions, origins, step=carried.sensor.ring_step)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
-        """Cast scans `first` to `stop` of the survey, and yield the returns of each group of scans.
+        """Cast scans `first` to `stop` of the survey, and yield the returns of each group.
 
-        A group is scans of one sensor and station whose firings follow each other. A frozen sensor
+        A group consists of consecutive scans that share a sensor and a station. A frozen sensor
         casts the older scans that it sends again (`Survey.sent_scan`).
         """
-        specs: list[ScanSpec] = []  # scans of the group
+        specs: list[ScanSpec] = []  # scans of the current group
         for spec in map(self.survey.sent_scan, range(first, stop)):
             sequence = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
             last = specs[-1] if specs else spec
@@ -231,9 +235,9 @@ class Rig:
     ) -> BatchPoints | DevicePoints:
         """Cast consecutive scans of one sensor and station, and return their points.
 
-        At a firing `t` nanoseconds after the start of the station, the carrier is at the pose of
-        `path` at `t + late_ns`; actors are at their poses at the time of the firing. Hits of each
-        triangle are counted if `tally`.
+        For a firing `t` nanoseconds after the start of the station, the platform has the pose of
+        `path` at time `t + late_ns`, and actors have their poses at the time of the firing. If
+        `tally` is set, the hits of each triangle are counted.
         """
         number = specs[0].sensor
         repeated, by_head = self._rays_of_sensor(number, path.moves)
@@ -243,10 +247,10 @@ class Rig:
         stop = specs[-1].firings[1]
         firings = Firings.from_scans(sensor, specs)
         poses = self._poses(firings, path, late_ns, by_head=by_head)
-        self.scene_casters[number].cover(poses.positions)
+        self.scene_casters[number].ensure_trees(poses.positions)
         if repeated is not None:
             pattern = repeated
-            start = first * channels % len(repeated)  # row of the first ray in the pattern
+            start = first * channels % len(repeated)  # pattern row of the first ray
         else:
             pattern = self.pattern(number, first, stop)
             start = 0
@@ -254,7 +258,7 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        first_key = specs[0].scan + specs[0].ahead  # a scan's number in keys of random numbers
+        first_key = specs[0].scan + specs[0].ahead  # scan number in the keys of random numbers
         scanned = self.pulse_casters[number].scan(
             first_key, pattern, poses, window, groups, firings, tally=tally
         )
@@ -272,10 +276,10 @@ class Rig:
     def _poses(
         self, firings: Firings, path: Trajectory, late_ns: float, *, by_head: bool
     ) -> CastPoses:
-        """Return the poses of consecutive firings on a path, with the clocks that motion needs.
+        """Return the poses of consecutive firings on a path, with the clocks of moving bodies.
 
-        With `by_head` the poses are of the head, else of the carrier. `late_ns`, nanoseconds, is
-        added to the times at which the carrier's poses are taken, and not to the actors' times.
+        If `by_head` is set, these are poses of the head, otherwise of the platform. `late_ns`
+        nanoseconds are added to the firing times to find the platform's poses, but not for actors.
         """
         spec = firings.spec
         carried = self.survey.carried[spec.sensor]
@@ -289,33 +293,36 @@ class Rig:
         poses = self._with_actor_clock(poses, firings)
         if path.moves:
             firing_starts = carried.sensor.begins_ns(firings.numbers) + late_ns
-            carrier = Clock(firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,)))
-            poses = replace(poses, carrier=carrier, station=spec.station)
+            platform = FiringClock(
+                firing_starts, carried.sensor.beams.time_ns, ActorTrajectories((path,))
+            )
+            poses = replace(poses, platform=platform, station=spec.station)
         return poses
 
     def _with_actor_clock(self, poses: CastPoses, firings: Firings) -> CastPoses:
-        """Return poses of firings with the clock of the actors, if there are actors."""
+        """Add the clock of the actors to the poses of firings, if there are actors."""
         if not self.scene.actors:
             return poses
         sensor = firings.sensor
         firing_starts = sensor.begins_ns(firings.numbers) + firings.spec.start_ns
-        clock = Clock(firing_starts, sensor.beams.time_ns, self._actor_trajectories)
+        clock = FiringClock(firing_starts, sensor.beams.time_ns, self._actor_trajectories)
         return replace(poses, clock=clock)
 
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Return the ranges of the same firings from several poses of a static carrier.
+        """Return the ranges that the same firings measure from several poses of a static platform.
 
-        `specs` are consecutive scans of one station; for random numbers, the scans of the next pose
-        have the next numbers. The poses are positions (k, 3), meters, and rotations (k, 3, 3) from
-        the carrier frame to the scene frame; they are not checked here. Ranges belong to the
-        nearest reported returns, meters: float32 (k, firings, channels); inf without a return.
+        `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
+        increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
+        from the platform frame to the scene frame; they are not checked here. The result is a
+        float32 array of shape (k, firings, channels) with the range of the nearest reported return
+        in meters, or inf if there is no return.
         """
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
         first = specs[0].firings[0]
-        self.scene_casters[number].cover(positions)
+        self.scene_casters[number].ensure_trees(positions)
         pattern = self._pattern_of_firings(number, first, specs[-1].firings[1])
         rays = len(pattern)
         ranges_m = np.full((len(positions), rays), np.inf, np.float32)
@@ -337,11 +344,11 @@ class Rig:
         first_scan: int,
         image: Floats32,
     ) -> None:
-        """Write the ranges of the same firings from several poses into `image` (poses * rays,).
+        """Write the ranges that the same firings measure from several poses into `image`.
 
-        `pattern` are the rays of the firings, in the carrier's frame; `image` has the rays of a
-        pose behind the rays of the pose before. `first_scan` is added to the number of `specs[0]`,
-        for random numbers.
+        `pattern` has the rays of the firings in the platform frame. `image` has shape (poses *
+        rays,), with all rays of the first pose first. `first_scan` is added to the scan number of
+        `specs[0]` to seed the random numbers.
         """
         rays = len(pattern)
         count = len(image) // rays
@@ -366,7 +373,7 @@ class Rig:
             )
             .returns
         )
-        assert returns.reported is not None  # steps have set the ranges of reported returns
+        assert returns.reported is not None  # the steps have set the ranges of reported returns
         nearest = required(returns.number) == 1
         if nearest.all():
             image[returns.ray] = returns.reported
@@ -374,7 +381,7 @@ class Rig:
             image[returns.ray[nearest]] = returns.reported[nearest]
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings in the frame of the carrier, stored for the next calls."""
+        """Return the rays of firings in the platform frame, stored for later calls."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first

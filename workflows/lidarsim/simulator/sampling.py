@@ -1,4 +1,4 @@
-"""Estimates of a survey from a sample of its rays."""
+"""Estimate properties of a survey by casting a sample of its rays."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from ..sensor.beams import Beams
 from ..survey.survey import Mounted, Survey
 from .rig import Rig
 
-SAMPLE_RAYS = 500_000  # largest number of rays that are cast
-SAMPLE_SECTIONS = (
-    500  # largest number of sections of a survey, of consecutive scans, that are sampled
-)
-SECTION_SCANS = 40  # largest number of consecutive scans of a section
+SAMPLE_RAYS = 500_000  # largest number of rays that `sample_survey` casts
+SAMPLE_SECTIONS = 500  # largest number of sections of consecutive scans that are sampled
+SECTION_SCANS = 40  # largest number of consecutive scans in a section
 RANGE_RAYS = 20_000  # largest number of rays that `sample_ranges` casts
-GOLDEN = 0.6180339887498949  # the golden ratio less 1
+GOLDEN = 0.6180339887498949  # golden ratio minus 1
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
-    """Estimate hits and points of a survey by casting a sample of its rays.
+    """Estimate the numbers of hits and points in a survey by casting a sample of its rays.
 
-    The rays are spread evenly over all scans, or over evenly spread sections of many thousand
-    scans. All rays of a small survey are cast. The result has the numbers of `rays` that were cast,
-    and of `hit_count` and `points` of the whole survey.
+    The sampled rays are spread evenly over all scans. In a survey of many thousand scans, they are
+    spread over evenly spaced sections instead. In a small survey, all rays are cast. The result has
+    the number of cast rays (`rays`), and the estimated numbers of hits (`hits`) and points
+    (`points`) in the whole survey.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count))
     subrays = max(returns.subrays for returns in survey.returns_each)
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
     sampled = survey
     if (every := -(-rays // SAMPLE_RAYS)) > 1:
-        # Faults and errors of certain channels do not fit a single beam.
+        # Settings that apply to individual channels do not fit a sensor with a single beam.
         without_channels: dict[str, Any] = {"channel_bias_m": 0.0, "ripple_deg": 0.0}
         carried = [
             replace(mounted, noise=mounted.noise and replace(mounted.noise, **without_channels))
@@ -50,7 +49,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
         noise = replace(survey.noise, **without_channels)
         sampled = replace(survey, sensors=carried, noise=noise, faults=())
     cast_rays = 0
-    sampled_rays = 0  # rays of the survey that the cast rays represent
+    sampled_rays = 0  # number of the survey's rays that the cast rays represent
     hit_count = 0
     points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
@@ -65,10 +64,10 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
-    """Return the distances from sampled rays of a survey to the nearest surfaces, meters: (n,).
+    """Return the distances in meters from sampled rays of a survey to the nearest surfaces.
 
-    Sensors have neither limits of range nor noise, faults or weather. Rays that meet no surface are
-    left out. `scans` are the scans of the survey that are sampled, by default all.
+    The sensors are simulated without range limits, noise, faults and weather. Rays that hit no
+    surface are omitted. Rays are sampled from `scans`, by default from all scans of the survey.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count) if scans is None else scans)
     rays = survey.ray_count * int((stops - firsts).sum()) // survey.scan_count
@@ -93,15 +92,15 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
         keep_every=1,
         **declared(Weather(), Weather),
     )
-    # Never CUDA, whose context would stay in this process.
+    # CUDA is never used, because its context would stay in this process.
     backend = "numpy" if available_backends()["tiles"] else "tiles"
     batches = _batches(Rig(scene, plain, backend), firsts, stops)
     return np.concatenate([np.zeros(0), *(batch.range for batch in batches)])
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
-    """Return the first scans and stops (m,) of evenly spread sections of `scans`."""
-    # A section spans at most two stations, which are cast separately.
+    """Return the first scans and the stops of evenly spaced sections of `scans`."""
+    # Limit the length so that a section spans at most two stations, which are cast separately.
     scans_per_section = max(1, min(*survey.steps_each, SECTION_SCANS))
     sections = even_indices(-(-len(scans) // scans_per_section), SAMPLE_SECTIONS)
     firsts = scans.start + scans_per_section * sections
@@ -109,7 +108,7 @@ def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return the sensors of a survey, each replaced by a sample of 1 / `every` of its rays."""
+    """Return the sensors of a survey, each replaced by a sample of one in `every` of its rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
         for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
@@ -117,32 +116,32 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast sections of a survey, from first scans to stops (m,), and yield their batches."""
+    """Cast sections of a survey, given by first scans and stops, and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 
 
 class _SampledRays(NamedTuple):
-    """Rays (k,) of a sensor that were chosen for a sample."""
+    """The k rays of a sensor that belong to a sample."""
 
-    firings: Ints  # (f,): the firings of the rays, each once
-    row: Ints  # (k,): index in `firings` of each ray's firing
+    firings: Ints  # (f,): distinct firings of the rays
+    row: Ints  # (k,): index into `firings` for each ray
     channel: Ints  # (k,)
 
 
 @dataclass(frozen=True, eq=False)
 class _FewRays(Sensor):
-    """A sensor of a single beam, whose firings are a sample of the rays of a sensor."""
+    """A sensor with a single beam, whose firings are a sample of another sensor's rays."""
 
     sampled: Sensor = field(default_factory=Sensor)
-    every: int = 1  # rays of the sensor for each sampled ray
+    every: int = 1  # number of the sensor's rays for each sampled ray
     period = None
 
     @classmethod
     def from_sensor(cls, sensor: Sensor, every: int) -> _FewRays:
-        """Sample a share 1 / `every` of the rays of a sensor, or more, so that no scan is empty."""
+        """Sample one in `every` of a sensor's rays, or more if a scan would otherwise be empty."""
         first, stop = sensor.firings(0)
-        # The numbers of firings of scans may differ by one.
+        # Scans may differ by one firing.
         every = max(1, min(every, (stop - first) * sensor.channels // 2))
         return cls(
             beams=Beams(np.zeros(1)),
@@ -157,30 +156,30 @@ class _FewRays(Sensor):
         )
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the start and stop of the sampled rays of a time step."""
+        """Return the first sampled ray of a time step, and one past the last."""
         first, stop = self.sampled.firings(step)
         channels = self.sampled.channels
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the rays of the sensor for firings (k,) of this sample, one ray each."""
-        # Steps of the golden ratio spread the rays evenly over firings and channels.
+        """Return the sensor's ray for each firing (k,) of this sample."""
+        # Multiples of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)
         return _SampledRays(*np.unique(fired, return_inverse=True), channel)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the directions of sampled rays, (k, 1, 3), in the frame of the sensor."""
+        """Return the directions of sampled rays in the sensor frame. Shape (k, 1, 3)."""
         rays = self._rays(firings)
         return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the origins of sampled rays, (k, 1, 3), or None if rays start at the sensor."""
+        """Return the origins of sampled rays, or None if all rays start at the sensor."""
         rays = self._rays(firings)
         origins = self.sampled.origins(rays.firings)
         return None if origins is None else origins[rays.row, rays.channel, None]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the times of the first beam in the firings of sampled rays, (k,), nanoseconds."""
+        """Return the start times in nanoseconds of the firings that the sampled rays belong to."""
         rays = self._rays(firings)
         return self.sampled.begins_ns(rays.firings)[rays.row] + self.sampled.lead_ns

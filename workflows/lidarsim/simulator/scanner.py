@@ -1,4 +1,4 @@
-"""The simulator as a function: a sensor in a scene, sweep by sweep."""
+"""`Scanner`, which simulates a sensor in a scene sweep by sweep."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from pydantic import Field
 from raybeam.poses import check_poses
 
 from ..base.arrays import Floats, Floats32, Indices
+from ..base.checks import check_fits, check_type
 from ..base.declared import Names
 from ..base.errors import LidarError
-from ..base.validation import checked
 from ..base.value_texts import shown
 from ..base.words import name_hint
 from ..columns.cloud import Cloud
@@ -38,9 +38,9 @@ from .casting.surfaces import warn_of_gray
 from .points.batch_columns import columns_of
 from .rig import Rig
 
-MAX_SCANS = 1 << 31  # the type of the column `scan`
-_MAX_REVOLUTIONS = 4  # whose scans are stored
-MAX_START_S = 9e9  # times are int64, nanoseconds
+MAX_SCANS = 1 << 31  # limit of the type of the column `scan`
+_MAX_REVOLUTIONS = 4  # number of revolutions whose scans are stored
+MAX_START_S = 9e9  # times are int64 nanoseconds
 SweepNumber = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
 StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
@@ -96,7 +96,6 @@ class Scanner:
     (2, 1809, 16)
     """
 
-    @checked
     def __init__(
         self,
         scene: Scene,
@@ -121,6 +120,7 @@ class Scanner:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
+        check_type("scene", scene, Scene, advice=" To read a file, use Scene.load('hall.glb').")
         if name and isinstance(sensor, Mounted):
             raise LidarError(
                 f"The name of a Mounted sensor is set in Mounted, but name is {name!r}. Use "
@@ -134,7 +134,7 @@ class Scanner:
             sensors=[mounted],
             poses=[CENTER],
             steps=1,
-            precision_m=precision_m,  # type: ignore[arg-type]  # None: of the sensor, as below
+            precision_m=precision_m,  # type: ignore[arg-type]  # None: set by the sensor below
             columns=columns,
             coordinates=coordinates,
             materials=materials,
@@ -153,24 +153,24 @@ class Scanner:
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
-        """Check the backend, build the rig with `options` of `Rig`, and set all attributes."""
+        """Check the backend, build the rig with the options of `Rig`, and set all attributes."""
         check_backend_here(options["backend"])
         try:
             self._rig = Rig(scene, survey, **options)
-        except ValueError as error:  # wrong threads or device
+        except ValueError as error:  # invalid `threads` or `device`
             raise LidarError(str(error)) from error
         self._actors = list(scene.actors)
         self._numbers = {name: number for number, name in enumerate(scene.object_names)}
-        # Objects whose triangles are all in instances.
+        # True for objects whose triangles all belong to instances.
         self._movable = np.zeros(len(scene.names), np.bool_)
         if scene.instances is not None:
             self._movable[scene.instances.owner] = True
             self._movable[scene.face_object] = False
-        # Sweeps share the caster, and instances are moved in it.
+        # Sweeps share the caster, in which instances are moved.
         self._lock = threading.Condition()
-        self._casts = 0  # sweeps under way
-        self._moves = 0  # moves of instances under way or waiting
-        self._unnumbered = 0  # sweeps and images that were scanned without a `number` so far
+        self._casts = 0  # sweeps in progress
+        self._moves = 0  # moves of instances in progress or waiting
+        self._unnumbered = 0  # number of sweeps and images scanned without a `number` so far
         self._revolutions: dict[int, list[ScanSpec]] = {}  # {revolution: its scans}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ class Scanner:
 
     @property
     def survey(self) -> Survey:
-        """Survey of a single time step, with the sensor and the options of the scanner."""
+        """Survey with a single time step, and with the sensor and the options of the scanner."""
         return self._rig.survey
 
     @property
@@ -210,10 +210,7 @@ class Scanner:
         """The scene, with actors and instances at their current poses."""
         return self._rig.scene
 
-    @checked
-    def span_s(
-        self, number: SweepNumber = 0, *, start_s: StartSeconds = None
-    ) -> tuple[float, float]:
+    def span_s(self, number: int = 0, *, start_s: float | None = None) -> tuple[float, float]:
         """Return the firing times of the first and the last beam of a sweep, in seconds.
 
         `number` and `start_s` are the same as in `sweep`, but `number` is 0 by default.
@@ -224,13 +221,12 @@ class Scanner:
         last_delay_ns = float(rig.survey.sensor.beams.time_ns.max())
         return begin_ns / 1e9, (end_ns + last_delay_ns) / 1e9
 
-    @checked
     def sweep(
         self,
         pose: Pose | Trajectory | Sequence[float],
         *,
-        number: SweepNumber | None = None,
-        start_s: StartSeconds = None,
+        number: int | None = None,
+        start_s: float | None = None,
     ) -> Cloud:
         """Simulate a sweep, which is one revolution of the head or one frame.
 
@@ -276,7 +272,7 @@ class Scanner:
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
         part = columns_of([returns])
-        # A device writes to page-locked memory with room for all rays, which the next sweep needs.
+        # A device writes to page-locked memory for all rays, which the next sweep reuses.
         columns = {column.name: part.columns[column.name] for column in table[1:]}
         owned_columns = {
             name: values if values.flags.owndata else values.copy()
@@ -285,13 +281,12 @@ class Scanner:
         part = replace(part, columns={**part.columns, **owned_columns})
         return part.cloud(table, survey.precision_m, origin)
 
-    @checked
     def ranges(
         self,
         poses: Pose | ArrayLike,
         *,
-        number: SweepNumber | None = None,
-        start_s: StartSeconds = None,
+        number: int | None = None,
+        start_s: float | None = None,
     ) -> Floats32:
         """Simulate the range images that the sensor measures from several poses.
 
@@ -334,7 +329,6 @@ class Scanner:
                 raise LidarError(str(error)) from error
             return rig.ranges(specs, checked_poses.positions, checked_poses.rotations)
 
-    @checked
     def move(
         self,
         name: str | Sequence[str],
@@ -416,9 +410,9 @@ class Scanner:
                 self._follow(self._with_moved(actors))
 
     def _numbers_of(self, names: list[str]) -> Indices:
-        """Return the numbers (k,) of actors and instances.
+        """Return the numbers of actors and instances by their names.
 
-        Raises LidarError for other or double names.
+        Raises LidarError if a name is unknown or occurs twice.
         """
         numbers = np.array([self._numbers.get(name, -1) for name in names], np.intp)
         object_count = len(self._movable)
@@ -433,9 +427,9 @@ class Scanner:
         return numbers
 
     def _refuse_name(self, name: str, number: int) -> NoReturn:
-        """Raise LidarError for a name of no actor or instance.
+        """Raise LidarError because a name refers to no actor or instance.
 
-        `number` is -1 for no object.
+        `number` is the number of the static object with this name, or -1 if there is none.
         """
         object_count = len(self._movable)
         names = [
@@ -448,9 +442,9 @@ class Scanner:
         raise LidarError(f"Unknown actor or instance {name!r}.{hint}")
 
     def _with_moved(self, moves: list[tuple[int, Trajectory]]) -> list[Actor]:
-        """Return all actors, some of them, by index, on new trajectories.
+        """Return all actors, with new trajectories for some of them, which are given by index.
 
-        The caller holds the lock.
+        The caller must hold the lock.
         """
         actors = self._actors.copy()
         for index, trajectory in moves:
@@ -458,9 +452,9 @@ class Scanner:
         return actors
 
     def _follow(self, actors: list[Actor]) -> None:
-        """Cast with other trajectories of all actors.
+        """Update the trajectories of all actors.
 
-        The caller holds the lock.
+        The caller must hold the lock.
         """
         self._rig = self._rig.with_actors(tuple(actors))
         self._actors = actors
@@ -472,16 +466,16 @@ class Scanner:
         rotations: Floats,
         actors: list[tuple[int, Trajectory]],
     ) -> None:
-        """Wait for sweeps under way and move instances, by object numbers, while new sweeps wait.
+        """Wait for sweeps in progress, then move instances given by their object numbers.
 
-        Actors, by index, get new trajectories.
+        New sweeps wait until the instances have moved. Actors given by index get new trajectories.
         """
         with self._lock:
-            self._moves += 1  # new sweeps wait
+            self._moves += 1  # makes new sweeps wait
             try:
                 self._lock.wait_for(lambda: not self._casts)
                 moved_actors = self._with_moved(actors)
-                self._rig = self._rig.moved(numbers, positions, rotations)
+                self._rig = self._rig.with_moved_instances(numbers, positions, rotations)
                 if actors:
                     self._follow(moved_actors)
             finally:
@@ -491,13 +485,14 @@ class Scanner:
     def _specs(
         self, rig: Rig, number: int | None, start_s: float | None, count: int
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of a revolution, and the delay of its start, nanoseconds.
+        """Return the scans of a revolution, and the delay of its start in nanoseconds.
 
-        The delay is `start_s` less the start of revolution `number` in a survey, 0 without a
-        `start_s`. Without a `number`, the scans belong to revolution 0, with the random numbers
-        of later revolutions, and `count` revolutions of random numbers are used up.
+        The delay is the difference between `start_s` and the start of revolution `number` in a
+        survey, or 0 if `start_s` is None. If `number` is None, the scans belong to revolution 0 but
+        use the random numbers of later revolutions, and `count` revolutions of random numbers are
+        used up.
         """
-        revolutions_ahead = 0  # so many revolutions are random numbers ahead
+        revolutions_ahead = 0  # how far the random numbers are ahead of the revolution
         if number is None:
             with self._lock:
                 revolutions_ahead = self._unnumbered
@@ -511,10 +506,13 @@ class Scanner:
     def _scans_of(
         self, rig: Rig, number: int, start_s: float | None, revolutions_ahead: int = 0
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of revolution `number`, and the delay of its start, nanoseconds.
+        """Return the scans of revolution `number`, and the delay of its start in nanoseconds.
 
-        A revolution that is `revolutions_ahead` gives the random numbers, by `ScanSpec.ahead`.
+        The random numbers are those of the revolution that follows `revolutions_ahead` later
+        (`ScanSpec.ahead`).
         """
+        check_fits("number", number, SweepNumber)
+        check_fits("start_s", start_s, StartSeconds)
         sensor = rig.survey.sensor
         specs = self._revolution(sensor, number)
         if specs[-1].scan >= MAX_SCANS:
@@ -526,7 +524,7 @@ class Scanner:
         return [spec.shifted(late_ns, ahead) for spec in specs], late_ns
 
     def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:
-        """Return the scans of revolution `number`, stored for the next sweeps."""
+        """Return the scans of revolution `number`, which are stored for the next sweeps."""
         specs = self._revolutions.get(number)
         if specs is None:
             specs = [
@@ -540,7 +538,7 @@ class Scanner:
 
     @contextmanager
     def _casting(self) -> Iterator[Rig]:
-        """Yield the current rig, whose instances are not moved until the context exits."""
+        """Yield the current rig, and keep its instances in place until the context exits."""
         with self._lock:
             self._lock.wait_for(lambda: not self._moves)
             self._casts += 1
@@ -554,7 +552,7 @@ class Scanner:
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
-    """Return the times of the first beams of the first and last firings, ns since time 0."""
+    """Return the start times of the first and the last firing, in nanoseconds since time 0."""
     sensor = rig.survey.sensor
     first_and_last = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
     begin, end = (sensor.begins_ns(first_and_last) + (sensor.lead_ns + specs[0].start_ns)).tolist()
@@ -562,13 +560,13 @@ def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
 
 
 def _trajectory_of(pose: Any) -> Trajectory:
-    """Return a trajectory unchanged, or the trajectory that stays at a pose."""
+    """Return a trajectory unchanged, or convert a pose to a stationary trajectory."""
     path: Trajectory = pose if hasattr(pose, "poses") else Stations((pose_of("pose", pose),))
     return path
 
 
 def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
-    """Return positions (k, 3) and rotations (k, 3, 3), or None for poses without rotations."""
+    """Return positions (k, 3), and rotations (k, 3, 3) or None if the poses are positions."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
@@ -582,7 +580,7 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
     if table.shape == (3,) or (table.ndim == 2 and table.shape[1] == 3):
         return table.reshape(-1, 3), None
     if table.ndim == 3 and table.shape[1:] == (4, 4):
-        # Not by `numpy.allclose`, which takes as long as casting 1,000 rays.
+        # `numpy.allclose` would take as long as casting 1,000 rays.
         if not (np.abs(table[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
             raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
         return table[:, :3, 3], table[:, :3, :3]

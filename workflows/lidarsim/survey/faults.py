@@ -11,10 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Ints
-from ..base.declared import AngleDeg, MinMax, Several, Text, Two, UnitShare, about
+from ..base.checks import check_fields, check_order
+from ..base.declared import AngleDeg, FileSection, MinMax, Several, Text, Two, UnitShare, about
 from ..base.errors import LidarError, prefixed
 from ..base.random_numbers import Purpose, uniform
-from ..base.validation import checked_fields, without_numpy
+from ..base.value_texts import one_line
 from ..base.words import did_you_mean, joined
 from ..sensor.sensor import Sensor
 
@@ -36,8 +37,7 @@ _KIND_FIELDS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-@checked_fields
-class Fault:
+class Fault(FileSection):
     """A temporary fault of a sensor, such as a dirty window or lost packets.
 
     Faults do not affect labels, which describe the true scene and list the active faults.
@@ -75,10 +75,18 @@ class Fault:
         Shift | None, about("offset in seconds that a time jump adds to timestamps")
     ] = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, value in self.words().items():  # labels have them as JSON
-            listed = np.iterable(value) and not isinstance(value, str)
-            object.__setattr__(self, name, without_numpy(tuple(value) if listed else value))
+            if np.iterable(value) and not isinstance(value, str):
+                value = tuple(np.asarray([*value]).tolist())
+            elif isinstance(value, np.number):
+                value = value.item()
+            object.__setattr__(self, name, value)
+        if self.elevation_deg is not None:
+            check_order("elevation_deg", self.elevation_deg)
         kind_fields = _KIND_FIELDS[self.kind]
         present = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
         optional = {name for name in kind_fields if name.endswith("_deg")}

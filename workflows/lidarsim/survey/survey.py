@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
@@ -15,12 +15,11 @@ import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import FILLED_IN, Names, Several, about, written_as
-from ..base.errors import LidarError
+from ..base.checks import check_fields, check_type
+from ..base.declared import FILLED_IN, FileSection, Names, Several, about, written_as
+from ..base.errors import ArgumentError, LidarError
 from ..base.notebook import picture_of, table_of
-from ..base.signatures import ReadableSignature
-from ..base.validation import checked_fields
-from ..base.value_texts import shown
+from ..base.value_texts import one_line, shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..base.words import joined, listed, plural, rounded, scans_in_words
 from ..columns.table import (
@@ -32,10 +31,10 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
-from ..media.materials import ClassNames, Material
+from ..media.materials import ClassNames, Material, class_names_problem
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
 from ..motion.navigation import Navigation, check_navigation
-from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, check_trajectory_type, pose_of
 from ..sensor.noise import MAX_ALARMS, Noise
 from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
 from ..sensor.sensor import Sensor
@@ -55,13 +54,15 @@ EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
 MAX_DURATION_NS = 2.0**63  # limit of the type of the column time: 292 years
 
 
+_ON_SENSORS = " To load a sensor model, use load_sensor('velodyne/vlp16')."
+
+
 def nanoseconds(moment: datetime) -> int:
     """Return the nanoseconds from 1970-01-01 UTC to a time with a time zone."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Mounted:
     """A sensor mounted on a platform.
 
@@ -92,7 +93,11 @@ class Mounted:
     noise: Noise | None = None
     unseen: Names = ()
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_type("sensor", self.sensor, Sensor, advice=_ON_SENSORS)
+        check_fields(self)
         names = (self.unseen,) if isinstance(self.unseen, str) else tuple(self.unseen)
         object.__setattr__(self, "unseen", names)
 
@@ -124,8 +129,6 @@ class ScanSpec:
         scan of the sweep that it replaces.
     """
 
-    __signature__ = ReadableSignature()
-
     scan: int
     station: int
     firings: tuple[int, int]
@@ -148,8 +151,7 @@ class ScanSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-@checked_fields
-class CloudOptions:
+class CloudOptions(FileSection):
     """Selection of the hits that become points, and the columns of points.
 
     In Python a column may also be a user's `Column`.
@@ -207,6 +209,11 @@ class CloudOptions:
         ),
     ] = None
 
+    __repr__ = one_line
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 class SensorSweeps(NamedTuple):
     """Sweeps of a sensor in a survey."""
@@ -217,7 +224,6 @@ class SensorSweeps(NamedTuple):
 
 
 @dataclass(frozen=True)
-@checked_fields
 class Survey(CloudOptions, Weather):
     """A simulated survey of a scene with one or more sensors on a platform.
 
@@ -287,7 +293,16 @@ class Survey(CloudOptions, Weather):
     classes: ClassNames = field(default_factory=dict, compare=False)
     epsg: EpsgCode | None = None
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
+        check_type("sensor", self.sensor, Sensor, advice=_ON_SENSORS)
+        check_fields(self)
+        check_type("classes", self.classes, Mapping)
+        if problem := class_names_problem(self.classes):
+            raise ArgumentError(f"classes: {problem}")
+        if self.trajectory is not None:
+            check_trajectory_type("trajectory", self.trajectory)
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
         self._set(trajectory=self._trajectory(), materials=tuple(self.materials))
         self._check_names()

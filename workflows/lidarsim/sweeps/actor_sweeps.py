@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Ints32
-from ..base.vectors import applied, cross
+from ..base.vectors import cross, matvec
 from ..motion.trajectory import CLOCK_S, full_poses, presence_ns, velocities
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -75,7 +75,7 @@ class _OneActor(NamedTuple):
         """Return an actor in sweeps with these starts and last beams (n,)."""
         appears_ns, leaves_ns = presence_ns(actor.trajectory)
         poses = _poses(actor, starts_ns)
-        lever_arms = applied(poses.rotations, actor.bounds.mean(axis=0))
+        lever_arms = matvec(poses.rotations, actor.bounds.mean(axis=0))
         present = (appears_ns <= starts_ns) & (starts_ns <= leaves_ns)
         comes = (starts_ns < appears_ns) & (appears_ns <= stops_ns)
         moving = (present | comes) & actor.trajectory.moves

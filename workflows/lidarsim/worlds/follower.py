@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats, Floats32
+from ..base.checks import check_items
 from ..base.errors import LidarError
-from ..base.validation import checked
 from ..columns.cloud import Cloud
 from ..motion.trajectory import StaticPose, Track
 from ..scene.actors import Actor
@@ -81,7 +81,6 @@ class Follower:
     1
     """
 
-    @checked
     def __init__(
         self,
         bodies: Sequence[SceneMesh],
@@ -90,6 +89,8 @@ class Follower:
         static: Sequence[SceneMesh | SceneInstance] = (),
         **options: Any,
     ) -> None:
+        check_items("bodies", bodies, SceneMesh)
+        check_items("static", static, SceneMesh, SceneInstance)
         self._static = list(static)
         self.names = unique_names([item.name for item in (*static, *bodies)])
         self._body_names = self.names[len(static) :]
@@ -126,7 +127,6 @@ class Follower:
         """Name of the ray-casting backend in use."""
         return self._frozen.backend
 
-    @checked
     def sweep(
         self, pose: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Cloud:
@@ -158,7 +158,6 @@ class Follower:
         path = StaticPose(sensor_pose[0, :3, 3] - origin, sensor_pose[0, :3, :3])
         return self._frozen.sweep(path, number=number)
 
-    @checked
     def ranges(
         self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Floats32:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarError
-from ..base.vectors import applied, length, matmul, turned
+from ..base.vectors import matmul, matvec, norm, rotate
 from ..base.words import name_hint, plural
 from ..motion.rotations import matrices as rotations_of_quaternions
 from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
@@ -198,7 +198,7 @@ def _mesh_of_geoms(model: Any, geoms: list[int], colors: Floats, choice: Choice)
 def _placed_geom(model: Any, geom: int, choice: Choice) -> GeomMesh:
     """Return the triangles of a geom in the frame of its body."""
     shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
-    points = turned(shape.vertices, _rotation(model.geom_quat[geom]))
+    points = rotate(shape.vertices, _rotation(model.geom_quat[geom]))
     return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
 
 
@@ -223,7 +223,7 @@ def _rotation(quaternion: Any) -> Floats:
     """Return the rotation (3, 3) of a quaternion w, x, y, z."""
     w, x, y, z = np.asarray(quaternion, np.float64).tolist()
     xyzw = np.array([[x, y, z, w]])
-    return np.asarray(rotations_of_quaternions(xyzw / length(xyzw)[:, None])[0])
+    return np.asarray(rotations_of_quaternions(xyzw / norm(xyzw)[:, None])[0])
 
 
 def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
@@ -232,7 +232,7 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
     position = np.zeros(3)
     while body:
         local = _rotation(model.body_quat[body])
-        position = applied(local, position) + np.asarray(model.body_pos[body], np.float64)
+        position = matvec(local, position) + np.asarray(model.body_pos[body], np.float64)
         rotation = matmul(local, rotation)
         body = int(model.body_parentid[body])
     return rotation, position

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..base.arrays import Floats, Floats32, Indices
 from ..base.errors import LidarError
-from ..base.signatures import ReadableSignature
 from ..columns.cloud import Cloud
 from ..sensor import Sensor
 from ..survey.survey import Mounted
@@ -65,8 +64,6 @@ class MujocoScanner:
     >>> scanner.sweep(data)  # doctest: +SKIP
     <Cloud of 21,316 points: x, y, z, scan, channel, object>
     """
-
-    __signature__ = ReadableSignature()
 
     def __init__(
         self,

@@ -1,1 +1,1 @@
-"""Pictures by our own ray caster: scenes seen by a camera, and points over them."""
+"""Render scenes with the project's own ray caster, and draw points over them."""

@@ -1,4 +1,4 @@
-"""The picture of a sensor's beams: directions and times of its first rays."""
+"""Draw the directions and times of a sensor's first rays."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lidarsim.sensor import LineSensor, Sensor
 
 from .picture_page import Page
 from .shot import SIZE
-from .theme import mapped
+from .theme import apply_colormap
 
 COLORS = "viridis"
-MAX_FIRINGS = 8  # firings of sensors of several channels
+MAX_FIRINGS = 8  # firings that are drawn for sensors with several channels
 
 
 class _BeamPlot(NamedTuple):
@@ -29,9 +29,9 @@ class _BeamPlot(NamedTuple):
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, colored by time.
 
-    The rays come from some firings, but for sensors of a single channel from a frame, or from two
-    cycles of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over
-    time.
+    A sensor with several channels shows `MAX_FIRINGS` firings, a sensor with a single channel one
+    frame. A sensor that looks down shows two mirror cycles: its rays lie in a plane, so their angle
+    is plotted over time.
     """
     page = Page(size)
     firings_per_revolution = round(getattr(sensor.head, "firings_per_turn", 1000))
@@ -59,14 +59,16 @@ def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
         axes.set_aspect("equal")
     norm = Normalize(0, max(float(times.max()), 1e-3))
     area = (10 if has_channels else 2) * page.unit**2
-    axes.scatter(plot.x_values, plot.y_values, s=area, c=mapped(COLORS, norm(times)), linewidths=0)
-    page.color_bar(mapped(COLORS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
+    axes.scatter(
+        plot.x_values, plot.y_values, s=area, c=apply_colormap(COLORS, norm(times)), linewidths=0
+    )
+    page.color_bar(apply_colormap(COLORS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
     page.title(sensor.name, f"{sensor.channels:,} channel{'s' * has_channels} · {words}")
     return page
 
 
 def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
-    """Plot the angle of directions (n, 3) in a vertical plane over times (n,)."""
+    """Plot the angles of directions (n, 3) in a vertical plane over times (n,)."""
     _, y, z = directions.T
     return _BeamPlot(times, np.degrees(np.arctan2(y, -z)), (f"time, {unit}", "angle, degrees"))
 
@@ -74,7 +76,7 @@ def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
 def _plot_directions(directions: Floats) -> _BeamPlot:
     """Plot the azimuths and elevations of directions (n, 3)."""
     x, y, z = directions.T
-    middle = np.degrees(np.arctan2(y[0], x[0]))  # no jump where azimuths pass 180 degrees
+    middle = np.degrees(np.arctan2(y[0], x[0]))  # avoids a jump at 180 degrees
     azimuth = np.degrees(np.arctan2(y, x))
     continuous = (azimuth - middle + 180) % 360 - 180 + middle
     labels = ("azimuth, degrees", "elevation, degrees")

@@ -1,4 +1,4 @@
-"""A perspective camera: from pixels to rays, from points to pixels."""
+"""Define a perspective camera that converts pixels to rays and points to pixels."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from lidarsim.base.arrays import AnyArray, Floats
 class Camera:
     """A pinhole camera.
 
-    Pixel coordinates are continuous: x to the right, y down, the center of the first pixel at
-    (0.5, 0.5).
+    Pixel coordinates are continuous: x points right, y points down, and the center of the first
+    pixel is at (0.5, 0.5).
     """
 
     eye: Floats  # (3,) meters
-    axes: Floats  # (3, 3), rows: unit vectors to the right, up and forward
+    axes: Floats  # (3, 3) unit vectors to the right, up, and forward as rows
     focal: float  # length in pixels
-    center: Floats  # (2,) pixel that looks straight ahead; it may lie outside the image
+    center: Floats  # (2,) principal point in pixels; it may lie outside the image
     size: tuple[int, int]  # width and height in pixels
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Return unit directions (n, 3) through pixel coordinates (n, 2)."""
+        """Return unit direction vectors (n, 3) through pixel coordinates (n, 2)."""
         plane = (np.asarray(pixels, dtype=np.float64) - self.center) / self.focal
         rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
         return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Return pixel coordinates (n, 2) of points (n, 3), and distances (n,) from the eye.
+        """Return the pixel coordinates (n, 2) of points (n, 3), and their distances from the eye.
 
-        Points beside or behind the eye have NaN coordinates.
+        Points beside or behind the eye have the coordinates NaN.
         """
         offset = np.asarray(points, dtype=np.float64) - self.eye
         side, up, ahead = (offset @ self.axes.T).T
@@ -41,15 +41,18 @@ class Camera:
         pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.center
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
-    def look_up(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
-        """Return values (n,) of an image at pixels (n, 2), and `outside` beside the image."""
+    def sample_image(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
+        """Return the values (n,) of an image at pixels (n, 2).
+
+        Pixels outside the image have the value `outside`.
+        """
         position = np.asarray(pixels)
         inside = np.all((position >= 0) & (position < np.array(self.size)), axis=1)
         column, row = np.where(inside[:, None], position, 0).astype(np.int64).T
         return np.where(inside, image[row, column], outside)
 
     def footprint(self, distance: ArrayLike) -> Floats:
-        """Return the width in meters that a pixel covers at a distance, seen face on."""
+        """Return the width in meters that a pixel covers on a facing surface at a distance."""
         return np.asarray(distance, dtype=np.float64) / self.focal
 
 
@@ -60,11 +63,20 @@ def fit_camera(
     azimuth_deg: float,
     elevation_deg: float,
 ) -> Camera:
-    """Place a camera so that points (n, 3) at two positions or more fill a frame within the image.
+    """Place a camera so that points fill a frame within the image.
 
-    Seen from the points, the eye is in the direction of azimuth and elevation, at 7 times their
-    radius, which keeps uprights upright; focal length and image center are then chosen so that the
-    projected points touch the frame: left, top, right and bottom as fractions of the image.
+    The camera is at 7 times the radius of the points, so that vertical lines stay almost vertical.
+
+    Parameters
+    ----------
+    points
+        (n, 3) positions, at least two of them different.
+    size
+        Width and height of the image in pixels.
+    frame
+        Left, top, right, and bottom edge of the frame, as fractions of the image.
+    azimuth_deg, elevation_deg
+        Direction from the points to the camera.
     """
     corners = np.asarray(points, dtype=np.float64)
     lower = corners.min(axis=0)
@@ -82,7 +94,7 @@ def fit_camera(
 
 
 def _camera_axes(azimuth: float, elevation: float) -> Floats:
-    """Return `Camera.axes` (3, 3) of a camera in a direction from the scene, radians."""
+    """Return `Camera.axes` (3, 3) for a camera in a direction from the scene, given in radians."""
     horizontal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     back = horizontal * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
     right = np.array([-horizontal[1], horizontal[0], 0.0])

@@ -1,4 +1,4 @@
-"""Chooses the part of a scene to show: around a trajectory, and under a roof."""
+"""Choose the part of a scene to show: around trajectories, and below a roof."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from raybeam import RayCaster
 
-from .surface import spiral
+from .surface import golden_spiral
 
-# Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
-# lowest point, and a minimum in meters.
+# The margin around a trajectory is the largest of a share of its length, a multiple of its height
+# above the lowest point of the scene, and a minimum in meters.
 _MARGIN_SHARE = 0.35
 _MARGIN_HEIGHTS = 2.0
 _MIN_MARGIN_M = 25.0
-_MAX_SHARE = 0.5  # share of the scene's ground; larger parts show all of it
+_MAX_SHARE = 0.5  # the whole scene is shown if the box covers a larger share of its area
 
-_MIN_ROOF_SHARE = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
+_MIN_ROOF_SHARE = 0.7  # share of steep upward rays that must hit the scene if there is a roof
 _STEEP_DEG = 60.0
 _RAYS = 64
-_MAX_SPREAD = 0.5  # spread of the heights above a sensor, over their median: more is a tree's crown
-_CONTACT = 1e-3  # share of the scene's diagonal: a sensor on a surface does not stand under it
-_MAX_POSITIONS = 8  # positions of sensors that cast rays
+_MAX_SPREAD = 0.5  # heights above a sensor with a larger relative spread are a tree, not a roof
+_CONTACT = 1e-3  # rays start at this share of the diagonal, off the surface that a sensor is on
+_MAX_POSITIONS = 8  # sensor positions from which rays are cast
 
 
 def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | None:
-    """Return a box (2, 3) around trajectories (k, 3), or None if the box is most of the scene.
+    """Return a box (2, 3) around trajectories, or None if the box covers most of the scene.
 
-    The box reaches down to the ground.
-
-    `bounds` (2, 3) are the scene's. All values are in meters.
+    `bounds` (2, 3) is the bounding box of the scene, and each trajectory has shape (k, 3), in
+    meters. The box extends down to the lowest point of the scene.
     """
     if not trajectories:
         return None
@@ -51,13 +50,13 @@ def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | 
     return box if box_area < _MAX_SHARE * scene_area else None
 
 
-def floor_and_cut(
+def floor_and_cut_heights(
     scene: Scene, caster: RayCaster, positions: Floats
 ) -> tuple[float | None, float | None]:
-    """Return the heights of the floor under positions (p, 3) and of the cut that opens the scene.
+    """Return the height of the floor below positions, and the height of a cut that opens the scene.
 
-    Both in meters. The cut is halfway up to the roof, None under the sky; the floor is None over an
-    abyss.
+    `positions` has shape (p, 3); all values are in meters. The cut is halfway up to the roof, or
+    None if there is no roof. The floor is None if there is no surface below a position.
     """
     sampled = positions[
         np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POSITIONS)).astype(int)
@@ -65,7 +64,7 @@ def floor_and_cut(
     floor = (
         sampled[:, 2] - caster.cast(sampled, np.tile([0.0, 0.0, -1.0], (len(sampled), 1))).distance
     )
-    rays = spiral(_RAYS, np.sin(np.radians(_STEEP_DEG)))
+    rays = golden_spiral(_RAYS, np.sin(np.radians(_STEEP_DEG)))
     start_m = _CONTACT * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     hits = caster.cast(
         np.repeat(sampled, _RAYS, axis=0), np.tile(rays, (len(sampled), 1)), t_min=start_m
@@ -84,9 +83,9 @@ def floor_and_cut(
 
 
 def _relative_spread(heights: Floats) -> float:
-    """Return the spread of the middle half of heights (n,), over the median.
+    """Return the interquartile range of heights (n,) divided by their median.
 
-    The spread of no heights is 0.
+    The result is 0 if there are no heights.
     """
     if not len(heights):
         return 0.0
@@ -95,24 +94,25 @@ def _relative_spread(heights: Floats) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ShownPart:
-    """A part of a scene."""
+class ScenePart:
+    """A part of a scene, with the origin of each triangle in the scene."""
 
     scene: Scene
-    parents: Ints  # (f,): the triangle of the uncut scene that each triangle is cut from
-    shares: Floats  # (f,): share of the parent's area
+    parents: Ints  # (f,) triangle of the uncut scene from which each triangle is cut
+    shares: Floats  # (f,) share of the parent's area
 
     @classmethod
-    def from_scene(cls, scene: Scene) -> ShownPart:
-        """Return the part that is the uncut scene."""
+    def from_scene(cls, scene: Scene) -> ScenePart:
+        """Return the whole scene as a part."""
         return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
 
-    def cut(self, box: Floats) -> ShownPart:
-        """Return the part inside a box (2, 3), or this part if the box is empty.
+    def cut(self, box: Floats) -> ScenePart:
+        """Return the part inside a box (2, 3), or this part if nothing is inside.
 
-        Objects narrower than the box are included if their middle is inside; wider objects, such as
-        the ground, are cut at its sides. All are cut at its top, because towers would hide the
-        trajectory. Objects keep their numbers even if no triangle is left.
+        Objects narrower than the box are kept completely if their center is inside. Wider objects,
+        such as the ground, are cut at the sides of the box. All objects are cut at the top, because
+        towers would hide the trajectory. Objects keep their numbers even if they have no triangle
+        left.
         """
         scene = self.scene
         boxes = scene.object_bounds[:, :, :2]
@@ -146,7 +146,7 @@ class ShownPart:
         full_areas = triangle_areas(scene.vertices[scene.faces[parents]])
         areas = triangle_areas(vertices[faces])
         shares = np.divide(areas, full_areas, out=np.ones(len(full_areas)), where=full_areas > 0)
-        return ShownPart(part, self.parents[parents], self.shares[parents] * shares)
+        return ScenePart(part, self.parents[parents], self.shares[parents] * shares)
 
 
 def _clip_triangles(
@@ -154,8 +154,8 @@ def _clip_triangles(
 ) -> tuple[Floats, Ints, Ints]:
     """Clip triangles to the half-space ``sign * (coordinate - limit) <= 0``.
 
-    A triangle with one corner inside becomes a smaller triangle, with two corners two triangles.
-    Returns vertices (v, 3), faces (f, 3), and the parent (f,) of each face.
+    A triangle with one corner inside becomes a smaller triangle; a triangle with two corners inside
+    becomes two triangles. Returns vertices (v, 3), faces (f, 3), and the parent (f,) of each face.
     """
     beyond = sign * (vertices[:, axis] - limit)
     outside = beyond[faces] > 0  # (f, 3)
@@ -164,7 +164,7 @@ def _clip_triangles(
     piece_parents = [parents[count == 0]]
     for corners_outside in (1, 2):
         rows = np.flatnonzero(count == corners_outside)
-        # The corner without another on its side comes first.
+        # Start with the corner that is alone on its side of the plane.
         first = np.argmax(outside[rows] == (corners_outside == 1), axis=1)
         a, b, c = (faces[rows, (first + k) % 3] for k in range(3))
         ab = len(vertices) + np.arange(len(rows))
@@ -181,9 +181,9 @@ def _clip_triangles(
 
 
 def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floats:
-    """Return the points (n, 3) where edges between vertices cross a plane.
+    """Return the points (n, 3) where the edges between vertices cross a plane.
 
-    `beyond` (v,) are the distances of all vertices from the plane.
+    `beyond` (v,) are the signed distances of all vertices from the plane.
     """
     share = beyond[start] / (beyond[start] - beyond[stop])
     return vertices[start] + share[:, None] * (vertices[stop] - vertices[start])

@@ -1,4 +1,4 @@
-"""Colors of points by one of their columns, and legends."""
+"""Choose the colors of points by one of their columns, and the matching legend."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
 from lidarsim.scene.colors import packed, unpacked
 
-from .theme import mapped, object_colors
+from .theme import apply_colormap, object_colors
 
-TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
-DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle is pale
-MAX_UNNAMED_LABELS = 12  # labels without names that have a color each
-MAX_COLORS = 1 << 16  # limit for labels
+TURBO = apply_colormap(
+    "turbo", np.linspace(0.07, 0.95, 256)
+)  # (256, 3), without its nearly black ends
+DIVERGING = apply_colormap("coolwarm", np.linspace(0, 1, 256))  # (256, 3), pale at the center
+MAX_UNNAMED_LABELS = 12  # more labels without names are shown on a scale
+MAX_COLORS = 1 << 16  # maximum number of distinct label colors
 
-# Columns that are composed of others (`values_of`).
+# Columns that are composed of other columns by `column_values`.
 RGB = Column("rgb", "uint32", "", "surface colors")
 NORMALS = Column(
     "normals",
@@ -32,9 +34,10 @@ MATERIAL = "material"  # name of the column
 NO_MATERIAL = "no material"
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a color scale
 _GRAY = 0.5
-# The scale of energies is logarithmic if they differ by the first factor and the median is this low
-# in their range, or if they differ by the second factor. The scale of other columns is linear: of
-# heights from 0.1 to 20 m, half of a logarithmic scale is for the lowest 1.4 m.
+# The scale of a column is logarithmic if the column allows it and either the values differ by the
+# first factor and the median is in this lowest share of their range, or the values differ by the
+# last factor. Columns such as heights do not allow it: for heights from 0.1 to 20 m, half of a
+# logarithmic scale would cover the lowest 1.4 m.
 _SKEWED_RATIO = 10.0
 _SKEWED_MEDIAN = 0.1
 _WIDE_RATIO = 30.0
@@ -43,24 +46,24 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 @dataclass(frozen=True, eq=False)
 class Coloring:
-    """Colors of points, and a legend: a scale between two limits, or labels."""
+    """Colors for the values of a column, with a scale between two limits or with labels."""
 
-    # Returns colors (n, 3) in 0 to 1 of values (n,).
+    # Returns the colors (n, 3), from 0 to 1, of values (n,)
     paint: Callable[[AnyArray], Floats]
     name: str  # name of the column
     unit: str  # unit of the limits
     meaning: str
     limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
-    # Name and color of existing labels, in order of their points if there are many.
+    # Name and color of each existing label, the most frequent first if there are many
     labels: tuple[tuple[str, Floats], ...] = ()
     values: tuple[int, ...] = ()  # values of the column, one for each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
-    divisor: float = 1.0  # values over the divisor have the unit of the limits
+    divisor: float = 1.0  # divides values to get the unit of the limits
 
 
-def with_composed(columns: Mapping[str, Column]) -> dict[str, Column]:
-    """Add `RGB` and `NORMALS` to columns that have all of their parts."""
+def add_composed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """Add `RGB` and `NORMALS` to columns that include all of their components."""
     composed = {
         name: column
         for name, (column, parts) in _COMPOSED.items()
@@ -69,31 +72,31 @@ def with_composed(columns: Mapping[str, Column]) -> dict[str, Column]:
     return {**columns, **composed}
 
 
-def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
+def column_values(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
     """Return the values of a column, or packed colors for `RGB` and `NORMALS`.
 
-    `read` returns a named column.
+    `read` returns the values of a column by its name.
     """
     if column is RGB:
         return packed(np.stack([read(name) for name in COLORS], axis=1))
     if column is NORMALS:
-        return packed(colors_of_normals(np.stack([read(name) for name in NORMAL], axis=1)))
+        return packed(normal_colors(np.stack([read(name) for name in NORMAL], axis=1)))
     return read(column.name)
 
 
-def colors_of_normals(normals: AnyArray) -> Bytes:
-    """Return the colors (n, 3) of unit vectors (n, 3).
+def normal_colors(normals: AnyArray) -> Bytes:
+    """Return the colors (n, 3) of unit normals (n, 3), gray for NaN.
 
-    NaN, for points on no surface, is gray.
+    Points that are not on a surface have the normal NaN.
     """
     known = np.isfinite(normals).all(axis=1, keepdims=True)
     return np.asarray(np.where(known, 127.5 * (1 + normals), 127.5).round().astype(np.uint8))
 
 
-def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
-    """Return the word for a label.
+def label_text(value: int, column: Column, names: Sequence[str] = ()) -> str:
+    """Return the text for a label value.
 
-    `names` are the words for the values 0, 1, 2, ….
+    `names` are the names of the values 0, 1, 2, ….
     """
     if 0 <= value < len(names) and names[value]:
         return names[value]
@@ -102,22 +105,29 @@ def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
-def colors_of(
+def make_coloring(
     values: AnyArray,
     column: Column,
     names: Sequence[str] = (),
     limits: tuple[float, float] | None = None,
 ) -> Coloring:
-    """Choose colors for the values (n,) of a column.
+    """Choose colors for the values of a column.
 
-    `limits` are the ends of a scale of numbers in its unit, in place of the lowest and the highest
-    value.
+    Each label gets its own color. Labels without names that are too many for a legend are shown on
+    a scale, as numbers are. A scale is logarithmic if `Column.scale` is "logarithmic" and the
+    values differ by large factors. Velocities are blue below 0 and red above. NaN is gray, as are
+    labels of points that are not on a surface.
 
-    `names` are the words for the values 0, 1, 2, … of a label. Labels have a color each; labels
-    without names and with too many values for a legend are on a scale like numbers. Columns with
-    `Column.scale` "logarithmic", such as intensities, have that scale if their values differ by
-    large factors. Velocities are blue below 0 and red above. NaN is gray, and so are points on no
-    surface.
+    Parameters
+    ----------
+    values
+        (n,) values of the column, or a sample of them.
+    column
+        The column.
+    names
+        Names of the values 0, 1, 2, … of a label column.
+    limits
+        Ends of a scale, in its unit. By default, they are percentiles of the values.
     """
     if column in (RGB, NORMALS):
         return Coloring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
@@ -139,7 +149,7 @@ def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Color
     colors = object_colors(min(count, MAX_COLORS))
     gray = len(colors)
     palette = np.vstack([colors, [_GRAY] * 3])
-    has_none = column.name in (OBJECT.name, MATERIAL)  # a value below 0
+    has_none = column.name in (OBJECT.name, MATERIAL)  # negative values mean none
 
     def paint(values: AnyArray) -> Floats:
         numbers = values.astype(np.int64)
@@ -147,13 +157,13 @@ def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Color
         return np.asarray(palette[np.where(is_surface, numbers % gray, gray)])
 
     values = tuple(labels.tolist())
-    words = [word_of(value, column, names) for value in values]
+    words = [label_text(value, column, names) for value in values]
     entries = tuple(zip(words, paint(labels), strict=True))
     return Coloring(paint, column.name, "", column.meaning, labels=entries, values=values)
 
 
 class _Range(NamedTuple):
-    """Range of numbers on a scale."""
+    """The range of numbers on a scale."""
 
     lower: float
     middle: float  # median
@@ -161,7 +171,7 @@ class _Range(NamedTuple):
 
     @property
     def has_large_factors(self) -> bool:
-        """True if the numbers are positive, and differ by factors that a linear scale hides."""
+        """Whether the numbers are positive and differ by factors that a linear scale would hide."""
         is_low = self.middle - self.lower < _SKEWED_MEDIAN * (self.upper - self.lower)
         is_skewed = self.upper > _SKEWED_RATIO * self.lower and is_low
         is_wide = self.upper > _WIDE_RATIO * self.lower
@@ -174,7 +184,7 @@ def _number_coloring(
     percentiles: tuple[float, float],
     chosen_limits: tuple[float, float] | None,
 ) -> Coloring:
-    """Return a scale for values (n,) between two percentiles, or chosen limits."""
+    """Return a scale for values (n,) between two percentiles or between given limits."""
     finite = np.isfinite(values)
     lower = 0.0
     middle = 0.5
@@ -216,9 +226,9 @@ def _number_coloring(
 def _scale_painter(
     limits: _Range, divisor: float, logarithmic: bool, scale: Floats
 ) -> Callable[[AnyArray], Floats]:
-    """Return the function from values (n,) to colors (n, 3) of a scale (256, 3).
+    """Return a function that maps values (n,) to colors (n, 3) of a scale (256, 3).
 
-    `limits` belong to values over the divisor.
+    The values are divided by `divisor` to get the unit of the limits.
     """
     lower, _, upper = limits
     start, stop = np.log([lower, upper]) if logarithmic else (lower, upper)

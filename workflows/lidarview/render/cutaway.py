@@ -1,4 +1,4 @@
-"""Cutaways of buildings: removes walls and roofs between the camera and the sensors."""
+"""Remove the walls and roofs between the camera and the sensors in a building."""
 
 from __future__ import annotations
 
@@ -8,49 +8,50 @@ import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
 
-from .surface import Surface, dot, spiral
+from .surface import RenderMesh, dot, golden_spiral
 
-MAX_SENSORS = 8  # sensors whose surroundings are tested
-MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall
-ENCLOSED = 0.7  # share of horizontal rays from indoor sensors that hit the scene
-HIDDEN = 0.65  # share of the sensors' hits; below, the camera sees too few of them
+MAX_SENSORS = 8  # number of sensors whose surroundings are tested
+MAX_LAYERS = 12  # number of removed surfaces on a ray; walls have two faces, and roofs have beams
+ENCLOSED = 0.7  # minimum share of horizontal rays that hit the scene if sensors are indoors
+HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller share of the sensors' hits
 
 
 @dataclass(frozen=True, eq=False)
 class Cutaway:
-    """The surfaces to remove.
+    """The rule that selects which surfaces are removed.
 
-    A hit is removed if its object surrounds the sensors seen from above, it lies in that object's
-    outer shell, and its plane has the camera on one side and most sensors on the other. So both
-    faces of near walls and the roof are removed, while far walls, the floor and things inside
-    stay, whatever the winding and grouping of triangles.
+    A hit is removed if three conditions hold: its object surrounds the sensors in plan view, the
+    hit is in the outer shell of the object, and its plane has the camera on one side and most
+    sensors on the other. Both faces of the walls in front and the roof are therefore removed, while
+    the walls at the back, the floor, and objects inside are kept, regardless of the winding and
+    grouping of triangles.
     """
 
-    surface: Surface
+    surface: RenderMesh
     sensors: Floats  # (p, 3) meters
     eye: Floats  # (3,) the camera
-    surrounds: Bools  # (objects,) whether the sensors are within the object, seen from above
+    surrounds: Bools  # (objects,) whether the object surrounds the sensors in plan view
     core: Floats  # (objects, 2, 3) box inside each object's shell
 
     @classmethod
-    def from_sensors(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:
-        """Find the surfaces that hide sensors at (p, 3) from a camera at `eye`."""
+    def from_sensors(cls, surface: RenderMesh, sensors: Floats, eye: Floats) -> Cutaway:
+        """Determine the surfaces that hide sensors at positions (p, 3) from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
         inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
         width = np.where(np.isfinite(core).all(axis=1), core[:, 1] - core[:, 0], 0.0)
         core[:, 0, :2] += 0.06 * width[:, :2]
         core[:, 1, :2] -= 0.06 * width[:, :2]
-        # The roof and things under it: all above the middle between sensors and top.
+        # The roof and objects below it: everything above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-        # Hills are not walls: objects below the sensors that only face up are ground.
+        # Hills are not walls. An object below the sensors that only faces up is ground.
         facing = np.full(len(core), np.inf)
         np.minimum.at(facing, surface.scene.face_object, surface.face_normals[:, 2])
         ground = (facing > 0) & (core[:, 0, 2] < sensors[:, 2].min())
         return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
-    def removes(self, points: Floats, triangle: Ints) -> Bools:
-        """Mark hits (n,) at points (n, 3) on triangles (n,) that are removed."""
+    def is_removed(self, points: Floats, triangle: Ints) -> Bools:
+        """Return a mask (n,) of the hits at points (n, 3) on triangles (n,) that are removed."""
         owner = self.surface.scene.face_object[triangle]
         lower = self.core[owner, 0]
         upper = self.core[owner, 1]
@@ -65,10 +66,10 @@ class Cutaway:
         return removed
 
 
-def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Return a cutaway that shows the surroundings of sensors at poses (p, 3) to a camera.
+def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | None:
+    """Return a cutaway that lets a camera see the surroundings of sensors at positions (p, 3).
 
-    None if the sensors are outdoors, or the camera sees most of their surroundings anyway.
+    Returns None if the sensors are outdoors, or if the camera sees enough without a cutaway.
     """
     if not len(poses):
         return None
@@ -88,20 +89,20 @@ def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None
 
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Return origins and directions (p * count, 3) of rays from sensors, between two elevations."""
-    rays = spiral(count, *np.sin(np.radians([low_deg, high_deg])))
+    """Return origins and directions (p * count, 3) of rays from sensors between two elevations."""
+    rays = golden_spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 
 
-def cast_through(
-    surface: Surface, cutaway: Cutaway | None, eye: Floats, directions: Floats
+def cast_with_cutaway(
+    surface: RenderMesh, cutaway: Cutaway | None, eye: Floats, directions: Floats
 ) -> tuple[Floats, Ints, Floats, Floats]:
     """Cast rays from the eye to the closest surfaces that are not removed.
 
     Returns
     -------
     distance, triangle, u, v
-        (n,) each; a miss is at infinity with triangle -1.
+        (n,) each. A miss has an infinite distance and the triangle -1.
     """
     hits = surface.caster.cast(eye, directions)
     distance = np.array(hits.distance, dtype=np.float64)
@@ -113,7 +114,7 @@ def cast_through(
     live = np.flatnonzero(triangle >= 0)
     for _ in range(MAX_LAYERS):
         points = eye + distance[live, None] * directions[live]
-        live = live[cutaway.removes(points, triangle[live])]
+        live = live[cutaway.is_removed(points, triangle[live])]
         if not len(live):
             break
         start = distance[live] * (1 + 1e-6)
@@ -126,16 +127,19 @@ def cast_through(
     return distance, triangle, u, v
 
 
-def blocked(
-    surface: Surface, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
+def is_blocked(
+    surface: RenderMesh, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Mark rays (n, 3) that hit a surface within `reach` meters that is not removed."""
+    """Return a mask of the rays (n, 3) that hit a surface within `reach` meters.
+
+    Removed surfaces do not block rays.
+    """
     hits = surface.caster.cast(origins, directions, t_max=reach)
     is_hit = np.asarray(hits.triangle >= 0)
     if cutaway is not None:
         indices = np.flatnonzero(is_hit)
         points = origins[indices] + hits.distance[indices, None] * directions[indices]
-        is_hit[indices] = ~cutaway.removes(
+        is_hit[indices] = ~cutaway.is_removed(
             points, np.asarray(hits.triangle[indices], dtype=np.int64)
         )
     return is_hit

@@ -1,4 +1,4 @@
-"""A film of points as they are scanned, over their scene in the dark."""
+"""Render a film of points as they are scanned, over the scene on a dark background."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from lidarsim.scene.actors import Actor
 from raybeam import RayCaster
 
 from .camera import Camera
-from .pictures import splat
-from .surface import dot, unit
+from .pictures import draw_discs
+from .surface import dot, normalize
 from .theme import rgb
 
 SIZE = (960, 540)  # pixels
 BACK, SURFACE, ACTOR = (np.append(rgb(c), 1.0) for c in ("#0e1116", "#5b6570", "#eac9a0"))
-# the carrier's trajectory; Pillow draws no endless lines
+# Colors of the platform's trajectory.
 _RED = "#ff4d5e"
 _WHITE = "#ffffff"
-_MAX_PIXEL = 4000
-FOCAL_PX = 922.0  # focal length of the camera, pixels: 55 degrees across
-# distances of the camera from the carrier, and of its target ahead, times the range
+_MAX_PIXEL = 4000  # Pillow cannot draw lines that reach far outside the image
+FOCAL_PX = 922.0  # focal length in pixels, for a field of view of 55 degrees
+# Distances from the platform to the camera and to its target, as multiples of the range.
 _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
-_HEADING_SHARE = 0.12  # share of the film, before and after, where the heading is measured
-# of a camera that circles: its distance, times the size, and its rise for a meter of distance
+_HEADING_SHARE = 0.12  # the heading is averaged over this share of the film before and after
+# A circling camera: its distance as a multiple of the size, and the tangent of its elevation.
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
-# times the focus: closer surfaces are left out, distant surfaces fade
+# As multiples of the focus distance: closer surfaces are omitted, and distant surfaces fade.
 _MIN_FOCUS = 0.3
 _HAZE_FOCUS = 6.0
-# brightness of old points; number of frames until new points have faded to it
+# Brightness of old points, and the number of frames in which new points fade to it.
 _OLD_BRIGHTNESS = 0.42
 _FADE_FRAMES = 3.0
 _POINT_RADIUS = 2.3  # half pixels
-_NOISE = 0.02  # share of the distance that a point may lie beside its surface
+_NOISE = 0.02  # distance of a point from its surface, as a share of its range
 
 
 class _Shape(NamedTuple):
@@ -51,25 +51,25 @@ class _Shape(NamedTuple):
     color: Floats  # (4,)
 
 
-class _Sights(NamedTuple):
-    """Positions and targets of the camera in all frames, meters."""
+class _CameraPath(NamedTuple):
+    """Positions and targets of the camera in all frames, in meters."""
 
     eyes: Floats  # (k, 3)
     targets: Floats  # (k, 3)
-    carrier: Floats  # (k, 3), or (0, 3) without a carrier
-    focus: float  # distance from the eye to the middle of the scene, or to the carrier
+    platform: Floats  # (k, 3), or (0, 3) without a platform
+    focus: float  # distance from the camera to the center of the scene or to the platform
 
     def camera(self, number: int) -> Camera:
-        """Return the camera of a frame."""
-        ahead = unit((self.targets - self.eyes)[number, None])
-        right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+        """Return the camera for a frame."""
+        ahead = normalize((self.targets - self.eyes)[number, None])
+        right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
         axes = np.concatenate([right, np.cross(right, ahead), ahead])
         return Camera(self.eyes[number], axes, FOCAL_PX, np.array(SIZE) / 2, SIZE)
 
 
 @dataclass(eq=False)
 class _FilmPoints:
-    """Points that a frame shows, of the frame and of earlier frames."""
+    """The points that a frame shows, including points from earlier frames."""
 
     positions: Floats = field(default_factory=lambda: np.empty((0, 3)))
     colors: Floats = field(default_factory=lambda: np.empty((0, 4)))
@@ -83,7 +83,7 @@ class _FilmPoints:
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Keep chosen points (n,) only."""
+        """Discard all points except those in a mask (n,)."""
         self.positions = self.positions[chosen]
         self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]
@@ -91,39 +91,42 @@ class _FilmPoints:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Content of a film.
+    """The content of a film.
 
-    Coordinates are local, in meters. Times are since the survey's start.
+    Coordinates are local, in meters. Times are relative to the start of the survey.
     """
 
-    moments_ns: Floats  # (k,) of the frames
-    # for each frame, its new points (n, 3) and their colors (n, 4), 0 to 1
+    moments_ns: Floats  # (k,) times of the frames
+    # New points (n, 3) in each frame, and their RGBA colors (n, 4) from 0 to 1
     new_points: Iterable[tuple[Floats, Floats]]
-    keep_share: float  # share of the points that later frames show, too
-    scene_triangles: AnyFloats  # (f, 3, 3): triangles of the scene
+    keep_share: float  # share of the points that later frames show as well
+    scene_triangles: AnyFloats  # (f, 3, 3) corners of the scene's triangles
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
-    box: Floats  # (2, 3), around which the camera circles without a carrier
-    carrier_trajectory: tuple[Floats, Floats] | None = None  # times (w,), ns, and positions (w, 3)
-    range_m: float = 1.0  # typical range of the carrier's points
+    box: Floats  # (2, 3) box that the camera circles if there is no platform
+    platform_trajectory: tuple[Floats, Floats] | None = (
+        None  # times (w,) in ns, and positions (w, 3)
+    )
+    range_m: float = 1.0  # typical range of the platform's points
 
     def frames(self) -> Iterator[Bytes]:
-        """Draw the frames, (height, width, 3) each, with new points brighter than old points.
+        """Yield the frames, uint8 arrays of shape (height, width, 3).
 
-        Old points in front of all surfaces are left out: an actor was there and has moved on.
+        New points are brighter than old points. Old points in front of all surfaces are omitted,
+        because they show where an actor was in an earlier frame.
         """
         random = np.random.default_rng(0)
         points = _FilmPoints()
         scene = [_shape(self.scene_triangles, SURFACE)] if len(self.scene_triangles) else []
-        sights = self._sights()
+        camera_path = self._camera_path()
         for number, (moment, part) in enumerate(zip(self.moments_ns, self.new_points, strict=True)):
-            camera = sights.camera(number)
+            camera = camera_path.camera(number)
             shapes = [*scene, *self._actor_shapes(moment)]
-            image, depth = _draw_surfaces(shapes, camera, sights.focus, self.top)
+            image, depth = _draw_surfaces(shapes, camera, camera_path.focus, self.top)
             points.add(number, *part)
-            image = _draw_points(image, depth, camera, points, number, sights.focus)
+            image = _draw_points(image, depth, camera, points, number, camera_path.focus)
             frame = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
-            _draw_trajectory(frame, camera, sights.carrier[: number + 1])
+            _draw_trajectory(frame, camera, camera_path.platform[: number + 1])
             yield np.asarray(frame)
             is_old = points.first_frame < number
             points.select(is_old | (random.random(len(is_old)) < self.keep_share))
@@ -134,28 +137,28 @@ class Film:
         present = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
         return [_shape(np.concatenate(present), ACTOR)] if present else []
 
-    def _sights(self) -> _Sights:
-        """Choose the camera's position and target in each frame."""
+    def _camera_path(self) -> _CameraPath:
+        """Choose the position and the target of the camera in each frame."""
         count = len(self.moments_ns)
-        if self.carrier_trajectory is None:
+        if self.platform_trajectory is None:
             azimuth = 2 * np.pi * np.arange(count) / count - 1.1
             rise = np.full(count, _CIRCLE_SLOPE)
-            direction = unit(np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1))
+            direction = normalize(np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1))
             distance = _CIRCLE_RADIUS * float(np.linalg.norm(np.ptp(self.box, 0)))
             middle = self.box.mean(axis=0)
             eyes = middle + distance * direction
-            return _Sights(eyes, np.tile(middle, (count, 1)), np.empty((0, 3)), distance)
+            return _CameraPath(eyes, np.tile(middle, (count, 1)), np.empty((0, 3)), distance)
         lead_ns = _HEADING_SHARE * self.moments_ns[-1]
-        times, positions = self.carrier_trajectory
-        earlier, carrier, later = (
+        times, positions = self.platform_trajectory
+        earlier, platform, later = (
             np.stack([np.interp(self.moments_ns + shift, times, x) for x in positions.T], 1)
             for shift in (-lead_ns, 0, lead_ns)
         )
-        ahead = unit((later - earlier) * [1.0, 1.0, 0.0])
-        ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # it stands, or rises
-        eyes = carrier - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
-        targets = carrier + _AHEAD * self.range_m * ahead
-        return _Sights(eyes, targets, carrier, _BEHIND * self.range_m)
+        ahead = normalize((later - earlier) * [1.0, 1.0, 0.0])
+        ahead[~ahead.any(axis=1)] = [1.0, 0.0, 0.0]  # the platform is stationary or rises
+        eyes = platform - _BEHIND * self.range_m * ahead + [0.0, 0.0, _ABOVE * self.range_m]
+        targets = platform + _AHEAD * self.range_m * ahead
+        return _CameraPath(eyes, targets, platform, _BEHIND * self.range_m)
 
 
 def _draw_points(
@@ -166,22 +169,26 @@ def _draw_points(
     number: int,
     focus: float,
 ) -> AnyFloats:
-    """Draw the points of a frame over an image of surfaces at a depth, both (height, width, …)."""
+    """Draw the points of a frame over an image of the surfaces.
+
+    `depth` (height, width) is the distance to the surface in each pixel, in meters.
+    """
     age = number - points.first_frame
     pixels, distance = camera.project(points.positions)
-    surface = camera.look_up(depth, pixels, -np.inf)  # no point is drawn outside the image
+    surface = camera.sample_image(depth, pixels, -np.inf)  # no point is drawn outside the image
     slack = _NOISE * distance + 2 * camera.footprint(distance)
     shown = (distance <= surface + slack) & (distance >= _MIN_FOCUS * focus)
     shown &= (age == 0) | (distance >= surface - slack) | np.isinf(surface)
     fade = _OLD_BRIGHTNESS + (1 - _OLD_BRIGHTNESS) * np.exp(-age / _FADE_FRAMES)
-    rows = np.flatnonzero(shown)  # the newest points on a surface are drawn last
+    # The nearest points are drawn last. On the same surface, the newest points are drawn last.
+    rows = np.flatnonzero(shown)
     rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
     colors = BACK + (points.colors[rows] - BACK) * fade[rows, None]
-    return splat(image, pixels[rows], colors, _POINT_RADIUS)
+    return draw_discs(image, pixels[rows], colors, _POINT_RADIUS)
 
 
 def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
-    """Draw positions (k, 3) of the carrier as a line, with a disc at the last."""
+    """Draw the positions (k, 3) of the platform as a line that ends in a disc."""
     pen = ImageDraw.Draw(frame)
     pixels, _ = camera.project(positions)
     line = [(float(x), float(y)) for x, y in pixels if max(abs(x), abs(y)) < _MAX_PIXEL]
@@ -191,8 +198,8 @@ def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> N
 
 
 def _shape(corners: AnyFloats, color: Floats) -> _Shape:
-    """Prepare triangles with corners (f, 3, 3) for rays."""
-    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    """Prepare triangles with corners (f, 3, 3) for ray casting."""
+    normals = normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, color)
 
@@ -200,16 +207,16 @@ def _shape(corners: AnyFloats, color: Floats) -> _Shape:
 def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces.
+    """Draw surfaces, and return the RGBA image (height, width, 4) and the depth (height, width).
 
-    Returns the image (height, width, 4), and the depth (height, width), meters.
+    The depth is in meters.
     """
     width, height = SIZE
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rays = camera.rays(grid.reshape(-1, 2) + 0.5)
     forward = rays @ camera.axes[2]
     start = _MIN_FOCUS * focus / forward
-    if camera.eye[2] > top:  # rays start where the scene is cut
+    if camera.eye[2] > top:  # rays start at the height where the scene is cut
         start = np.maximum(start, (top - camera.eye[2]) / np.minimum(rays[:, 2], -1e-6))
     depth = np.full(len(rays), np.inf)
     image = np.tile(BACK, (len(rays), 1))
@@ -227,9 +234,9 @@ def _draw_surfaces(
 
 
 def _edges(inverse_depth: Floats) -> Floats:
-    """Return the strength (height, width, 1) of edges between surfaces.
+    """Return the strength (height, width, 1) of the edges between surfaces.
 
-    The inverse of depth is linear in the picture of a plane: behind an edge there is less of it.
+    The inverse depth of a plane is linear in the image. Beyond an edge, it falls below this line.
     """
     padded = np.pad(inverse_depth, 1, mode="edge")
     sides = (

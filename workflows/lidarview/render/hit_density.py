@@ -1,4 +1,4 @@
-"""Colors of a scene's surfaces by hits per square meter."""
+"""Color the surfaces of a scene by hits per square meter."""
 
 from __future__ import annotations
 
@@ -14,41 +14,44 @@ from lidarsim.scene.scene_mesh import triangle_areas
 from .coloring import TURBO
 from .theme import UNSEEN, rgb
 
-_GRID_LEVELS = 24  # levels of a grid whose cells are half as wide each time
-_MIN_HITS = 12  # hits that suffice for an estimate of density; points in a cell of the grid
+_GRID_LEVELS = 24  # number of times that the width of the grid cells is halved
+_MIN_HITS = 12  # minimum number of hits, or points in a grid cell, for estimating a density
 _MAX_ROUNDS = 12
-_MAX_RATIO = 300.0  # densest to sparsest color
+_MAX_RATIO = 300.0  # maximum ratio between the ends of the scale
 
 
 def hit_colors(
     scene: Scene, corners: Floats32, hit_counts: Floats, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, tuple[float, float]]:
-    """Color triangles by hits per square meter.
+    """Color triangles by hits per square meter, dividing large triangles with many hits.
 
-    Large triangles with many hits are divided.
-
-    Large triangles have the density of a grid of points, the finest grid with enough points in its
-    cells; small triangles share their hits with neighbors, as in `hit_density`.
+    On a large triangle, the density is counted in the finest grid that has enough points in each
+    cell. Small triangles share their hits with neighbors, as in `hit_density`.
 
     Parameters
     ----------
-    corners, hit_counts
-        (f, 3, 3), meters, and (f,): the drawn triangles of the scene, and the hits of each.
+    scene
+        Scene with the drawn triangles.
+    corners
+        (f, 3, 3) corners of the triangles, in meters.
+    hit_counts
+        (f,) hits on each triangle.
     points
-        (n, 3): an evenly spaced sample of hit points, which may lack some places.
+        (n, 3) evenly spaced sample of the hit points, which may have gaps.
     max_pieces
-        Largest number of pieces.
+        Maximum number of pieces.
 
     Returns
     -------
     pieces
-        (k, 3, 3): corners of the pieces; the first piece of each triangle has its number.
+        (k, 3, 3) corners of the pieces. The first piece of each triangle has the number of the
+        triangle.
     owner
-        (k,): the triangle of each piece.
+        (k,) triangle of each piece.
     colors
-        (k, 3, 3) at the corners.
+        (k, 3, 3) colors at the corners.
     limits
-        Ends of the logarithmic scale, hits per square meter; its colors are `TURBO`.
+        Ends of the logarithmic scale in hits per square meter. The colors of the scale are `TURBO`.
     """
     triangle_density = hit_density(scene, hit_counts)
     pieces, owner, areas, point_density = _divide(corners, hit_counts > 0, points, max_pieces)
@@ -64,7 +67,7 @@ def hit_colors(
         corner_density[is_counted] = _corner_means(
             pieces[is_counted], areas[is_counted], corner_density[is_counted]
         )
-    # Where points were counted, none are gray; elsewhere the hits are known.
+    # Gray depends on the point density where points were counted, otherwise on the known hits.
     colors = _density_colors(
         corner_density, (~is_counted & (hit_counts[owner] > 0))[:, None], limits
     )
@@ -72,7 +75,7 @@ def hit_colors(
 
 
 def hits_title(limits: tuple[float, float]) -> str:
-    """Return the title of a scale with the ends `limits`: surfaces with fewer hits are gray.
+    """Return the title of a hit density scale between two limits.
 
     Examples
     --------
@@ -88,9 +91,10 @@ def density_label(density: float) -> str:
 
 
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
-    """Return the mean density of all pieces around each corner, for smooth transitions: (k, 3).
+    """Return the mean density of all pieces around each corner, for smooth transitions.
 
-    `pieces` (k, 3, 3) are corners, `areas` (k,) square meters, `density` (k, 3) at the corners.
+    `pieces` (k, 3, 3) are the corners, `areas` (k,) are in square meters, and `density` (k, 3) is
+    given at the corners, as is the result.
     """
     corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
     _, corner = np.unique(corner_keys, return_inverse=True)
@@ -101,11 +105,12 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square meter of triangles (f,), from their hits (f,).
+    """Return the hits per square meter on triangles (f,), given the hits on each triangle.
 
-    If triangles are so small that most have one hit or none, hits are shared with neighbors:
-    each triangle gives a third of its hits to each corner, each corner returns hits by area, until
-    a density is estimated from a dozen hits. The total stays the same.
+    If most triangles are so small that they have at most one hit, neighbors share their hits: each
+    triangle passes a third of its hits to each corner, and each corner distributes them by area.
+    This is repeated until a density is estimated from a dozen hits. The total number of hits is
+    preserved.
     """
     hits = hit_counts.astype(np.float64)
     area = triangle_areas(scene.vertices[scene.faces])
@@ -115,18 +120,18 @@ def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
 
 
 def _rounds(hit_counts: Floats) -> int:
-    """Choose how many times to share hits with the neighbors."""
+    """Choose how many times neighbors share their hits."""
     hit = hit_counts[hit_counts > 0]
     if not len(hit):
         return 0
-    # Counts of one do not show how many triangles were missed: assume three times as many as
-    # were hit, so that the rings of a sparse scan merge.
+    # Counts of one do not reveal how many triangles were missed. Assume three times as many as were
+    # hit, so that the rings of a sparse scan merge.
     typical = hit.mean() if hit.mean() > 3 else hit.mean() / 3
     return min(_MAX_ROUNDS, math.floor(_MIN_HITS / typical / 2))
 
 
 def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Floats:
-    """Spread hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
+    """Distribute hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
     corner_hits = np.zeros(vertices)
     corner_areas = np.zeros(vertices)
     for corner in faces.T:
@@ -141,9 +146,9 @@ def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Fl
 
 
 def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale over densities on areas (f,).
+    """Choose the ends of a logarithmic scale for densities on areas (f,).
 
-    Few hits are on surfaces below the scale, and little area is above.
+    Few hits are on surfaces below the scale, and little area is above it.
     """
     lower = 1.0
     upper = 10.0
@@ -157,9 +162,10 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
 
 
 def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
-    """Return colors (..., 3) by densities and masks of hits, both (...,).
+    """Return colors (..., 3) for densities (...,).
 
-    Shared hits fade out to gray; triangles that were hit themselves are never gray.
+    Surfaces that only share the hits of their neighbors fade to gray at low densities. Surfaces
+    with hits, marked by the mask `hit` (...,), never do.
     """
     lower, upper = limits
     share = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
@@ -171,9 +177,10 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
 def _divide(
     pieces: Floats32, hit: Bools, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, Floats]:
-    """Divide triangles that were hit (f,) while there are enough points in the cells of a grid.
+    """Divide triangles with hits (f,) as long as the grid cells contain enough points.
 
-    Returns pieces, owners and areas, and points per square meter, NaN for whole triangles.
+    Returns the pieces, their owners, their areas, and their points per square meter, which are NaN
+    for undivided triangles.
     """
     owner = np.arange(len(pieces))
     areas = triangle_areas(pieces)
@@ -191,7 +198,7 @@ def _divide(
         area = _WeightGrid(middles[is_hit], areas[is_hit], width, lower).interpolate(
             middles[active]
         )
-        # Where there are few points, this is the last time that they are counted.
+        # Cells with few points are not divided again, so this density is final.
         parts = np.bincount(owner)[owner[active]]
         point_density[active] = np.where(parts > 1, point_count / np.maximum(area, 1e-30), np.nan)
         active[active] = point_count >= _MIN_HITS
@@ -217,7 +224,7 @@ def _divide(
 
 
 class _WeightGrid:
-    """Sums of weights (n,) of positions (n, 3) in the cells of a grid."""
+    """Sums of the weights (n,) of positions (n, 3) in the cells of a grid."""
 
     def __init__(self, positions: Floats32, weights: Floats, width: float, lower: Floats32) -> None:
         self._width = width
@@ -241,19 +248,19 @@ class _WeightGrid:
 
 
 def _keys(cells: Ints) -> Ints:
-    """Return a number (n,) for each cell (n, 3)."""
-    cells = cells + 1  # the neighbors of the lowest cell are not negative
+    """Return a unique number (n,) for each cell (n, 3)."""
+    cells = cells + 1  # so that neighbors of the lowest cell are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
 def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
-    """Return the longest edge of each piece, (k,), and its length."""
+    """Return the index and the length of the longest edge of each piece, shape (k,)."""
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 
 
 def _halved(pieces: Floats32) -> tuple[Floats32, Floats32]:
-    """Cut each piece through the middle of its longest edge."""
+    """Split each piece at the midpoint of its longest edge."""
     rows = np.arange(len(pieces))
     edge = _longest(pieces)[0]
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))

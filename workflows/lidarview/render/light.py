@@ -1,4 +1,4 @@
-"""Light on surfaces: the visible part of sky and sun at each point."""
+"""Compute the light on surfaces from the visible parts of the sky and the sun."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 
 from .camera import Camera
-from .cutaway import Cutaway, blocked
-from .surface import Surface, dot, spiral
+from .cutaway import Cutaway, is_blocked
+from .surface import RenderMesh, dot, golden_spiral
 
-STRIDE = 2  # shadows are computed at every second pixel of every second row
+STRIDE = 2  # shadows are computed at every second pixel in every second row
 SKY_LIGHTS = 24
 SUN_LIGHTS = 4
 ROTATIONS = (
     0.12,
     0.02,
-)  # radians from a grid point's light to its neighbor's, of the sky and the sun
-SUN_RADIUS_RAD = 0.045  # radians: ten times the real one, for soft edges
-SUN_SHARE = 0.4  # share of the light on open horizontal ground
-THIN_OPENNESS = 0.5  # openness of surfaces too thin for a grid point
-# brightness of a surface that faces the light
+)  # rotation of the sky and sun lights between neighboring grid points, in radians
+SUN_RADIUS_RAD = 0.045  # ten times the real radius, for soft shadows
+SUN_SHARE = 0.4  # share of the sun in the light on open horizontal ground
+THIN_OPENNESS = 0.5  # openness of surfaces that are too thin to contain a grid point
+# Brightness of a surface that faces the light.
 AMBIENT = 0.24
 SKY = 0.54
 SUN = 0.36
@@ -31,21 +31,22 @@ SUN = 0.36
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Light at a grid of pixels, and their surfaces."""
+    """The light at a grid of pixels, and the surfaces in these pixels."""
 
     camera: Camera
-    sun: Floats  # (3,) unit vector towards the sun
-    openness: Floats32  # (rows, columns) in 0 to 1: the unblocked share of the light
+    sun: Floats  # (3,) unit vector toward the sun
+    openness: Floats32  # (rows, columns) unblocked share of the light, from 0 to 1
     position: Floats32  # (rows, columns, 3) meters; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
 
     def brightness(
         self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
     ) -> Floats32:
-        """Return the brightness (n,) of points by Lambert's law, and the open part of the sky.
+        """Return the brightness (n,) of points by Lambert's law and the visible part of the sky.
 
-        `pixels` (n, 2) are the coordinates of points (n, 3) in the picture, and `ground` (n,) marks
-        points on the ground, whose open parts keep their color.
+        `pixels` (n, 2) are the pixel coordinates of the points, and `position` and `normal` (n, 3)
+        their positions and normals. `ground` (n,) marks points on the ground, which keep their
+        color where they are not shaded.
         """
         openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
@@ -53,13 +54,13 @@ class LightMap:
         return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
 
     def _openness_at(self, pixels: Floats, position: Floats32, normal: Floats32) -> Floats32:
-        """Interpolate openness (n,) between the nine grid points around that are on the surface."""
+        """Interpolate the openness (n,) between nearby grid points on the same surface."""
         rows, columns = self.openness.shape
         tolerance = plane_tolerance(self.camera, position, STRIDE)
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
         cell = np.floor(start).astype(np.int64)
         part = start - cell
-        # The mean of two by two, because neighbors rotate the lights, interpolated.
+        # Interpolate the mean of two by two grid points, which rotate the lights differently.
         shares = 1 - part, np.ones_like(part), part
         total = np.full(len(pixels), 1e-3, np.float32)
         summed = np.full(len(pixels), 1e-3 * THIN_OPENNESS, np.float32)
@@ -78,9 +79,10 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return how well points (n, 3) share a surface with spots (n, 3), from 0 to 0.4.
+    """Return how well points (n, 3) match the surface at other points, from 0 to 0.4.
 
-    Points of the same surface lie within `tolerance` (n,), meters, of each other's plane.
+    `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
+    surface lie within `tolerance` (n,) meters of each other's plane.
     """
     with np.errstate(invalid="ignore"):
         in_plane = np.abs(dot(spot - position, normal)) < tolerance
@@ -88,32 +90,36 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance (n,), meters, for points of a plane at a distance of `stride` pixels."""
+    """Return the tolerance (n,) in meters for points on a plane that are `stride` pixels apart."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
 
 
 def _sun_direction(camera: Camera) -> Floats:
-    """Return the direction (3,) of the sun, left behind the camera: shadows fall to the right."""
+    """Return the direction (3,) of the sun.
+
+    The sun is behind the camera on the left, so shadows fall to the right.
+    """
     back = -camera.axes[2] * np.array([1.0, 1.0, 0.0])
     sun = 0.4 * back / np.linalg.norm(back) - 0.55 * camera.axes[0] + np.array([0.0, 0.0, 0.95])
     return sun / np.linalg.norm(sun)
 
 
 def make_light_map(
-    surface: Surface,
+    surface: RenderMesh,
     cutaway: Cutaway | None,
     camera: Camera,
     position: Floats32,
     normal: Floats32,
     reach: float,
 ) -> LightMap:
-    """Cast rays from a grid of surface points to lights all over the sky and in the sun.
+    """Cast rays from a grid of surface points to lights in the sky and in the sun.
 
-    All points have the same lights: steps in brightness are invisible, while random directions
-    would need smoothing. Positions and normals are (rows, columns, 3), NaN without a surface.
-    Surfaces that the cutaway removes cast no shadow, nor do surfaces farther than `reach`, meters.
+    All points use the same lights, because small steps in brightness are invisible, while random
+    directions would cause noise. Surfaces that the cutaway removes cast no shadow, and neither do
+    surfaces farther away than `reach` meters. `position` and `normal` have shape (rows, columns,
+    3), and are NaN for pixels without a surface.
     """
     sun = _sun_direction(camera)
     has_surface = np.isfinite(position[..., 0])
@@ -125,15 +131,16 @@ def make_light_map(
         * camera.footprint(np.sqrt(dot(origins - camera.eye, origins - camera.eye)))[:, None]
         * facing
     )
-    # Neighbors rotate the lights differently, and are averaged: like four times as many lights.
+    # Neighbors rotate the lights differently and are averaged, which has the effect of four times
+    # as many lights.
     quarter = _quarters(has_surface)
     total_light = np.full(len(origins), 1e-9)
     open_light = np.full(len(origins), 1e-9)
     for direction, strength, rotation in zip(*_lights(sun), strict=True):
-        towards = _rotated(direction, rotation)[quarter]
-        light = strength * np.clip(dot(facing, towards), 0, None)
+        toward = _rotated(direction, rotation)[quarter]
+        light = strength * np.clip(dot(facing, toward), 0, None)
         lit = np.flatnonzero(light)
-        free = lit[~blocked(surface, cutaway, origins[lit], towards[lit], reach)]
+        free = lit[~is_blocked(surface, cutaway, origins[lit], toward[lit], reach)]
         total_light += light
         open_light[free] += light[free]
     openness = np.ones(has_surface.shape, np.float32)
@@ -142,13 +149,16 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return 0 to 3 for each point of a grid (rows, columns) with a surface, by its neighbors."""
+    """Return the number, 0 to 3, of each grid point with a surface in its block of two by two.
+
+    `has_surface` has shape (rows, columns).
+    """
     row, column = np.nonzero(has_surface)
     return np.asarray(row % 2 + 2 * (column % 2))
 
 
 def _rotated(direction: Floats, rotation: float) -> Floats:
-    """Return a direction (3,) in four rotations around z, a step of `rotation` radians apart."""
+    """Return a direction (3,) in four rotations about z, `rotation` radians apart."""
     x, y, z = direction
     angles = rotation * np.arange(4)
     cos = np.cos(angles)
@@ -157,9 +167,10 @@ def _rotated(direction: Floats, rotation: float) -> Floats:
 
 
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return directions (k, 3) of lights, even over sky and sun's disc, strengths and rotations.
+    """Return directions, strengths, and rotations of lights in the sky and the sun.
 
-    The strengths (k,) of sky and sun together are 1 on level ground; rotations (k,) in radians.
+    The directions (k, 3) are evenly spread. The strengths (k,) add up to 1 on level ground. The
+    rotations (k,) are in radians.
     """
     n = np.arange(SUN_LIGHTS)
     azimuth = 2 * np.pi * 0.6180339887 * n
@@ -169,5 +180,5 @@ def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
     disc = np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * np.cross(side, sun)
     counts = [SKY_LIGHTS, SUN_LIGHTS]
     strengths = [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS]
-    lights = np.concatenate([spiral(SKY_LIGHTS), sun + radius[:, None] * disc])
+    lights = np.concatenate([golden_spiral(SKY_LIGHTS), sun + radius[:, None] * disc])
     return lights, np.repeat(strengths, counts), np.repeat(ROTATIONS, counts)

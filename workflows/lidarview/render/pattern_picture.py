@@ -1,4 +1,4 @@
-"""The picture of a sensor's pattern: a frame, and the coverage of the field of view over time."""
+"""Draw a sensor's scan pattern: a frame, and the coverage of the field of view over time."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from lidarsim.sensor.ray_sensors import PrismSensor
 from . import theme
 from .beam_picture import COLORS, beam_page
 from .picture_page import Page
-from .theme import mapped
+from .theme import apply_colormap
 
 TIMES_S = (0.1, 0.5, 2.0)
-CELL_DEG = 0.28  # cell of the coverage: the width of a beam of Livox
-FIELD_S = 4.0  # cells that are met in this time are the field of view
+CELL_DEG = 0.28  # width of a coverage cell, which is the beam width of Livox sensors
+FIELD_S = 4.0  # the cells that are hit within this time are the field of view
 CONVENTIONS = "azimuth in degrees from x (forward) to y (left); elevation above the xy plane"
 _COVERED = to_rgb(theme.OBJECT_COLORS[0])
-_FIRST_FIRINGS = 8  # firings of sensors of several channels
-_MAX_FRAME_RAYS = 300_000  # limit for a frame; a longer frame has every n-th firing
+_FIRST_FIRINGS = 8  # firings that are drawn for sensors with several channels
+_MAX_FRAME_RAYS = 300_000  # longer frames are thinned out to every n-th firing
 _CHUNK_RAYS = 1_000_000
-_WIDE = 2.0  # charts of fields of view with a greater ratio of sides stand one above the other
+_WIDE = 2.0  # charts are stacked if the field of view has a larger aspect ratio
 _WIDE_SIZE = (1600, 1150)
 _NARROW_SIZE = (1600, 640)
 
 
 class _Pattern(NamedTuple):
-    """Directions of a frame, and when the cells of all directions are met first.
+    """Ray directions in a frame, and the first time at which each direction cell is hit.
 
     Attributes
     ----------
     azimuths_deg, elevations_deg
-        Angles (n,) of the rays of a frame.
+        (n,) angles of the rays in a frame.
     times_s
-        Their times (n,), seconds.
+        (n,) times of the rays in seconds.
     met_s
-        Times (rows, columns) at which cells are met first, seconds; infinite if never.
+        (rows, columns) time of the first ray in each cell, in seconds, or infinity.
     every
-        The frame has the rays of each so manieth firing.
+        The frame contains only one out of this many firings.
     """
 
     azimuths_deg: Floats
@@ -56,7 +56,7 @@ class _Pattern(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """Part of the grid of cells that has rays."""
+    """The part of the cell grid that has rays."""
 
     row_range: slice
     column_range: slice
@@ -64,18 +64,18 @@ class _Window(NamedTuple):
 
 
 def draw_pattern(path: Path, sensor: Sensor) -> None:
-    """Write the picture of `pattern_page`.
+    """Write the picture of `pattern_page` as a .png file.
 
-    Raises LidarError if the file, a .png, cannot be written.
+    Raises LidarError if the file cannot be written.
     """
     pattern_page(sensor).save(path)
 
 
 def pattern_page(sensor: Sensor) -> Page:
-    """Draw a sensor's frame, colored by time, and the directions covered after `TIMES_S`.
+    """Draw a sensor's frame, colored by time, and the coverage after each of `TIMES_S`.
 
-    For sensors with prisms, whose patterns do not repeat, the covered shares of the field of view
-    are stated. A sensor that looks down has its angles over time instead, as in `beam_page`.
+    For sensors with prisms, whose patterns do not repeat, the covered share of the field of view is
+    stated. For a sensor that looks down, the angle over time is drawn instead, as in `beam_page`.
     """
     if isinstance(sensor, LineSensor):
         page = beam_page(sensor)
@@ -119,7 +119,7 @@ def pattern_page(sensor: Sensor) -> Page:
 
 
 def _pattern_of(sensor: Sensor) -> _Pattern:
-    """Return the directions of a frame, and the times at which cells are met."""
+    """Compute the scan pattern of a sensor."""
     per_second = _firings_per_second(sensor)
     per_frame = max(round(getattr(sensor.head, "firings_per_turn", per_second / 10)), 1)
     every = -(-per_frame * sensor.channels // _MAX_FRAME_RAYS)
@@ -138,31 +138,31 @@ def _pattern_of(sensor: Sensor) -> _Pattern:
 
 
 def _firings_per_second(sensor: Sensor) -> float:
-    """Return the rate of firings, from the times of the first thousand."""
+    """Return the firing rate, measured over the first thousand firings."""
     start_ns, stop_ns = sensor.begins_ns(np.array([0, 1000]))
     return float(1000 / (stop_ns - start_ns) * 1e9)
 
 
 def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
-    """Return azimuths and elevations (n,) of the rays of firings, degrees."""
+    """Return the azimuths and elevations (n,) of the rays in firings."""
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
     return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
 
 
 def _times_s(sensor: Sensor, firings: Ints) -> Floats:
-    """Return times (n,) of the rays of firings since the start of the sensor, seconds."""
+    """Return the times (n,) of the rays in firings, relative to the start of the sensor."""
     times_ns = sensor.times_ns(firings).reshape(-1).astype(np.float64)
     return (times_ns - sensor.start_ns) / 1e9
 
 
 def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
-    """Return the rows and columns (n,) of the cells of directions."""
+    """Return the rows and columns (n,) of the cells that contain directions."""
     rows = ((elevations_deg + 90) / CELL_DEG).astype(np.int64)
     return rows, ((azimuths_deg + 180) / CELL_DEG).astype(np.int64)
 
 
 def _window(pattern: _Pattern) -> _Window:
-    """Return the part of the cells that has rays, with an empty cell around."""
+    """Return the part of the grid that has rays, with a margin of one cell."""
     met = np.isfinite(pattern.met_s)
     met[_cells(pattern.azimuths_deg, pattern.elevations_deg)] = True
     edges = []
@@ -176,7 +176,10 @@ def _window(pattern: _Pattern) -> _Window:
 
 
 def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
-    """Return headings, and the covered cells, of `TIMES_S`, with equal headings together."""
+    """Return a heading and a mask of covered cells for each of `TIMES_S`.
+
+    Times with identical coverage share an entry.
+    """
     field = np.isfinite(met_s).sum()
     covered = {seconds: met_s <= seconds for seconds in TIMES_S}
     groups = groupby(TIMES_S, key=lambda seconds: int(covered[seconds].sum()))
@@ -193,7 +196,7 @@ def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
 
 
 def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes]:
-    """Return charts one above the other, or side by side."""
+    """Add charts to a page, stacked if the field of view is wide, otherwise side by side."""
     left, right, bottom, top = window.extent
     limits = {"xlim": (left, right), "ylim": (bottom, top)}
     charts = []
@@ -214,7 +217,7 @@ def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes
 
 
 class _TimeScale(NamedTuple):
-    """Unit of the times of a picture, and their colors."""
+    """The time unit of a picture, and its color scale."""
 
     unit: str
     per_s: float
@@ -222,7 +225,7 @@ class _TimeScale(NamedTuple):
 
 
 def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> None:
-    """Draw the rays of a frame, colored by time."""
+    """Draw the rays in a frame, colored by time."""
     last_s = float(pattern.times_s.max())
     unit, per_s = ("s", 1.0) if last_s > 5 else ("ms", 1e3)
     scale = _TimeScale(unit, per_s, Normalize(0, max(per_s * last_s, 1e-3)))
@@ -230,7 +233,7 @@ def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> No
     _draw_rays(
         page, axes, (pattern.azimuths_deg, pattern.elevations_deg), pattern.times_s, scale, area
     )
-    colors = mapped(COLORS, np.linspace(0, 1, 256))
+    colors = apply_colormap(COLORS, np.linspace(0, 1, 256))
     page.color_bar(colors, scale.norm, f"ray time, {unit}")
     words = "one frame" if sensor.cycle == "frame" else "one revolution"
     if pattern.every > 1:
@@ -239,14 +242,14 @@ def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> No
 
 
 def _draw_firings(page: Page, axes: Axes, sensor: Sensor) -> None:
-    """Draw the first firings of a sensor, colored by their own times, where they are."""
+    """Draw the first firings of a sensor with their own color scale."""
     firings = np.arange(_FIRST_FIRINGS)
     angles_deg = _angles_deg(sensor, firings)
     times_s = _times_s(sensor, firings)
     last_s = float(times_s.max())
     unit, per_s = ("µs", 1e6) if last_s < 0.01 else ("ms", 1e3)
     stretched = _TimeScale(unit, per_s, Normalize(0, max(per_s * last_s, 1e-3)))
-    middle = angles_deg[0][0]  # no jump where azimuths pass 180 degrees
+    middle = angles_deg[0][0]  # avoids a jump at 180 degrees
     azimuths_deg = (angles_deg[0] - middle + 180) % 360 - 180 + middle
     _draw_rays(page, axes, (azimuths_deg, angles_deg[1]), times_s, stretched, 8.0)
     axes.autoscale()
@@ -262,10 +265,10 @@ def _draw_rays(
     scale: _TimeScale,
     area: float,
 ) -> None:
-    """Draw rays as dots of an area, colored by their times (n,)."""
+    """Draw rays as dots with an area, colored by their times (n,)."""
     axes.scatter(
         *angles_deg,
         s=area * page.unit**2,
-        c=mapped(COLORS, scale.norm(scale.per_s * times_s)),
+        c=apply_colormap(COLORS, scale.norm(scale.per_s * times_s)),
         linewidths=0,
     )

@@ -1,4 +1,4 @@
-"""The finished picture: a rendered image with axes, legend, color bar and title."""
+"""Compose a picture from a rendered image, axes, a legend, a color bar, and a title."""
 
 from __future__ import annotations
 
@@ -32,43 +32,39 @@ from .shot import SurfaceView
 from .stage import make_axis, nice_step
 
 DPI = 200
-FONT = "DejaVu Sans"  # comes with matplotlib
-MAX_LARGE_MARKERS = 40  # more sensors than this are small dots
-MAX_PATH_POINTS = 200  # points of the drawn trajectory of a sensor
-# areas of numbered marks, square points of a picture 1600 wide: of 1 to 9, and of more
+FONT = "DejaVu Sans"  # included in Matplotlib
+MAX_LARGE_MARKERS = 40  # more sensors than this are drawn as small dots
+MAX_PATH_POINTS = 200  # points on the drawn trajectory of a sensor
+# Areas of markers with one and two digits, in square points for a picture 1600 pixels wide.
 _MARK = 62
 _MARK_OF_TWO_DIGITS = 92
-MAX_NAMES = 12  # limit for names of actors, beside the actors
-# pixels of a picture 1600 wide
+MAX_NAMES = 12  # actors are not named if there are more
+# All lengths below are in pixels for a picture 1600 pixels wide.
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
 LEGEND_ROWS = 30
-# Of the numbers along the axes, in pixels of a picture 1600 wide.
 TICK = 7.0  # length of a tick mark
-# from an edge to the numbers right or left of it, and under it
+# Distances from an edge to the tick labels beside it and below it.
 LABEL_MARGIN_X = 14.0
 LABEL_MARGIN_Y = 24.0
 LETTER_WIDTH = 12.0  # width of a digit
-TITLE_DISTANCE = 32.0  # distance between the numbers and the title
-LABEL_SPACING = 34.0  # numbers stand at least this far apart
-MIN_AXIS = 36.0  # a shorter height axis has no room for numbers
+TITLE_DISTANCE = 32.0  # distance between the tick labels and the title
+LABEL_SPACING = 34.0  # minimum distance between tick labels
+MIN_AXIS = 36.0  # a shorter height axis has no tick labels
 
 
 class Page:
-    """A picture under construction.
-
-    Its size is (width, height) in pixels.
-    """
+    """A picture under construction, with a size (width, height) in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
         self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.PAGE)
-        self.unit = size[0] / 1600  # fonts and lines grow with the picture
+        self.unit = size[0] / 1600  # fonts and lines scale with the picture
 
     def show(self, shot: SurfaceView, image: AnyFloats) -> Axes:
-        """Fill the page with a painted shot, its ground's grid, its axes and its sensors.
+        """Draw a colored view with the grid on its ground, its axes, sensors, and actor names.
 
-        The returned axes have the shot's pixels as coordinates.
+        The returned axes use the pixel coordinates of the view.
         """
         colors = image[..., :3]
         opacity = image[..., 3:]
@@ -78,7 +74,7 @@ class Page:
         axes = self.figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set(xlim=(0, self.size[0]), ylim=(self.size[1], 0))
-        grid = shot.runs(_grid(shot), shot.on_ground)
+        grid = shot.visible_segments(_grid(shot), shot.project_ground)
         axes.add_collection(LineCollection(grid, colors=theme.LINE, linewidths=0.6 * self.unit))
         self._label_axes(axes, shot)
         self._draw_sensors(axes, shot)
@@ -86,7 +82,7 @@ class Page:
         return axes
 
     def _label_axes(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write numbers and titles along the ground's near edges and up from its left corner."""
+        """Write tick labels and titles along the front edges and up the left corner."""
         label_positions: list[Floats] = []
         for k, (start, end, outward) in enumerate(_axis_edges(shot)):
             axis = shot.stage.axes[k]
@@ -143,7 +139,10 @@ class Page:
         text_artist.set_parse_math(False)  # names come from files
 
     def _draw_sensors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Mark the sensors, hollow if hidden, each on a stem."""
+        """Draw the paths of sensors, and a marker on a stem for each sensor.
+
+        Markers of hidden sensors are hollow.
+        """
         for path in shot.paths:
             points = path[
                 np.linspace(0, len(path) - 1, min(len(path), MAX_PATH_POINTS)).astype(int)
@@ -157,13 +156,13 @@ class Page:
                 zorder=4,
                 solid_capstyle="round",
             )
-            self.lines(axes, shot, np.stack([points[:-1], points[1:]], axis=1), 1.8, 0.9)
+            self.draw_lines(axes, shot, np.stack([points[:-1], points[1:]], axis=1), 1.8, 0.9)
         poses = shot.sensors
         is_crowded = len(shot.sensors) > MAX_LARGE_MARKERS
-        pixels, is_visible = shot.visible(poses)
+        pixels, is_visible = shot.project_visible(poses)
         if not is_crowded:
             feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
-            self.lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
+            self.draw_lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
         size, edge_width = (5, 0.2) if is_crowded else (20, 0.7)
         for chosen, face, edge in (
             (is_visible, theme.SENSOR, theme.PAGE),
@@ -180,16 +179,15 @@ class Page:
             )
 
     def _name_actors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Name the actors, if there are not too many, above their positions.
+        """Write the names of the actors above their positions, unless there are too many.
 
-        Names of hidden actors are paler.
-
-        Of a robot, whose links are called ROBOT/LINK, the first link has its name.
+        Names of hidden actors are paler. A robot, whose links are named ROBOT/LINK, is named at its
+        first link.
         """
         boxes = shot.scene.object_bounds
         label_positions = np.empty((0, 2))
         actor_indices = np.arange(len(boxes) - shot.actors, len(boxes))
-        # Absent actors are a single point.
+        # Absent actors are reduced to a single point.
         is_present = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
         actor_indices = actor_indices[is_present[actor_indices]]
         names = [robot_name(shot.scene.names[k]) for k in actor_indices]
@@ -201,8 +199,8 @@ class Page:
             [boxes[actor_indices, :, :2].mean(axis=1), boxes[actor_indices, 1, 2]]
         )
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
-        pixels, is_visible = shot.visible(tops)
-        for k in np.argsort(-pixels[:, 1]).tolist():  # the front first
+        pixels, is_visible = shot.project_visible(tops)
+        for k in np.argsort(-pixels[:, 1]).tolist():  # from front to back
             pixel = pixels[k]
             name = names[k]
             color = theme.INK if is_visible[k] else theme.LINE
@@ -225,14 +223,14 @@ class Page:
             style = {"va": "bottom", "path_effects": halo, "zorder": 7}
             self._text(axes, position, shortened(name), 6.6, ink, **style)
 
-    def numbers(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write numbers from 1 on the sensors' markers.
+    def number_sensors(self, axes: Axes, shot: SurfaceView) -> None:
+        """Write numbers on the markers of the sensors, starting from 1.
 
         Hidden sensors have white markers.
         """
-        pixels, is_visible = shot.visible(shot.sensors)
+        pixels, is_visible = shot.project_visible(shot.sensors)
         area = _MARK if len(pixels) < 10 else _MARK_OF_TWO_DIGITS
-        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # the front last
+        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # from back to front
             x = float(pixels[k, 0])
             y = float(pixels[k, 1])
             above = 8 + rank / len(pixels)
@@ -249,11 +247,11 @@ class Page:
             style = {"va": "center_baseline", "weight": "bold", "zorder": above}
             self._text(axes, (x, y), str(k + 1), 5.2 if k < 99 else 4.0, ink, **style)
 
-    def lines(
+    def draw_lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
     ) -> None:
-        """Draw the visible parts of segments (n, 2, 3), in the sensors' color."""
-        runs = shot.runs(segments, shot.visible)
+        """Draw the visible parts of line segments (n, 2, 3) in the color of sensors."""
+        runs = shot.visible_segments(segments, shot.project_visible)
         axes.add_collection(
             LineCollection(
                 runs, colors=theme.SENSOR, linewidths=width * self.unit, alpha=alpha, zorder=4
@@ -261,7 +259,10 @@ class Page:
         )
 
     def chart(self, frame: tuple[float, float, float, float], **options: Any) -> Axes:
-        """Add axes with a grid in a frame (left, bottom, width, height), fractions of the page."""
+        """Add axes with a grid.
+
+        `frame` is (left, bottom, width, height) in fractions of the page.
+        """
         axes = self.figure.add_axes(frame)
         small = 0.6 * self.unit
         axes.set(facecolor=theme.GROUND, axisbelow=True, **options)
@@ -286,10 +287,21 @@ class Page:
         origin: Sequence[float] | Floats = (0.0, 0.0),
         tick_count: int = 8,
     ) -> Axes:
-        """Add axes for a map, with limits (2, 2) in meters: the lowest and the highest corner.
+        """Add axes for a map.
 
-        The ticks are world coordinates, which are the coordinates in the chart plus `origin` (2,).
-        Large coordinates are shortened in the axis titles, as in "x − 500 000 (m)".
+        The tick labels are world coordinates. Large coordinates are shortened by an offset in the
+        axis title, for example "x − 500 000 (m)".
+
+        Parameters
+        ----------
+        frame
+            Left, bottom, width, and height in fractions of the page.
+        limits
+            (2, 2) lower and upper corner of the map in meters.
+        origin
+            (2,) world coordinates of the origin of the map.
+        tick_count
+            Approximate number of ticks on the x axis.
         """
         (x0, y0), (x1, y1) = limits.tolist()
         axes = self.chart(frame, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
@@ -304,7 +316,7 @@ class Page:
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, above lines of detail."""
+        """Write a title at the top left, above lines with details."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
         position = 0.03, 1 - line
         self._text(self.figure, position, text, 11, theme.INK, ha="left", weight="bold")
@@ -317,7 +329,7 @@ class Page:
         self._text(self.figure, (0.03, 0.025), text, 7.2, theme.MUTED, ha="left")
 
     def heading(self, axes: Axes, text: str, **options: Any) -> None:
-        """Name a chart, above its left end."""
+        """Write a heading above the left end of a chart."""
         style: dict[str, Any] = {
             "fontsize": 7.6 * self.unit,
             "color": theme.INK,
@@ -328,11 +340,11 @@ class Page:
     def legend(
         self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor", **options: Any
     ) -> None:
-        """Draw a legend of (name, color) in the right margin, with options of `key`.
+        """Draw a legend in the right margin.
 
-        The last line counts the rest.
-
-        An empty name of the sensor leaves the sensor out.
+        `entries` are (name, color). If there are more than `LEGEND_ROWS`, the last line states the
+        number of omitted entries. `sensor` is the label of the sensor marker, which is omitted if
+        the label is empty. The options are passed to `key`.
         """
         rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:
@@ -365,7 +377,10 @@ class Page:
         parent: Axes | Figure | None = None,
         **options: Any,
     ) -> None:
-        """Draw a legend of handles in the right margin, or on a parent, with `size` in points."""
+        """Draw a legend of Matplotlib handles in the right margin or on a parent.
+
+        `size` is the font size in points.
+        """
         style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
         legend = (parent or self.figure).legend(
@@ -377,8 +392,8 @@ class Page:
             prop={"family": FONT, "size": size * self.unit},
             **style,
         )
-        # Names come from files: matplotlib leaves out names that start with an underscore,
-        # and fails on texts that only look like a formula ("$\\frac{x$").
+        # Names come from files. Matplotlib would omit names that start with an underscore, and
+        # fail on names that look like a formula ("$\\frac{x$").
         for text, handle in zip(legend.get_texts(), handles, strict=True):
             text.set_parse_math(False)
             text.set_text(str(handle.get_label()))
@@ -390,7 +405,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a color bar of colors (n, 3) in the right margin, beside its title."""
+        """Draw a color bar with colors (n, 3) and a title in the right margin."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
@@ -419,9 +434,7 @@ class Page:
             _label_in_full(axes.yaxis)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colors.
-
-        A link at the path is replaced.
+        """Write the page as a PNG file in its light colors, replacing an existing file or link.
 
         Raises
         ------
@@ -433,20 +446,21 @@ class Page:
             Storage.at(path.parent, durable=False).write(path.name, self.png())
 
     def png(self) -> bytes:
-        """Return the page as a PNG, in its light colors."""
+        """Return the page as PNG data in its light colors."""
         image = io.BytesIO()
         self.figure.savefig(image, dpi=DPI, format="png")
         return image.getvalue()
 
     def svg(self) -> str:
-        """Return the page as an element of HTML, whose ink may follow the style of a document.
+        """Return the page as an SVG element for an HTML document.
 
-        The colors of `theme.STYLED` are variables of CSS, such as --picture-ink.
+        The colors in `theme.STYLED` become CSS variables such as ``--picture-ink``, so that the
+        document can style them.
         """
         text = io.StringIO()
         with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
             self.figure.savefig(text, format="svg", dpi=DPI, metadata={"Date": None})
-        # Comments and styles would be repeated by all elements of a document.
+        # A document with several pictures would repeat comments and styles.
         svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
         svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
         svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
@@ -456,14 +470,14 @@ class Page:
 
 
 def label_logarithms(axis: Axis, is_narrow: bool) -> None:
-    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis, or powers of ten if narrow."""
+    """Label a logarithmic axis with 1, 2, 5, 10, … if narrow, otherwise with powers of ten."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())
 
 
 def _label_in_full(axis: Axis) -> None:
-    """Write the numbers at a linear axis in full, as 1,497.005: never as a sum with an offset."""
+    """Label a linear axis with complete numbers such as 1,497.005, without an offset."""
     ticks = axis.get_majorticklocs()
     step = float(np.diff(ticks[:2])[0]) if len(ticks) > 1 else 1.0
     decimals = next((n for n in range(12) if math.isclose(step, round(step, n))), 12)
@@ -473,7 +487,7 @@ def _label_in_full(axis: Axis) -> None:
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Return lines (n, 2, 3) of the ground: its border, and a line at each tick."""
+    """Return the grid lines (n, 2, 3) on the ground: its border, and a line at each tick."""
     (x0, y0), (x1, y1) = shot.stage.ground.tolist()
     level = shot.stage.level
     x_ticks, y_ticks = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
@@ -484,7 +498,7 @@ def _grid(shot: SurfaceView) -> Floats:
 
 
 def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
-    """Return the ends (3,) of the axes x, y and z, and the outward direction (2,) in pixels."""
+    """Return the ends (3,) and the outward direction (2,) in pixels of the x, y, and z axis."""
     corners = shot.stage.corners
     flat, _ = shot.camera.project(corners)
     middle, _ = shot.camera.project(corners.mean(axis=0)[None])
@@ -501,6 +515,6 @@ def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def robot_name(name: str) -> str:
-    """Return the robot of a link, ROBOT/LINK, or the name itself of an actor without links."""
-    # Traffic has names of its files in brackets, with any letters.
+    """Return the robot of a link named ROBOT/LINK, or the name of any other actor."""
+    # Names of traffic actors contain a file name in parentheses, which may include a slash.
     return name if "(" in name else name.partition("/")[0]

@@ -1,4 +1,4 @@
-"""The pictures of a scene: objects, density of hits, and points."""
+"""Draw pictures of a scene: its objects, its hit density, and its points."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from lidarsim.columns.table import AXES, Column, Z
 from lidarsim.scene.scene import Scene
 
 from . import theme
-from .coloring import TURBO, colors_of, values_of
+from .coloring import TURBO, column_values, make_coloring
 from .hit_density import hit_colors, hits_title
 from .picture_page import LEGEND_ROWS, Page, robot_name
 from .shot import SurfaceView
 
-MAX_POINTS = 1_000_000  # limit for drawn points of a cloud; a picture has a few more pixels
-# to count, and to color
-MAX_HITS = 200_000
-MAX_PIECES = 100_000
-SOLID_RADIUS = 5.0  # half pixels that a point covers at least where gaps are closed
-# more from one trajectory would hide the surfaces
+MAX_POINTS = 1_000_000  # maximum number of drawn points; a picture has only a few more pixels
+MAX_HITS = 200_000  # hit points for estimating the density
+MAX_PIECES = 100_000  # additional triangles from dividing large ones
+SOLID_RADIUS = 5.0  # minimum radius in half pixels where gaps are closed
+# More rays from a trajectory would hide the surfaces.
 MAX_RAYS = 600
 MAX_RAYS_OF_PATHS = 150
-# An object that covers this much of the ground is a floor or a hall.
+# An object that covers this share of the ground is a floor or a hall.
 MIN_FLOOR_SHARE = 0.6
 
 
 def draw_scene(shot: SurfaceView, triangles: int) -> Page:
-    """Draw a scene with a number of triangles, each object in its own color, and the sensors.
+    """Draw a scene with the sensors, each object in its own color.
 
-    Of more objects than a legend has rows, copies of an object share a color. A scene with colors
-    is drawn in its colors, without a legend.
+    If a scene has more objects than a legend has rows, copies of an object share a color. A scene
+    with colors is drawn in these colors, without a legend. `triangles` is the number of triangles
+    in the caption.
     """
     scene = shot.scene
     words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
@@ -55,11 +55,11 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
         name if count == 1 else f"{name} ({count:,})"
         for name, count in zip(without_common_prefix(names), counts, strict=True)
     ]
-    first = len(names) - shot.actors  # actors are first in the legend
+    first = len(names) - shot.actors  # the legend starts with the actors
     is_visible = np.bincount(kinds, has_faces) > 0
     order = [*range(first, len(names)), *range(first)]
     if is_visible.sum() > LEGEND_ROWS:
-        order.sort(key=lambda k: k < first and counts[k] == 1)  # then copies
+        order.sort(key=lambda k: k < first and counts[k] == 1)  # followed by copies
     entries = [(labels[k], colors[firsts[k]]) for k in order if is_visible[k]]
     page.legend(entries, _sensor_label(shot))
     page.title("Scene", f"{words} · {shot.caption}", shot.models)
@@ -73,12 +73,15 @@ def draw_hits(
 
     Parameters
     ----------
+    shot
+        The scene and the camera.
     hit_counts
-        (f,) hits of each triangle of the scene.
+        (f,) hits on each triangle of the uncut scene.
     points
-        (n, 3) an evenly spaced sample of the hits, local meters, perhaps with gaps.
+        (n, 3) evenly spaced sample of the hits, local, in meters. It may have gaps.
     sample_rays
-        (n, 2, 3) ends of rays, local meters; some rays that end in the picture are drawn.
+        (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end in the
+        picture are drawn.
     """
     hits = hit_counts[shot.part.parents] * shot.part.shares
     corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)
@@ -88,8 +91,8 @@ def draw_hits(
         shot.scene, corners, hits, counted_points, max_pieces
     )
     page = Page(shot.camera.size)
-    axes = page.show(shot, shot.divided(pieces, owner).paint(colors, 0.5))
-    page.lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
+    axes = page.show(shot, shot.subdivide(pieces, owner).paint(colors, 0.5))
+    page.draw_lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
     page.color_bar(TURBO, LogNorm(*limits), hits_title(limits))
     if label := _sensor_label(shot):
         page.legend([], label, bbox_to_anchor=(0.842, 0.18))  # below the color bar
@@ -98,14 +101,14 @@ def draw_hits(
 
 
 def _sensor_label(shot: SurfaceView) -> str:
-    """Return the entry of a legend for the marks of sensors; empty if there are none."""
+    """Return the legend entry for the sensors, or an empty string without sensors."""
     if shot.paths:
         return "Sensor path"
     return "Sensor position" + "s" * (len(shot.sensors) > 1) if len(shot.sensors) else ""
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
-    """Choose rays (n, 2, 3) that end in the picture."""
+    """Select some of the rays (n, 2, 3) that end in the picture."""
     slack = 1e-3 * shot.stage.size
     lowest, highest = shot.stage.bounds
     ray_ends = sample_rays[:, 1]
@@ -123,10 +126,22 @@ def draw_cloud(
     names: Sequence[str] = (),
     solid: bool = False,
 ) -> Page:
-    """Draw points of a cloud colored by a column, over the scene drawn pale.
+    """Draw a cloud colored by a column over the scene in pale colors.
 
-    The cloud is a sample of `count` points; hidden points are left out. `names` are the words for
-    the values 0, 1, 2, … of a label. `solid` closes gaps between points.
+    Parameters
+    ----------
+    shot
+        The scene and the camera.
+    cloud
+        Sample of the cloud. Hidden points are not drawn.
+    count
+        Number of points in the whole cloud, for the caption.
+    column
+        Column that determines the colors.
+    names
+        Names of the values 0, 1, 2, … of a label column.
+    solid
+        Whether to close the gaps between points.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
@@ -134,10 +149,10 @@ def draw_cloud(
         if column in AXES:
             values = cloud.positions[:, AXES.index(column)]
         else:
-            values = values_of(column, cloud.__getitem__)
-        colored = colors_of(values, column, names)
+            values = column_values(column, cloud.__getitem__)
+        colored = make_coloring(values, column, names)
         positions = cloud.positions - shot.scene.origin
-        image = with_points(image, shot, positions, colored.paint(values), solid)
+        image = draw_points(image, shot, positions, colored.paint(values), solid)
         if colored.limits is None:
             page.legend(colored.labels, _sensor_label(shot))
         else:
@@ -155,11 +170,10 @@ def draw_cloud(
 
 
 def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
-    """Return the kinds of objects (objects,), and the names of kinds.
+    """Group objects that share a color and a legend entry.
 
-    The last objects are actors.
-
-    Each actor is a kind, and so are all links of a robot together.
+    Copies of an object form a group, and so do the links of a robot. The last `actors` objects are
+    actors. Returns the group (objects,) of each object, and the names of the groups.
     """
     if len(names) <= LEGEND_ROWS:
         return np.arange(len(names)), list(names)
@@ -176,7 +190,7 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
 
 
 def _object_colors(scene: Scene, kinds: Ints) -> Floats:
-    """Return colors (objects, 3) in 0 to 1 of a scene's objects, a color for each kind.
+    """Return the colors (objects, 3) of a scene's objects, one color for each group.
 
     Floors and halls are gray, so that the objects inside stand out.
     """
@@ -192,48 +206,53 @@ def _object_colors(scene: Scene, kinds: Ints) -> Floats:
     return colors
 
 
-def with_points(
+def draw_points(
     image: Floats32, shot: SurfaceView, points: Floats, colors: Floats, solid: bool = False
 ) -> Floats32:
     """Draw points (n, 3) as discs over an image.
 
-    Larger discs close gaps if `solid`.
-
-    Only points on the surface of their pixel are drawn: others are hidden, or on a wall that was
-    removed. Points have the light of the surface.
+    Only points on the visible surface of their pixel are drawn; all other points are hidden, or on
+    a wall that has been removed. The points are lit like the surface. If `solid` is set, larger
+    discs close the gaps between points.
     """
     pixels, distance = shot.camera.project(points)
-    # Allow range noise up to one per cent of the scene's size.
+    # Allow for range noise of up to one percent of the scene's size.
     slack = 0.01 * shot.stage.size + 2 * shot.camera.footprint(distance)
     shown = np.zeros(len(points), np.bool_)
-    # A point at a silhouette may fall beside the pixel that shows its surface.
+    # A point at a silhouette may fall into a pixel next to the one that shows its surface.
     for beside in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
         remaining = np.flatnonzero(~shown)
-        depth = shot.camera.look_up(shot.depth, pixels[remaining] + beside, np.inf)
+        depth = shot.camera.sample_image(shot.depth, pixels[remaining] + beside, np.inf)
         shown[remaining] = np.abs(distance[remaining] - depth) <= slack[remaining]
     order = np.flatnonzero(shown)
     order = order[np.argsort(-distance[order])]
     pixels = pixels[order]
-    light = shot.camera.look_up(shot.pixel_samples.light.reshape(shot.depth.shape), pixels, 1.0)
+    light = shot.camera.sample_image(
+        shot.pixel_samples.light.reshape(shot.depth.shape), pixels, 1.0
+    )
     shaded = np.ones((len(order), 4), np.float32)
     shaded[:, :3] = colors[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1)
     width, height = shot.camera.size
     radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
     if solid:
         radius = max(radius, SOLID_RADIUS * width / 1600)
-    result = splat(image, pixels, shaded, radius)
+    result = draw_discs(image, pixels, shaded, radius)
     if solid:  # surfaces keep their outlines
         bare = shot.pixel_samples.triangle.reshape(height, width) < 0
         result[bare] = image[bare]
     return result
 
 
-def splat(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> Floats32:
-    """Draw discs of a radius in half pixels at pixels (n, 2), in colors (n, 4) in 0 to 1."""
-    # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
+def draw_discs(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> Floats32:
+    """Draw discs at pixels (n, 2) in RGBA colors (n, 4) from 0 to 1.
+
+    `radius` is in half pixels. If discs overlap, the nearest center determines the color of a
+    pixel.
+    """
+    # Discs are drawn at twice the resolution and then averaged, so that their edges are smooth.
     height, width, _ = image.shape
     reach = int(radius)
-    margin = reach + 2  # room for discs of points beside the edge
+    margin = reach + 2  # so that discs may extend beyond the edge
     row_length = 2 * (width + margin)
     fine = np.zeros((2 * (height + margin), row_length), np.uint32)
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
@@ -247,8 +266,8 @@ def splat(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> 
         for dx in range(-reach, reach + 1)
         if dx * dx + dy * dy <= radius * radius
     ]
-    # The last of several colors for a pixel stays: the color of the point with the closest
-    # middle. Of equally close points, the point in front counts.
+    # The last color that is written to a pixel remains. Offsets are processed from the edge of the
+    # disc to its center, and points from back to front.
     for _, offset in sorted(disc, reverse=True):
         fine.ravel()[middle + offset] = color
     fine_bytes = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)
@@ -259,5 +278,5 @@ def splat(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> 
 
 
 def _pack_colors(colors: AnyFloats) -> UInts32:
-    """Pack colors (..., 4) in 0 to 1 into numbers (...,) of four bytes."""
+    """Pack RGBA colors (..., 4) from 0 to 1 into 32-bit integers (...,)."""
     return np.round(255 * colors).astype(np.uint8).view(np.uint32)[..., 0]

@@ -1,4 +1,4 @@
-"""A shot: the surface in each pixel of a camera, before coloring."""
+"""Determine the surface and the light in each pixel of a picture, before coloring."""
 
 from __future__ import annotations
 
@@ -18,43 +18,47 @@ from raybeam import RayCaster
 
 from . import theme
 from .camera import Camera, fit_camera
-from .closeup import ShownPart, floor_and_cut, surrounding_box
-from .cutaway import Cutaway, cast_through, plan_cutaway
+from .closeup import ScenePart, floor_and_cut_heights, surrounding_box
+from .cutaway import Cutaway, cast_with_cutaway, plan_cutaway
 from .light import STRIDE, LightMap, make_light_map, plane_tolerance, surface_similarity
 from .stage import PlotBox
-from .surface import Surface, separate_objects, unit
+from .surface import RenderMesh, normalize, separate_objects
 
 SIZE = (1600, 1000)  # pixels of a finished picture
-# Frame of the scene; the title is above, legend and color bar are on the right.
+# Frame of the scene. The title is above, and the legend or color bar is on the right.
 FRAME = (0.08, 0.115, 0.79, 0.91)
-# instead of a triangle
+# Values in place of a triangle index.
 SKY = -1
 GROUND = -2
-# of the samples of an edge pixel from its middle, pixels
+# Offsets of the samples in an edge pixel from its center, in pixels.
 _EDGE_OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-STEPS = 700  # points along a line where its visibility is tested
-# Of the scene's diagonal: between objects that touch, and to the pieces of a triangle.
+STEPS = 700  # points along a line at which visibility is tested
+# Shares of the scene's diagonal: the gap between touching objects, and the distance at which rays
+# start in front of the pieces of a triangle.
 _OBJECT_GAP = 5e-6
 _PIECE_GAP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """Hits of the camera's rays.
+class RaySamples:
+    """Hits of camera rays.
 
     Every array has a row for each ray.
     """
 
-    triangle: Ints  # (n,) or SKY, GROUND
-    distance: Floats32  # (n,) meters, infinite for the sky
-    position: Floats32  # (n, 3) meters, NaN for the sky
+    triangle: Ints  # (n,) triangle index, SKY, or GROUND
+    distance: Floats32  # (n,) in meters, infinite for the sky
+    position: Floats32  # (n, 3) in meters, NaN for the sky
     normal: Floats32  # (n, 3) unit length, NaN for the sky
-    light: Floats32  # (n,) brightness: 1 on open ground
-    weights: Floats32  # (n, 3) of the triangle's corners
+    light: Floats32  # (n,) brightness, 1 on open ground
+    weights: Floats32  # (n, 3) weights of the triangle's corners
 
-    def scattered(self, which: Ints, count: int) -> Samples:
-        """Return `count` samples, with these samples at indices `which` (n,) and sky elsewhere."""
-        result = Samples(
+    def scatter(self, which: Ints, count: int) -> RaySamples:
+        """Return `count` samples of the sky in which these samples replace those at given indices.
+
+        `which` (n,) are the indices of the samples.
+        """
+        result = RaySamples(
             np.full(count, SKY),
             np.full(count, np.inf, np.float32),
             np.full((count, 3), np.nan, np.float32),
@@ -67,9 +71,10 @@ class Samples:
         return result
 
     def paint(self, face_colors: Floats, contrast: float) -> Floats32:
-        """Return colors (n, 4) of the samples: red, green and blue times opacity, and opacity.
+        """Return the premultiplied RGBA colors (n, 4) of the samples.
 
-        `face_colors` are (f, 3), or (f, 3, 3) at the corners; `contrast` is the strength of light.
+        `face_colors` has shape (f, 3), or (f, 3, 3) with colors at the corners. `contrast` is the
+        strength of light and shade.
         """
         image = np.zeros((len(self.triangle), 4), np.float32)
         surface = np.flatnonzero(self.triangle >= 0)
@@ -81,47 +86,54 @@ class Samples:
         image[surface, 3] = 1
         light = self.light[ground, None]
         image[ground, :3] = theme.VEIL * light * theme.rgb(theme.MUTED)
-        image[ground, 3:] = 1 - light * (1 - theme.VEIL)  # shadows darken the page, too
+        image[ground, 3:] = 1 - light * (1 - theme.VEIL)  # shadows darken the page as well
         return image
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """A scene with sensors on its ground, seen by a camera."""
+    """A scene with sensors, viewed by a camera."""
 
-    part: ShownPart
+    part: ScenePart
     uncut: Scene  # the part before it was cut open
-    sensors: Floats  # (p, 3) meters, local coordinates
+    sensors: Floats  # (p, 3) local, in meters
     paths: tuple[Floats, ...]  # paths of moving sensors, (k, 3) each
-    actors: int  # number of actors, the last objects of the scene, which are labeled
+    actors: int  # number of actors, which are the last objects of the scene
     caption: str  # number of sensors, and the time
-    models: str  # models of the sensors, for a caption
+    models: str  # sensor models, for a second caption
     stage: PlotBox
     camera: Camera
-    pixel_samples: Samples  # through the middle of each pixel
+    pixel_samples: RaySamples  # one through each pixel center
     edges: Ints  # (e,) pixels that show the edge of a surface
-    edge_samples: Samples  # (e times a constant): several for each edge pixel, together
+    edge_samples: RaySamples  # several for each edge pixel, in the order of `edges`
 
     @property
     def scene(self) -> Scene:
-        """Scene of the drawn triangles."""
+        """Scene with the drawn triangles."""
         return self.part.scene
 
     @property
     def depth(self) -> Floats32:
-        """Depth (height, width) from the eye to surfaces, meters, or infinite without a surface."""
+        """Distance (height, width) from the camera to the surface in meters.
+
+        Pixels without a surface have an infinite distance.
+        """
         return self.pixel_samples.distance.reshape(self.camera.size[::-1])
 
     def paint(self, face_colors: Floats, contrast: float = 1.0) -> Floats32:
-        """Color the shot.
+        """Color the view.
 
-        `face_colors` are (f, 3) in 0 to 1, or (f, 3, 3) at the corners; a `contrast` of 0 is for
-        flat colors, of 1 for full light and shade.
+        Parameters
+        ----------
+        face_colors
+            (f, 3) colors from 0 to 1, or (f, 3, 3) with colors at the corners.
+        contrast
+            0 for flat colors, 1 for full light and shade.
 
         Returns
         -------
-        (height, width, 4) in 0 to 1: red, green and blue times opacity, and opacity. The page
-        shows through the ground, and where there is nothing.
+        Premultiplied RGBA image (height, width, 4) from 0 to 1. The ground is almost transparent,
+        and pixels without a surface are fully transparent.
         """
         image = self.pixel_samples.paint(face_colors, contrast)
         finer = self.edge_samples.paint(face_colors, contrast)
@@ -129,10 +141,11 @@ class SurfaceView:
             image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
 
-    def divided(self, pieces: Floats32, owner: Ints) -> SurfaceView:
-        """Return the same shot with triangles divided into pieces (k, 3, 3), for painting pieces.
+    def subdivide(self, pieces: Floats32, owner: Ints) -> SurfaceView:
+        """Return the same view with triangles divided into pieces that can be colored.
 
-        The first piece of each triangle has its number; `owner` (k,) is the triangle of each piece.
+        `pieces` (k, 3, 3) are the corners of the pieces, and `owner` (k,) is the triangle of each
+        piece. The first piece of each triangle has the number of the triangle.
         """
         is_divided = np.append(np.bincount(owner) > 1, [False, False])
         back = _PIECE_GAP * self.stage.size
@@ -142,12 +155,12 @@ class SurfaceView:
         corners = pieces[numbers].reshape(-1, 3)
         caster = RayCaster(corners, np.arange(len(corners)).reshape(-1, 3))
 
-        def find(samples: Samples) -> Samples:
+        def find(samples: RaySamples) -> RaySamples:
             piece = samples.triangle.copy()
             weights = samples.weights.copy()
             indices = np.flatnonzero(is_divided[piece])
             positions = samples.position[indices].astype(np.float64)
-            ahead = unit(positions - self.camera.eye)
+            ahead = normalize(positions - self.camera.eye)
             hits = caster.cast(positions - back * ahead, ahead, t_max=2 * back)
             is_piece = owner[numbers[hits.triangle]] == piece[indices]
             piece[indices[is_piece]] = numbers[hits.triangle[is_piece]]
@@ -158,27 +171,33 @@ class SurfaceView:
             self, pixel_samples=find(self.pixel_samples), edge_samples=find(self.edge_samples)
         )
 
-    def visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Return pixel coordinates (n, 2) of points (n, 3), local meters, and a visibility mask."""
+    def project_visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
+        """Return the pixel coordinates of local points, and a mask of the visible points.
+
+        The points have shape (n, 3), the pixel coordinates (n, 2), and the mask (n,).
+        """
         pixels, distance = self.camera.project(points)
-        depth = self.camera.look_up(self.depth, pixels, -np.inf)
+        depth = self.camera.sample_image(self.depth, pixels, -np.inf)
         return pixels, distance <= depth + 2 * self.camera.footprint(distance)
 
-    def on_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Return pixel coordinates (n, 2) of points (n, 3) of the ground, and a visibility mask."""
+    def project_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
+        """Return the pixel coordinates of points on the ground, and a mask of the visible points.
+
+        The points have shape (n, 3), the pixel coordinates (n, 2), and the mask (n,).
+        """
         pixels, _ = self.camera.project(points)
         bare = (self.pixel_samples.triangle < 0).reshape(self.depth.shape)
-        return pixels, self.camera.look_up(bare, pixels, False)
+        return pixels, self.camera.sample_image(bare, pixels, False)
 
-    def runs(
+    def visible_segments(
         self, segments: Floats, is_visible: Callable[[Floats], tuple[Floats, Bools]]
     ) -> list[Floats]:
         """Split line segments (n, 2, 3) into their visible pieces.
 
-        `is_visible` returns the pixel coordinates of points, and a mask of visible points. Returns
-        the pixel coordinates (2, 2) of the ends of each piece.
+        `is_visible` returns the pixel coordinates of points and a visibility mask. The result
+        contains the pixel coordinates (2, 2) of the ends of each piece.
         """
-        # Steps of equal length in the picture: interpolate 1 / depth, which is linear there.
+        # Steps have equal lengths in the picture, where 1 / depth is linear.
         start_depth, stop_depth = (
             (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
         )
@@ -209,27 +228,33 @@ def take_shot(
     size: tuple[int, int] = SIZE,
     backend: str = "auto",
 ) -> SurfaceView:
-    """Look at a scene from a good viewpoint.
+    """Render the surfaces of a scene from an automatically chosen viewpoint.
 
-    The camera looks down from the side on which the scene is wider. If the sensors stand inside a
-    building, the walls and roofs in front of them are removed; a part of a large scene is cut open
-    above them.
+    The camera looks down from the side on which the scene is wider. If the sensors are inside a
+    building, the walls and roofs in front of them are removed. If only a part of a large scene is
+    shown, it is cut open above the sensors.
 
     Parameters
     ----------
     scene
         The scene.
     poses
-        (p, 3) sensor positions, world coordinates.
+        (p, 3) sensor positions, in world coordinates.
     paths
-        Trajectories of moving sensors, (k, 3) each, local coordinates.
+        Trajectories of moving sensors, (k, 3) each, in local coordinates.
     trajectories
-        Trajectories in a scene that may be much larger: only their surroundings are shown then,
-        and the caption says so.
+        Trajectories in local coordinates. If the scene is much larger than their surroundings, only
+        the surroundings are shown, and the caption says so.
     actors
-        Number of actors, the last objects of the scene.
-    caption, models
-        Captions: the number of sensors, by default, and the time; the models of the sensors.
+        Number of actors, which are the last objects of the scene.
+    caption
+        Caption of the picture, by default the number of sensors.
+    models
+        Sensor models, for a second caption.
+    size
+        Width and height of the picture in pixels.
+    backend
+        Backend of the ray caster.
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
     positions = np.concatenate([sensors, *paths])
@@ -241,7 +266,7 @@ def take_shot(
     camera = viewpoint.camera
     centers = _pixel_centers(size)
     inside = np.flatnonzero(_outline(stage, camera))
-    pixel_samples = viewpoint.sample(centers[inside]).scattered(inside, len(centers))
+    pixel_samples = viewpoint.sample(centers[inside]).scatter(inside, len(centers))
     light = viewpoint.light_map(pixel_samples)
     edges = np.flatnonzero(_edges(pixel_samples, opened.part.scene, camera))
     edge_pixels = (centers[edges, None] + _EDGE_OFFSETS).reshape(-1, 2)
@@ -265,18 +290,18 @@ def take_shot(
 
 
 class _OpenScene(NamedTuple):
-    """The part of a scene that is shown, cut open above sensors in a building."""
+    """The displayed part of a scene, cut open above sensors in a building."""
 
-    part: ShownPart
-    surface: Surface  # surface of the part
+    part: ScenePart
+    surface: RenderMesh  # surface of the part
     uncut: Scene  # the part before it was cut open
-    bounds: Floats  # (2, 3) of the part
+    bounds: Floats  # (2, 3) bounds of the part
     box: Floats | None  # (2, 3) around trajectories; None if all of the scene is shown
     cut_height: float | None  # None if the part is not cut open
 
     @property
     def remark(self) -> str:
-        """Remark on the shown part, for a caption, or no text if the scene is shown completely."""
+        """Remark on the displayed part for a caption; empty if the whole scene is shown."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)
@@ -289,44 +314,44 @@ class _OpenScene(NamedTuple):
 def _open_scene(
     scene: Scene, positions: Floats, trajectories: Sequence[Floats], backend: str
 ) -> _OpenScene:
-    """Choose the part of a scene around trajectories, and cut the roof off above sensors."""
+    """Select the part of a scene around trajectories, and remove the roof above the sensors."""
     box = surrounding_box(scene.bounds, trajectories)
-    part = ShownPart.from_scene(scene)
+    part = ScenePart.from_scene(scene)
     if box is not None:
         part = part.cut(box)
     bounds = part.scene.bounds
     gap = _OBJECT_GAP * float(np.linalg.norm(np.ptp(bounds, 0)))
     part = replace(part, scene=separate_objects(part.scene, part.scene.face_object, gap))
-    surface = Surface.from_scene(part.scene, backend)
+    surface = RenderMesh.from_scene(part.scene, backend)
     uncut = part.scene
     cut_height = None
     if box is not None and len(positions):
-        _, cut_height = floor_and_cut(part.scene, surface.caster, positions)
+        _, cut_height = floor_and_cut_heights(part.scene, surface.caster, positions)
     if cut_height is not None:
         bounds = bounds.clip(max=[np.inf, np.inf, cut_height])
         part = part.cut(bounds)
-        surface = Surface.from_scene(part.scene, backend)
+        surface = RenderMesh.from_scene(part.scene, backend)
     return _OpenScene(part, surface, uncut, bounds, box, cut_height)
 
 
 @dataclass(frozen=True, eq=False)
 class _Viewpoint:
-    """A camera that sees a scene through its cutaway."""
+    """A camera that views a scene through a cutaway."""
 
-    surface: Surface
+    surface: RenderMesh
     cutaway: Cutaway | None
     stage: PlotBox
     camera: Camera
-    reach: float  # meters; surfaces farther from a point cast no shadow
+    reach: float  # in meters; surfaces farther away cast no shadow on a point
 
-    def sample(self, pixels: Floats) -> Samples:
+    def sample(self, pixels: Floats) -> RaySamples:
         """Cast rays through pixel coordinates (n, 2).
 
-        The light of the samples is 1.
+        The light of the samples is set to 1.
         """
         eye = self.camera.eye
         directions = self.camera.rays(pixels)
-        distance, triangle, u, v = cast_through(self.surface, self.cutaway, eye, directions)
+        distance, triangle, u, v = cast_with_cutaway(self.surface, self.cutaway, eye, directions)
         normal = np.full((len(pixels), 3), np.nan, np.float32)
         hit = triangle >= 0
         normal[hit] = self.surface.normals(triangle[hit], u[hit], v[hit], directions[hit])
@@ -340,10 +365,10 @@ class _Viewpoint:
         position[triangle == SKY] = np.nan
         light = np.ones(len(pixels), np.float32)
         weights = np.stack([1 - u - v, u, v], axis=1).astype(np.float32)
-        return Samples(triangle, distance.astype(np.float32), position, normal, light, weights)
+        return RaySamples(triangle, distance.astype(np.float32), position, normal, light, weights)
 
-    def light_map(self, samples: Samples) -> LightMap:
-        """Compute the light at every second of the samples of all pixels."""
+    def light_map(self, samples: RaySamples) -> LightMap:
+        """Compute the light on a coarse grid of the samples of all pixels."""
         width, height = self.camera.size
         coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
         position = samples.position.reshape(height, width, 3)[coarse]
@@ -352,28 +377,28 @@ class _Viewpoint:
 
 
 def _choose_viewpoint(
-    surface: Surface, stage: PlotBox, positions: Floats, size: tuple[int, int], has_motion: bool
+    surface: RenderMesh, stage: PlotBox, positions: Floats, size: tuple[int, int], has_motion: bool
 ) -> _Viewpoint:
     """Place a camera, and remove the walls and roofs that hide sensors at positions (p, 3)."""
-    # Moving objects are on the ground, between other objects.
+    # Moving objects are on the ground between other objects, so the camera looks down more steeply.
     camera = _camera(stage, size, 48.0 if has_motion else 33.0)
     cutaway = plan_cutaway(surface, positions, camera.eye)
     if cutaway is None:
         return _Viewpoint(surface, None, stage, camera, np.inf)
-    # From higher up more of the floor is visible between objects.
+    # A higher camera sees more of the floor between objects.
     camera = _camera(stage, size, 42.0)
     cutaway = replace(cutaway, eye=camera.eye)
     return _Viewpoint(surface, cutaway, stage, camera, 0.15 * stage.size)
 
 
 def _pixel_centers(size: tuple[int, int]) -> Floats:
-    """Return the coordinates (pixels, 2) of the middles of all pixels."""
+    """Return the coordinates (pixels, 2) of all pixel centers."""
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     return np.asarray(grid.reshape(-1, 2) + 0.5)
 
 
-def _add_light(samples: Samples, pixels: Floats, light: LightMap) -> None:
+def _add_light(samples: RaySamples, pixels: Floats, light: LightMap) -> None:
     """Set the light of samples at pixel coordinates (n, 2)."""
     lit = np.flatnonzero(samples.triangle != SKY)
     is_ground = samples.triangle[lit] == GROUND
@@ -383,7 +408,7 @@ def _add_light(samples: Samples, pixels: Floats, light: LightMap) -> None:
 
 
 def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
-    """Choose the box to show: around the scene and the sensors close to the scene."""
+    """Return a plot box around the scene and the sensors close to it."""
     lower, upper = bounds
     reach = 2 * max(float(np.linalg.norm(upper - lower)), 1e-3)
     close_sensors = sensors[((sensors > lower - reach) & (sensors < upper + reach)).all(axis=1)]
@@ -392,18 +417,18 @@ def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
 
 
 def _camera(stage: PlotBox, size: tuple[int, int], elevation_deg: float) -> Camera:
-    """Look along the diagonal, so that the wider side of the stage runs across the picture."""
+    """Place a camera so that the wider side of the scene runs across the picture."""
     is_wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
     top = stage.corners.copy()
     top[:, 2] = stage.bounds[1, 2]
-    # The scene is inside the ground's margin, and so is its top.
+    # The scene does not extend into the margin of the ground.
     top[:, :2] = np.clip(top[:, :2], stage.bounds[0, :2], stage.bounds[1, :2])
     corners = np.concatenate([stage.corners, top])
     return fit_camera(corners, size, FRAME, -62.0 if is_wide else -28.0, elevation_deg)
 
 
 def _outline(stage: PlotBox, camera: Camera) -> Bools:
-    """Return a mask (pixels,) of the pixels that show the stage's box."""
+    """Return a mask (pixels,) of the pixels that show the plot box."""
     limits = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
     flat, _ = camera.project(list(product(*limits)))
     image = Image.new("1", camera.size)
@@ -414,7 +439,7 @@ def _outline(stage: PlotBox, camera: Camera) -> Bools:
 
 
 def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
-    """Return distances (n,), meters, from the eye to the ground along directions (n, 3)."""
+    """Return the distances (n,) in meters from the eye to the ground along directions (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]
         position = eye[:2] + distance[:, None] * directions[:, :2]
@@ -422,8 +447,8 @@ def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
     return np.where(inside & (distance > 0), distance, np.inf)
 
 
-def _edges(samples: Samples, scene: Scene, camera: Camera) -> Bools:
-    """Return a mask (pixels,) of pixels that show another surface than a neighbor."""
+def _edges(samples: RaySamples, scene: Scene, camera: Camera) -> Bools:
+    """Return a mask (pixels,) of the pixels whose surface differs from that of a neighbor."""
     width, height = camera.size
     kind = np.append(scene.face_object, [GROUND, SKY])[samples.triangle]
     number = np.arange(width * height).reshape(height, width)

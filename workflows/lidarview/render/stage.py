@@ -1,4 +1,4 @@
-"""The ground that a scene stands on: its rectangle, and round ticks along its edges."""
+"""Define the box around a scene: the ground below it, and round ticks along its axes."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 
-# Longer numbers are hard to read: coordinates with more digits are labeled from an offset.
+# Coordinates with more digits are hard to read, so they are labeled relative to an offset.
 MAX_DIGITS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """Ticks of an axis."""
+    """The ticks of an axis."""
 
     title: str  # name, offset of the labels, and unit
     ticks: Floats  # (n,) local meters; round numbers in world coordinates
-    labels: tuple[str, ...]  # world coordinates, less the offset in the title
+    labels: tuple[str, ...]  # world coordinates minus the offset in the title
 
 
 @dataclass(frozen=True, eq=False)
 class PlotBox:
-    """A box with round ticks on its axes, above a ground rectangle, in local meters."""
+    """A box above a rectangular ground, with ticks on its axes, in local coordinates."""
 
     bounds: Floats  # (2, 3) lowest and highest corner of the shown part
     ground: Floats  # (2, 2) lowest and highest corner of the ground
-    level: float  # height of the ground, a little under the lowest point
+    level: float  # height of the ground, slightly below the lowest point
     axes: tuple[Axis, Axis, Axis]
 
     @property
@@ -38,16 +38,19 @@ class PlotBox:
 
     @property
     def corners(self) -> Floats:
-        """Corners of the ground, anticlockwise from the lowest: (4, 3)."""
+        """Corners (4, 3) of the ground, counterclockwise from the lowest x and y."""
         (x0, y0), (x1, y1) = self.ground
         return np.array([[x, y, self.level] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
 
     @classmethod
     def from_bounds(cls, bounds: Floats, origin: Floats) -> PlotBox:
-        """Build the stage of a box (2, 3), local meters, which may be flat or a single point."""
+        """Build the plot box for local bounds (2, 3), which may be flat or a single point.
+
+        `origin` (3,) is the world position of the local origin.
+        """
         lower, upper = bounds
         widest = float((upper - lower).max()) or 1.0
-        # A flat or pointlike box gets some width, so that there is something to look at.
+        # Give a flat box or a single point some width, so that there is something to see.
         pad = np.maximum(np.array([0.15, 0.15, 0.0]) * widest - (upper - lower), 0) / 2
         lower = lower - pad
         upper = upper + pad
@@ -66,7 +69,7 @@ class PlotBox:
 
 
 def make_axis(name: str, lower: float, upper: float, step: float, origin: float) -> Axis:
-    """Place round ticks between `lower` and `upper`, which are local.
+    """Place ticks at round world coordinates between two local coordinates.
 
     World coordinates are local coordinates plus `origin`.
     """
@@ -88,7 +91,7 @@ def make_axis(name: str, lower: float, upper: float, step: float, origin: float)
 
 
 def nice_step(length: float) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten that is at least `length`.
+    """Return the smallest of 1, 2, and 5 times a power of ten that is at least `length`.
 
     Examples
     --------

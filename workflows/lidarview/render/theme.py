@@ -1,4 +1,4 @@
-"""Colors of the pictures."""
+"""Define the colors of all pictures."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ MUTED = "#5d6876"
 CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
 SENSOR = "#e0182d"
-RANGE_COLORS = "viridis_r"  # color map of range images: yellow is near
-VEIL = 0.085  # share of MUTED over the page: the ground in a rendered picture
-# In pictures within a page, the style of the page defines these colors.
+RANGE_COLORS = "viridis_r"  # colormap of range images; yellow is close
+VEIL = 0.085  # opacity of MUTED over the page, which is the color of the ground
+# In pictures within an HTML page, the style sheet of the page defines these colors.
 STYLED = {
     PAGE: "page", GROUND: "ground", LINE: "line", INK: "ink", MUTED: "muted", UNSEEN: "unseen",
     SENSOR: "sensor",
 }  # fmt: skip
 
-# Distinct even for most color-blind readers (after Paul Tol's "bright" and "muted" sets, 2021,
-# in an order that keeps neighbors apart).
+# Distinct even for most color-blind readers. The colors follow the "bright" and "muted" sets by
+# Paul Tol (2021), in an order that keeps neighbors distinct.
 OBJECT_COLORS = (
     "#4477aa", "#ee7733", "#44aa77", "#cc6677", "#66b8d9", "#ccaa33",
     "#8a63b0", "#997755", "#88aa44", "#cc77b8", "#336688", "#b0574f",
@@ -36,15 +36,15 @@ OBJECT_COLORS = (
 
 
 def rgb(color: str) -> Floats:
-    """Return a color as (3,) in 0 to 1."""
+    """Return a color as an array of shape (3,) with values from 0 to 1."""
     return np.array(to_rgb(color))
 
 
 def object_colors(count: int) -> Floats:
-    """Return the colors of `count` objects, (count, 3) in 0 to 1.
+    """Return distinct colors for objects, shape (count, 3), with values from 0 to 1.
 
-    The first twelve are a chosen set; further colors are spread over the hues by the golden angle,
-    with lightness in three steps.
+    The first twelve colors come from `OBJECT_COLORS`. Further colors are spread over the hues by
+    the golden angle, with three levels of lightness.
     """
     chosen = [to_rgb(color) for color in OBJECT_COLORS[:count]]
     further = [
@@ -54,6 +54,6 @@ def object_colors(count: int) -> Floats:
     return np.array(chosen + further, dtype=np.float64).reshape(count, 3)
 
 
-def mapped(name: str, fraction: ArrayLike) -> Floats:
-    """Return the colors (n, 3) of a matplotlib color map at fractions (n,) in 0 to 1."""
+def apply_colormap(name: str, fraction: ArrayLike) -> Floats:
+    """Return the colors (n, 3) of a Matplotlib colormap at fractions (n,) from 0 to 1."""
     return np.asarray(matplotlib.colormaps[name](np.asarray(fraction)), dtype=np.float64)[..., :3]

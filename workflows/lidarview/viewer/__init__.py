@@ -1,1 +1,1 @@
-"""The page of points in a browser, and the server of the page."""
+"""Show points on a browser page, and serve the page."""

@@ -1,8 +1,8 @@
-"""The HTTP server of pages: it checks requests by their headers, and holds few connections.
+"""Serve HTTP requests that pass a check of their headers, over a limited number of connections.
 
-A request is refused before its body is read, so that programs without the page's address cannot
-make the server keep what they send. Each request has to arrive within a time, and connections that
-wait for a request give way to new ones.
+A request is refused before its body is read, so programs that do not know the address of the page
+cannot make the server store data. Each request must arrive within a time limit. If too many
+connections are open, the oldest connection without a complete request is closed.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from tornado.web import Application
 
 MAX_BODY_BYTES = 4096  # our pages send no bodies
 MAX_CONNECTIONS = 64  # a browser opens six at a time
-REQUEST_WITHIN_S = 10.0  # limit for a request, after the connection or the last answer
-_MAX_BUFFER_BYTES = 256 << 10  # limit for the bytes of a connection: 64 kB of headers, and a body
-_PIECE = 1 << 16  # bytes that are read at a time of a request that is refused
-_MAX_DIGITS = 9  # digits of a Content-Length
+REQUEST_WITHIN_S = 10.0  # time limit for a request, from the connection or the last response
+_MAX_BUFFER_BYTES = 256 << 10  # buffer of a connection, for 64 kB of headers and a body
+_PIECE = 1 << 16  # bytes of a refused request that are read and discarded at a time
+_MAX_DIGITS = 9  # maximum number of digits in a Content-Length
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """An answer in place of the application's."""
+    """A response that the server sends instead of passing the request to the application."""
 
     status: HTTPStatus
     reason: str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
-# Returns the refusal of a request, or None for a request that the application answers.
+# Returns a refusal, or None to pass the request to the application.
 Check = Callable[[RequestStartLine, HTTPHeaders], Refusal | None]
 
 
 def guarded_server(application: Application, check: Check) -> HTTPServer:
-    """Return a server that hands requests to an application which a check lets pass."""
+    """Return a server that passes a request to the application only if `check` returns None."""
     server = _GuardedServer(
         application, max_body_size=MAX_BODY_BYTES, max_buffer_size=_MAX_BUFFER_BYTES
     )
@@ -58,20 +58,20 @@ def guarded_server(application: Application, check: Check) -> HTTPServer:
 
 
 class _GuardedServer(HTTPServer):
-    """Counts connections, and wraps the requests of each in `_GuardedRequest`."""
+    """An HTTP server that limits its connections and checks the headers of each request."""
 
     check: Check
 
     def initialize(self, *arguments: object, **options: object) -> None:
         super().initialize(*arguments, **options)  # type: ignore[arg-type]
         self._open: set[object] = set()
-        # {connection whose request has not fully arrived: its end}, the oldest first
+        # Time limits of the connections whose request is incomplete, the oldest first.
         self._unfinished: dict[object, asyncio.TimerHandle] = {}
 
     def start_request(
         self, server_conn: object, request_conn: HTTPConnection
     ) -> HTTPMessageDelegate:
-        """Return what a request is given to, which begins now."""
+        """Start the time limit of a request, and return the delegate that receives the request."""
         self._open.add(server_conn)
         stream = cast(HTTP1ServerConnection, server_conn).stream
         timer = asyncio.get_running_loop().call_later(REQUEST_WITHIN_S, stream.close)
@@ -89,7 +89,7 @@ class _GuardedServer(HTTPServer):
         )
 
     def on_close(self, server_conn: object) -> None:
-        """Forget a connection that has ended."""
+        """Forget a closed connection."""
         self._forget(server_conn)
         super().on_close(server_conn)
 
@@ -98,14 +98,14 @@ class _GuardedServer(HTTPServer):
         self._open.discard(server_conn)
 
     def _finish(self, server_conn: object) -> None:
-        """Take note that a request has arrived, or that its connection has ended."""
+        """Stop the time limit of a connection."""
         timer = self._unfinished.pop(server_conn, None)
         if timer is not None:
             timer.cancel()
 
 
 class _GuardedRequest(HTTPMessageDelegate):
-    """Hands a request to the application if the check lets the headers pass."""
+    """A request that is passed to the application once its headers have been checked."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class _GuardedRequest(HTTPMessageDelegate):
     def headers_received(
         self, start_line: RequestStartLine | ResponseStartLine, headers: HTTPHeaders
     ) -> Awaitable[None] | None:
-        """Check the headers, and refuse the request or hand it over."""
+        """Refuse the request, or start passing it to the application."""
         start_line = cast(RequestStartLine, start_line)
         refusal = self._check(start_line, headers) or _too_large(headers)
         if refusal is not None:
@@ -132,22 +132,22 @@ class _GuardedRequest(HTTPMessageDelegate):
         return self._request.headers_received(start_line, headers)
 
     def data_received(self, chunk: bytes) -> Awaitable[None] | None:
-        """Hand over a piece of the body."""
+        """Pass a part of the body to the application."""
         return self._request.data_received(chunk)
 
     def finish(self) -> None:
-        """Let the application answer."""
+        """Let the application answer the request."""
         self._finished()
         self._request.finish()
 
     def on_connection_close(self) -> None:
-        """Tell the application that the browser has left."""
+        """Notify the application that the client has disconnected."""
         if self._is_handed_over:
             self._request.on_connection_close()
 
 
 async def _refuse(stream: IOStream, refusal: Refusal, method: str) -> None:
-    """Send a refusal, and end the connection.
+    """Send a refusal and close the connection.
 
     Further data from the client is discarded until the client or the server closes the connection.
     Closing it earlier would reset the connection, and the client might lose the response.
@@ -166,7 +166,7 @@ async def _refuse(stream: IOStream, refusal: Refusal, method: str) -> None:
     lines = [f"HTTP/1.1 {refusal.status} {refusal.status.phrase}"]
     lines += [f"{name}: {value}" for name, value in headers.items()]
     head = "\r\n".join([*lines, "", ""]).encode()
-    with suppress(OSError):  # the client has gone, or the time is over
+    with suppress(OSError):  # the client has disconnected, or the time limit has passed
         await stream.write(head if method == "HEAD" else head + body)
         stream.socket.shutdown(socket.SHUT_WR)
         while True:
@@ -174,7 +174,7 @@ async def _refuse(stream: IOStream, refusal: Refusal, method: str) -> None:
 
 
 def _too_large(headers: HTTPHeaders) -> Refusal | None:
-    """Return the refusal of a body that is larger than any of our pages sends."""
+    """Return a refusal if the declared body is larger than `MAX_BODY_BYTES`."""
     size = headers.get("Content-Length", "0")
     is_number = size.isascii() and size.isdecimal()
     if is_number and (len(size) > _MAX_DIGITS or int(size) > MAX_BODY_BYTES):

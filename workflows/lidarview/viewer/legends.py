@@ -1,4 +1,4 @@
-"""Legends of colors: labels and scales."""
+"""Build the legends that the page shows for colors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ..render.coloring import (
     Coloring,
 )
 
-MAX_LABELS = 1000  # limit for a legend
+MAX_LABELS = 1000  # maximum number of labels in a legend
 
-Legend = dict[str, Any]  # JSON for the page: of `legend_of` or `scale_legend`
+Legend = dict[str, Any]  # sent to the page as JSON
 
 
-def legend_of(coloring: Coloring) -> Legend:
-    """Return the legend of colors: a scale with numbers, or labels with their values."""
+def make_legend(coloring: Coloring) -> Legend:
+    """Return the legend of a coloring: a scale with numbers, or labels with their values."""
     if coloring.name in (RGB.name, NORMALS.name):
         return scale_legend(coloring.meaning, (), np.empty((0, 3)))
     if coloring.limits is None:
@@ -39,7 +39,7 @@ def legend_of(coloring: Coloring) -> Legend:
     title += f": {coloring.meaning}" if coloring.meaning else ""
     if coloring.logarithmic:
         marks = [rounded(number, 2) for number in (lower, (lower * upper) ** 0.5, upper)]
-    else:  # the digits suit a bar of this span, without -0
+    else:  # as many digits as the span needs; adding 0.0 avoids "-0"
         digits = int(np.clip(np.ceil(1 - np.log10(upper - lower)), 0, 6)) if upper > lower else 2
         marks = [
             f"{round(number, digits) + 0.0:,.{digits}f}"
@@ -52,5 +52,8 @@ def legend_of(coloring: Coloring) -> Legend:
 
 
 def scale_legend(title: str, marks: Sequence[str], colors: Floats = TURBO[::15]) -> Legend:
-    """Return the legend of a scale of colors (n, 3), 0 to 1, with evenly spread marks."""
+    """Return the legend of a color scale with evenly spaced marks.
+
+    `colors` has shape (n, 3), with values from 0 to 1.
+    """
     return {"title": title, "marks": list(marks), "colors": as_bytes(colors).tolist()}

@@ -1,7 +1,8 @@
-"""Packs columns of points for a page in one file, so that they compress well.
+"""Pack point columns for a page in a single file, so that they compress well.
 
-A column becomes whole numbers, the differences of neighbors in zigzag (0, -1, 1, -2, …), and
-planes of their bytes, the lowest first. The module `ask.js` of the page unpacks them.
+The values of a column are mapped to integers. The differences between neighbors are zigzag-encoded
+(0, -1, 1, -2, … become 0, 1, 2, 3, …) and stored as byte planes, the lowest byte first. The page
+unpacks them in `ask.js`.
 """
 
 from __future__ import annotations
@@ -12,17 +13,18 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 
-_LEVELS = 4095  # levels of a column of fractions, besides NaN
-_LOGARITHMIC_RATIO = 100.0  # ratio of the largest to the smallest value; above, levels are of logs
-_MAX_CODE = 1 << 31  # limit for whole numbers that are packed exactly
-_STEPS = 50_000  # steps of a coordinate, over the length of the points
+_LEVELS = 4095  # levels of a floating-point column, in addition to NaN
+_LOGARITHMIC_RATIO = 100.0  # levels are logarithmic above this ratio of the largest to the smallest
+_MAX_CODE = 1 << 31  # integers up to this span are packed exactly
+_STEPS = 50_000  # steps along the longest side of the points
 
 
 class PackedColumn(NamedTuple):
-    """A column as planes of bytes, and how its values are computed.
+    """A column as byte planes, with the parameters to restore its values.
 
-    The value of a code is ``base + step * code``. With `fractions`, code 0 is NaN, and the value of
-    another is ``base + step * (code - 1)``; with `logarithmic`, its exponential.
+    The value of a code is ``base + step * code``. If `fractions` is set, code 0 is NaN and the
+    other values are ``base + step * (code - 1)``. If `logarithmic` is set as well, the result is
+    the natural logarithm of the value.
     """
 
     planes: Bytes  # (planes * n,)
@@ -33,7 +35,11 @@ class PackedColumn(NamedTuple):
 
 
 def pack_column(values: AnyArray) -> PackedColumn:
-    """Pack the values (n,) of a column: whole numbers exactly, fractions in 4,095 levels."""
+    """Pack the values (n,) of a column.
+
+    Integers are stored exactly unless their span exceeds 2**31. Floating-point values are quantized
+    to 4,095 levels.
+    """
     if not len(values):
         return PackedColumn(np.zeros(0, np.uint8), 0.0, 1.0)
     if values.dtype.kind in "iub":
@@ -41,7 +47,7 @@ def pack_column(values: AnyArray) -> PackedColumn:
         reach = int(values.max()) - lowest
         step = max(1, -(-reach // _MAX_CODE))
         codes = (values.astype(np.int64) - lowest) // step
-        return PackedColumn(planes_of(codes), float(lowest), float(step))
+        return PackedColumn(byte_planes(codes), float(lowest), float(step))
     finite = np.isfinite(values)
     numbers = values[finite].astype(np.float64)
     if not len(numbers):
@@ -59,12 +65,15 @@ def pack_column(values: AnyArray) -> PackedColumn:
     if finite.any():
         all_codes[finite] = 1 + np.round((scaled - base) / step_size).astype(np.int64)
     return PackedColumn(
-        planes_of(all_codes), float(base), step_size, fractions=True, logarithmic=logarithmic
+        byte_planes(all_codes), float(base), step_size, fractions=True, logarithmic=logarithmic
     )
 
 
 def pack_positions(positions: Floats) -> tuple[PackedColumn, PackedColumn, PackedColumn]:
-    """Pack positions (n, 3) in steps of a part in 50,000 of their length without outliers."""
+    """Pack the x, y, and z coordinates of positions (n, 3).
+
+    The step is 1/50,000 of the longest side of the points, ignoring outliers.
+    """
     if not len(positions):
         nothing = PackedColumn(np.zeros(0, np.uint8), 0.0, 1.0)
         return nothing, nothing, nothing
@@ -76,15 +85,15 @@ def pack_positions(positions: Floats) -> tuple[PackedColumn, PackedColumn, Packe
 
 def _pack_axis(values: Floats, step: float) -> PackedColumn:
     base = float(values.min())
-    return PackedColumn(planes_of(np.round((values - base) / step).astype(np.int64)), base, step)
+    return PackedColumn(byte_planes(np.round((values - base) / step).astype(np.int64)), base, step)
 
 
-def planes_of(codes: Ints) -> Bytes:
-    """Return the planes of bytes of the zigzag differences of codes (n,).
+def byte_planes(codes: Ints) -> Bytes:
+    """Return the byte planes of the zigzag-encoded differences between neighboring codes (n,).
 
     Examples
     --------
-    >>> planes_of(np.array([0, 3, 2, 300]))
+    >>> byte_planes(np.array([0, 3, 2, 300]))
     array([ 0,  6,  1, 84,  0,  0,  0,  2], dtype=uint8)
     """
     steps = np.diff(codes, prepend=0)

@@ -1,4 +1,4 @@
-"""Selects points of a cloud for a page: by scans, by columns, and for a camera."""
+"""Select points of a cloud for display: by scan, by column values, and for a camera."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ STATION = Column("station", "int64", "", "station from which the point was scann
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK_ROWS = 1 << 15  # rows that are read at a time
-_SAMPLE_POINTS = 200_000  # points for an estimate of the counts of tiles
+_SAMPLE_POINTS = 200_000  # points for estimating the number of points in each tile
 _TILE_COLUMNS = 48
 _TILE_ROWS = 27
-TILES = _TILE_COLUMNS * _TILE_ROWS  # parts of a picture
-_KEEP_SHARE = 0.8  # share of the points, each time there are too many
+TILES = _TILE_COLUMNS * _TILE_ROWS  # tiles of an image
+_KEEP_SHARE = 0.8  # share of the points that is kept whenever there are too many
 
 
-class HeldPoints:
+class InMemoryPoints:
     """Points in memory, in any order of their scans."""
 
     def __init__(self, cloud: Cloud) -> None:
@@ -39,24 +39,27 @@ class HeldPoints:
         return len(self._cloud)
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at rows.
+        """Return the values of a column at selected rows.
 
-        Columns x, y and z are world coordinates.
+        The columns x, y, and z are world coordinates.
         """
         if name in AXES:
             return np.asarray(self._cloud.positions[row_selection, AXES.index(name)])
         return self._cloud[name][row_selection]
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return all rows."""
+        """Return the range of all rows, because the scans are in no particular order."""
         return 0, len(self)
 
 
-class OrderedPoints(HeldPoints):
-    """All points of a recording in memory, in the order of their scans."""
+class ScanOrderedPoints(InMemoryPoints):
+    """Points in memory, in the order of their scans."""
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the first row of a range of scans, and one past its last row."""
+        """Return the range of rows, start and stop, that contains the scans from first to last.
+
+        Without a scan column, the range contains all rows.
+        """
         if "scan" not in self._cloud.columns:
             return super().rows_of(scans)
         first, last = scans
@@ -66,13 +69,17 @@ class OrderedPoints(HeldPoints):
 
 
 class JoinedPoints:
-    """Points of several results in turn, with the columns that all results have."""
+    """The concatenated points of several results, with the columns that all results share.
+
+    The column `RESULT` is added.
+    """
 
     table: tuple[Column, ...]
 
     def __init__(self, results: Sequence[Points]) -> None:
-        self._firsts = np.cumsum([0, *map(len, results)])  # rows; the last is one past all
-        # [(row of the first point, points of a result)]
+        # First row of each result, followed by the total number of rows
+        self._firsts = np.cumsum([0, *map(len, results)])
+        # (first row, points) of each result
         self.results = [*zip(self._firsts[:-1].tolist(), results, strict=True)]
         shared = set.intersection(*({column.name for column in result.table} for result in results))
         self.table = (*(entry for entry in results[0].table if entry.name in shared), RESULT)
@@ -81,9 +88,9 @@ class JoinedPoints:
         return int(self._firsts[-1])
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at ascending rows.
+        """Return the values of a column at selected rows, which must be in ascending order.
 
-        Columns x, y and z are world coordinates.
+        The columns x, y, and z are world coordinates.
         """
         if isinstance(row_selection, slice):
             row_selection = np.arange(*row_selection.indices(len(self)))
@@ -98,22 +105,22 @@ class JoinedPoints:
 
 @dataclass(frozen=True, eq=False)
 class StationPoints:
-    """Points with a further column, the station from which each point was scanned."""
+    """Points with an additional column: the station from which each point was scanned."""
 
-    points: CloudFile | HeldPoints | JoinedPoints
-    scans: Ints  # (n,): first scan of each sweep, ascending
-    stations: Ints  # (n,): station of each sweep
+    points: CloudFile | InMemoryPoints | JoinedPoints
+    scans: Ints  # (n,) first scan of each sweep, ascending
+    stations: Ints  # (n,) station of each sweep
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """Columns beside the positions."""
+        """Columns in addition to the positions."""
         return (*self.points.table, STATION)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at rows, as the points without the column do."""
+        """Return the values of a column at selected rows."""
         if name != STATION.name:
             return self.points.values(name, row_selection)
         scans = self.points.values("scan", row_selection)
@@ -121,11 +128,11 @@ class StationPoints:
         return np.asarray(self.stations[np.maximum(sweep, 0)])
 
 
-Points = CloudFile | HeldPoints | JoinedPoints | StationPoints
+Points = CloudFile | InMemoryPoints | JoinedPoints | StationPoints
 
 
 def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
-    """Return the ranges of rows, start and stop, that contain ranges of scans."""
+    """Return the ranges of rows, start and stop, that contain the given ranges of scans."""
     if isinstance(points, StationPoints):
         return _row_ranges(points.points, scans)
     if isinstance(points, JoinedPoints):
@@ -138,31 +145,42 @@ def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Filter:
-    """Filter: points whose columns are within limits, (column, lowest, highest) each.
+class PointFilter:
+    """A filter that keeps points whose column values are within limits.
 
-    Limits of one column are joined when a filter is read, so that a long filter takes no longer
-    than one limit of each column. `hidden` are values of columns that are left out.
+    Several limits on a column are combined when a filter is parsed, so a long filter takes no
+    longer to apply than a single limit per column.
+
+    Attributes
+    ----------
+    limits
+        (column, lowest, highest) for each limited column, inclusive.
+    hidden
+        (column, values) for each column with excluded values.
     """
 
     limits: tuple[tuple[str, float, float], ...] = ()
     hidden: tuple[tuple[str, tuple[float, ...]], ...] = ()  # (column, values)
 
     @classmethod
-    def read(cls, text: str, names: Sequence[str]) -> Filter:
-        """Read limits of known columns from an address, such as ``column,lowest,highest``.
+    def parse(cls, text: str, names: Sequence[str]) -> PointFilter:
+        """Parse a filter from the query of a URL.
 
-        Semicolons separate the columns.
+        The entries are separated by semicolons. ``column,lowest,highest`` limits a column, and
+        ``!column,value,value`` excludes a value, which is written twice. Columns that are not in
+        `names` are ignored.
 
-        An entry ``!column,value,value`` leaves a value out. `names` are the known columns.
-        ValueError if a limit is not a number.
+        Raises
+        ------
+        ValueError
+            If a limit is not a number.
 
         Examples
         --------
-        >>> Filter.read("z,0,1.5;what,1,2", ["z"])
-        Filter(limits=(('z', 0.0, 1.5),), hidden=())
-        >>> Filter.read("z,0,1.5;z,1,2;!class,3,3", ["z", "class"])
-        Filter(limits=(('z', 1.0, 1.5),), hidden=(('class', (3.0,)),))
+        >>> PointFilter.parse("z,0,1.5;what,1,2", ["z"])
+        PointFilter(limits=(('z', 0.0, 1.5),), hidden=())
+        >>> PointFilter.parse("z,0,1.5;z,1,2;!class,3,3", ["z", "class"])
+        PointFilter(limits=(('z', 1.0, 1.5),), hidden=(('class', (3.0,)),))
         """
         hidden = dict[str, set[float]]()
         limits = dict[str, tuple[float, float]]()
@@ -181,15 +199,15 @@ class Filter:
             tuple((name, tuple(sorted(hidden[name]))) for name in hidden if name in names),
         )
 
-    def without(self, column: str) -> Filter:
-        """Return the filter without what concerns a column."""
-        return Filter(
+    def without_column(self, column: str) -> PointFilter:
+        """Return the filter without the limits and excluded values of a column."""
+        return PointFilter(
             tuple(limit for limit in self.limits if limit[0] != column),
             tuple(values for values in self.hidden if values[0] != column),
         )
 
-    def keeps(self, points: Points, row_selection: Ints | slice) -> Bools:
-        """Return a mask (n,) of the points at rows that are within all limits."""
+    def mask(self, points: Points, row_selection: Ints | slice) -> Bools:
+        """Return a mask (n,) of the selected rows with finite positions that pass the filter."""
         x, y, z = (points.values(axis, row_selection) for axis in AXES)
         is_kept = np.asarray(np.isfinite(x + y + z))
         for name, lower, upper in self.limits:
@@ -200,16 +218,17 @@ class Filter:
         return is_kept
 
 
-def read_scans(text: str) -> ScanRanges:
-    """Read ranges of scans from an address, ``first-last,…``.
+def parse_scans(text: str) -> ScanRanges:
+    """Parse ranges of scans in the query of a URL, such as ``4-6,0-1``, and merge adjacent ranges.
 
-    Ranges that touch are joined.
-
-    ValueError if the text is not such a list.
+    Raises
+    ------
+    ValueError
+        If the text is not a list of ranges.
 
     Examples
     --------
-    >>> read_scans("4-6,0-1,5-9,2-2")
+    >>> parse_scans("4-6,0-1,5-9,2-2")
     ((0, 2), (4, 9))
     """
     ranges: list[tuple[int, int]] = []
@@ -223,28 +242,37 @@ def read_scans(text: str) -> ScanRanges:
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """Camera of a browser: the matrix (4, 4) from local coordinates to clip coordinates."""
+class BrowserCamera:
+    """The camera of a page: a matrix (4, 4) from local coordinates to clip coordinates."""
 
     matrix: Floats
 
     @classmethod
-    def read(cls, text: str) -> Eye:
-        """Read 16 numbers in the order of WebGL, column by column, else raise ValueError."""
+    def parse(cls, text: str) -> BrowserCamera:
+        """Parse 16 numbers in the column-major order of WebGL.
+
+        Raises
+        ------
+        ValueError
+            If the text does not consist of 16 numbers.
+        """
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
-        """Project points (n, 3) to the picture, (n, 2) in -1 to 1, with a visibility mask."""
+        """Project points (n, 3) to image coordinates from -1 to 1.
+
+        Returns the coordinates (n, 2), and a mask (n,) of the points inside the image.
+        """
         x, y, z, w = self._clip(points)
         inside = (np.abs(x) < w) & (np.abs(y) < w) & (z > -w)
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
     def _clip(self, points: AnyFloats) -> AnyFloats:
-        """Return points (n, 3) in clip coordinates, (4, n)."""
+        """Return the clip coordinates (4, n) of points (n, 3)."""
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:
-        """Return the tile (n,) of the picture that each point (n, 3) is in, or -1 outside."""
+        """Return the image tile (n,) of each point (n, 3), or -1 for points outside the image."""
         projected, inside = self.project(points)
         x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
         column = (x_share * _TILE_COLUMNS).astype(np.int64)
@@ -252,45 +280,52 @@ class Eye:
         return np.where(inside, row * _TILE_COLUMNS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
-        """Return True if a box (2, 3) may be partly in the picture."""
-        x, y, z, w = self._clip(corners_of(box))
+        """Return False if a box (2, 3) is certainly outside the image."""
+        x, y, z, w = self._clip(box_corners(box))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
 
 
-def corners_of(box: Floats) -> Floats:
+def box_corners(box: Floats) -> Floats:
     """Return the corners (8, 3) of a box (2, 3)."""
     return np.array(list(itertools.product(*box.T)))
 
 
 def even_shares(counts: AnyArray, max_points: int) -> Floats:
-    """Return the share (t,) of points that each tile shows, the same number of points in each.
+    """Return the share of points to show in each tile so that all tiles show equally many.
 
-    `counts` (t,) are the points of the tiles. A tile with fewer points shows all its points; all
-    tiles together show `max_points`.
+    Tiles with fewer points show all of them. All tiles together show `max_points`. `counts` and the
+    shares have shape (t,).
     """
     ordered = np.sort(counts)
-    # All points of smaller tiles, and equally many points of each further tile.
+    # All points of the smaller tiles, and equally many points of each larger tile.
     shares = (max_points - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
     level = shares[(shares <= ordered).argmax()] if ordered.sum() > max_points else np.inf
     return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
-def positions(points: Points, row_selection: Ints | slice) -> Floats:
-    """Return the positions at rows, float64 (n, 3), world coordinates, meters."""
-    # The matrix product of a camera is fastest on contiguous columns.
+def read_positions(points: Points, row_selection: Ints | slice) -> Floats:
+    """Return the positions (n, 3) at selected rows, float64, in world coordinates."""
+    # The matrix product in a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 
 
-class Abandoned(Exception):  # noqa: N818 - no error: nobody waits for the answer any more
-    """Raised when nobody waits for an answer any more."""
+class ClientDisconnected(Exception):  # noqa: N818 - not an error
+    """Raised when the client that requested an answer has disconnected."""
 
 
 class PointFinder:
-    """Selects points of a cloud.
+    """Finds points of a cloud that pass a filter.
 
-    The finder remembers the bounding boxes of blocks that were read, 48 bytes each: 150 kB for a
-    hundred million points. `origin` is the world position of the local origin, (3,).
+    The finder stores the bounding boxes of the blocks that it has read, which takes 48 bytes per
+    block, or 150 kB for a hundred million points.
+
+    Parameters
+    ----------
+    points
+        The points.
+    origin
+        (3,) world position of the local origin.
     """
 
     def __init__(self, points: Points, origin: Floats) -> None:
@@ -303,67 +338,85 @@ class PointFinder:
     def find(
         self,
         max_points: int,
-        point_filter: Filter = Filter(),
+        point_filter: PointFilter = PointFilter(),
         scans: ScanRanges | None = None,
-        eye: Eye | None = None,
-        abandoned: Callable[[], bool] = lambda: False,
+        camera: BrowserCamera | None = None,
+        is_disconnected: Callable[[], bool] = lambda: False,
     ) -> tuple[Ints, int]:
-        """Find at most `max_points` points that pass a filter, in order.
+        """Find at most `max_points` points that pass a filter.
 
-        The points are evenly spaced in the file; with an eye, all are in its picture and evenly
-        spaced there. `abandoned` is called now and then; once it returns True, nobody waits for the
-        answer.
+        Without a camera, the points are evenly spaced in the file. With a camera, all points are
+        inside its image and are evenly spaced there.
+
+        Parameters
+        ----------
+        max_points
+            Maximum number of points.
+        point_filter
+            The filter.
+        scans
+            Ranges of scans, or None for all.
+        camera
+            The camera, or None.
+        is_disconnected
+            Called from time to time. If it returns True, the search ends.
 
         Returns
         -------
         rows
-            int64 (k,), ascending.
+            (k,) row indices, int64, ascending.
         count
-            Number of points that pass the filter, also outside the picture.
+            Number of points that pass the filter, including those outside the image.
 
         Raises
         ------
-        Abandoned
-            If nobody waits for the answer.
+        ClientDisconnected
+            If `is_disconnected` has returned True.
         """
-        ranges = [(0, len(self.points))]  # ranges of rows, first and after the last
+        ranges = [(0, len(self.points))]  # ranges of rows, start and stop
         if scans is not None:
             ranges = _row_ranges(self.points, scans)
         total = sum(stop - start for start, stop in ranges)
-        if point_filter == Filter() and (eye is None or total <= max_points):
+        if point_filter == PointFilter() and (camera is None or total <= max_points):
             numbers = even_indices(total, max_points)
             offsets = np.cumsum([0, *(stop - start for start, stop in ranges)])[:-1]
             part = np.searchsorted(offsets, numbers, "right") - 1
             rows = numbers + (np.array([start for start, _ in ranges], np.int64) - offsets)[part]
-            return rows[point_filter.keeps(self.points, rows)], total
-        if eye is None:
-            return self._search(ranges, max_points, point_filter, abandoned)
-        sample, count = self.find(_SAMPLE_POINTS, point_filter, scans, None, abandoned)
-        tiles = eye.tiles(self._local(sample))
+            return rows[point_filter.mask(self.points, rows)], total
+        if camera is None:
+            return self._search(ranges, max_points, point_filter, is_disconnected)
+        sample, count = self.find(_SAMPLE_POINTS, point_filter, scans, None, is_disconnected)
+        tiles = camera.tiles(self._local(sample))
         counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(sample), 1))
         if counts.sum() == 0:  # the sample may have missed rare points
             counts += 1
         rows, _ = self._search(
-            ranges, max_points, point_filter, abandoned, eye, even_shares(counts, max_points)
+            ranges,
+            max_points,
+            point_filter,
+            is_disconnected,
+            camera,
+            even_shares(counts, max_points),
         )
         return rows, count
 
     def _local(self, row_selection: Ints | slice) -> Floats:
-        return positions(self.points, row_selection) - self._origin
+        return read_positions(self.points, row_selection) - self._origin
 
     def _search(
         self,
         ranges: Sequence[tuple[int, int]],
         max_points: int,
-        point_filter: Filter,
-        abandoned: Callable[[], bool],
-        eye: Eye | None = None,
+        point_filter: PointFilter,
+        is_disconnected: Callable[[], bool],
+        camera: BrowserCamera | None = None,
         shares: Floats | None = None,
     ) -> tuple[Ints, int]:
-        """Read blocks in turn, and thin the points out while there are too many.
+        """Read blocks one after another, and thin out the points whenever there are too many.
 
-        Arguments and results are as in `find`, with ranges of rows (start, stop), and the shares
-        (tiles,) of the points that are kept in each tile of the eye's picture.
+        `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the shares of points to
+        keep in each tile of the camera's image. The other parameters and the results are the same
+        as in `find`.
         """
         random = np.random.default_rng(0)
         thin = 1.0
@@ -371,25 +424,25 @@ class PointFinder:
         chunks = [np.empty(0, np.int64)]
         for start, stop in ranges:
             for block in range(start // BLOCK_ROWS, -(-stop // BLOCK_ROWS)):
-                if abandoned():
-                    raise Abandoned
+                if is_disconnected():
+                    raise ClientDisconnected
                 first = max(start, block * BLOCK_ROWS)
                 last = min(stop, (block + 1) * BLOCK_ROWS)
                 box = self._boxes[block]
                 is_read = not np.isnan(box[0, 0])
-                if eye is not None and is_read and not eye.may_see(box):
+                if camera is not None and is_read and not camera.may_see(box):
                     continue
-                rows = first + np.flatnonzero(point_filter.keeps(self.points, slice(first, last)))
+                rows = first + np.flatnonzero(point_filter.mask(self.points, slice(first, last)))
                 count += len(rows)
                 share = np.full(len(rows), thin)
-                if eye is not None and shares is not None and len(rows):
+                if camera is not None and shares is not None and len(rows):
                     local = self._local(rows)
                     is_whole_block = len(rows) == min(
                         BLOCK_ROWS, len(self.points) - block * BLOCK_ROWS
                     )
                     if is_whole_block and not is_read:
                         box[:] = local.min(axis=0), local.max(axis=0)
-                    tiles = eye.tiles(local)
+                    tiles = camera.tiles(local)
                     share *= np.where(tiles >= 0, shares[tiles], 0.0)
                 chunks.append(rows[random.random(len(rows)) < share])
                 while sum(map(len, chunks)) > max_points:

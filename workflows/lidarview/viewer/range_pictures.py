@@ -1,4 +1,4 @@
-"""Range images of single sweeps, as pictures."""
+"""Draw range images of single sweeps."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ import numpy as np
 from lidarsim.base.arrays import Bytes, Floats, Ints
 from lidarsim.scene.colors import as_bytes
 
-from ..render.theme import RANGE_COLORS, mapped
+from ..render.theme import RANGE_COLORS, apply_colormap
 
-_IMAGE_WIDTH = 1024  # most columns of a range image
+_IMAGE_WIDTH = 1024  # maximum number of columns
 
-_IMAGE_ROWS = 128  # rows of a range image, unless its rows are channels
+_IMAGE_ROWS = 128  # number of rows unless rows are channels
 
-_COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
+_COLUMN_SHARE = 0.9  # number of columns as a share of the sensor's azimuth steps
 
-_MIN_CHANNELS = 4  # least channels of a sensor whose channels are the rows of a range image
+# A sensor with fewer or more channels gets elevation steps as rows.
+_MIN_CHANNELS = 4
 
-_MAX_CHANNELS = 512  # likewise
+_MAX_CHANNELS = 512
 
-_MAX_DOWNWARD_SINE = -0.7  # sine of the median elevation; below, the sensor looks down
+# A sensor looks down if the sine of its median elevation is below this value.
+_MAX_DOWNWARD_SINE = -0.7
 
 _MAX_FIELD_RAD = math.radians(300)  # a wider field of view is shown as 360°
 
@@ -29,15 +31,28 @@ _MAX_FIELD_RAD = math.radians(300)  # a wider field of view is shown as 360°
 def range_image(
     points: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
 ) -> Bytes:
-    """Return a range image of points, RGBA (rows, columns, 4).
+    """Draw a range image of a sweep.
 
-    `points` (n, 3) are in the sensor frame, `ranges` (n,) their distances from the sensor, meters;
-    `channels` (n,) are None if unknown; `limits` are the ranges at the ends of the color scale.
+    Rows are channels, the highest at the top. If the sensor has fewer than four or more than 512
+    channels, or if the channels are unknown, rows are elevation steps instead. Columns are azimuth
+    steps from left to right. For a sensor that looks down, the image has a single row of angles
+    across the trajectory. If several points fall into a pixel, the nearest is shown. Empty pixels
+    are transparent.
 
-    Of several points in a pixel the nearest is shown. Rows are channels, the highest above, or
-    steps of elevation if the sensor has few or very many channels. Columns are steps of azimuth
-    from left to right. A sensor that looks down has a single row, of angles across its trajectory.
-    Empty pixels are transparent.
+    Parameters
+    ----------
+    points
+        (n, 3) positions in the sensor frame, in meters.
+    ranges
+        (n,) distances from the sensor, in meters.
+    channels
+        (n,) channel numbers, or None if unknown.
+    limits
+        Ranges at the ends of the color scale, in meters.
+
+    Returns
+    -------
+    RGBA image, uint8, of shape (rows, columns, 4).
     """
     looks_down = float(np.median(points[:, 2] / np.maximum(ranges, 1e-9))) < _MAX_DOWNWARD_SINE
     azimuth = np.arctan2(points[:, 1], -points[:, 2] if looks_down else points[:, 0])
@@ -53,18 +68,18 @@ def range_image(
     else:
         row, row_count = _image_rows(points, ranges, channels)
     fullest_row_azimuth = azimuth[row == np.bincount(row).argmax()]
-    # Mean step of azimuth in the row with the most points; columns are a little wider.
+    # Mean azimuth step in the row with the most points. Columns are a little wider.
     spacing_rad = float(np.ptp(fullest_row_azimuth)) / len(fullest_row_azimuth)
     width = int(np.clip(_COLUMN_SHARE * field_rad / max(spacing_rad, 1e-9), 32, _IMAGE_WIDTH))
     column = ((left_rad - azimuth) * (width / max(field_rad, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
-    order = np.argsort(-ranges, kind="stable")  # the nearest is written last
+    order = np.argsort(-ranges, kind="stable")  # the nearest point is written last
     image[row[order], np.minimum(column, width - 1)[order]] = _range_colors(ranges, limits)[order]
     return image
 
 
 def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
-    """Return the rows (n,) of points in a range image, 0 at the top, and the number of rows."""
+    """Return the row of each point in a range image, from the top, and the number of rows."""
     if channels is not None:
         count = int(channels.max()) + 1
         if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
@@ -76,15 +91,18 @@ def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[
 
 
 def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
-    """Return the colors (n, 4) of ranges (n,) between limits."""
+    """Return the RGBA colors (n, 4) of ranges (n,), clipped to the limits."""
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
     colors = np.full((len(ranges), 4), 255, np.uint8)
-    colors[:, :3] = as_bytes(mapped(RANGE_COLORS, shade))
+    colors[:, :3] = as_bytes(apply_colormap(RANGE_COLORS, shade))
     return colors
 
 
-def are_around(sensors: Floats, bounds: Floats) -> bool:
-    """Return True if all sensors (n, 3), n > 1, are beside or above an object's bounds (2, 3)."""
+def surround_object(sensors: Floats, bounds: Floats) -> bool:
+    """Return True if there are several sensors, all beside or above the bounds of an object.
+
+    `sensors` has shape (n, 3) and `bounds` (2, 3).
+    """
     outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
     return len(sensors) > 1 and bool(outside.all())

@@ -1,4 +1,4 @@
-"""Views of results: opened, joined, and served until an interrupt."""
+"""Open results, combine them into a view, and serve the view until an interrupt."""
 
 from __future__ import annotations
 
@@ -23,56 +23,64 @@ from ..picture_file import (
 from .point_selection import (
     JoinedPoints,
 )
-from .server import PORT, PageServer, announced, page_server
-from .view import CLOUD, IN_SENSOR_AXES, Downloads, GrowingView, View
+from .server import PORT, PageServer, announce_page, page_server
+from .view import CLOUD, IN_SENSOR_AXES, DownloadFormats, ProgressiveView, View
 
 
 @contextmanager
 def result_page(
-    view: View | GrowingView, *, port: int = PORT, browser: bool = True
+    view: View | ProgressiveView, *, port: int = PORT, browser: bool = True
 ) -> Iterator[PageServer]:
-    """Serve the page of a result while the body runs, and announce its address."""
-    count = view.total if isinstance(view, GrowingView) else len(view.points)
+    """Serve a view while the body runs, and announce its address."""
+    count = view.total if isinstance(view, ProgressiveView) else len(view.points)
     shows = f"shows {plural(count, 'point')}"
     shows += "" if cell_display() else ". Press Ctrl-C to stop."
     with (
         page_server(view.answer, port) as page,
-        announced(page, f"{page.url} {shows}", browser, on_stdout=True),
+        announce_page(page, f"{page.url} {shows}", browser, on_stdout=True),
     ):
         yield page
 
 
 def wait_for_interrupt(stopped: Event | None = None) -> None:
-    """Keep a page open until Ctrl-C, or until its user stops the page."""
+    """Wait until the user presses Ctrl-C or until `stopped` is set."""
     stopped = stopped or Event()
     with suppress(KeyboardInterrupt):
-        while not stopped.wait(0.2):  # Ctrl-C does not end an unlimited wait everywhere
+        # On some platforms, Ctrl-C does not interrupt a wait without a timeout.
+        while not stopped.wait(0.2):
             pass
 
 
-def show_view(view: View | GrowingView, *, port: int, browser: bool = True) -> None:
-    """Show a view in the browser until Ctrl-C."""
+def show_view(view: View | ProgressiveView, *, port: int, browser: bool = True) -> None:
+    """Serve a view until the user presses Ctrl-C."""
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     with result_page(view, port=port, browser=browser):
         wait_for_interrupt()
 
 
-def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
-    """Open results of surveys of the same scene as a view of all their points.
+def open_results(paths: Sequence[Path], downloads: DownloadFormats | None = None) -> View:
+    """Open the results of surveys of the same scene as a single view.
 
-    The scene, sensors and actors come from the first result.
+    The scene, the sensors, and the actors come from the first result. The view can be played over
+    time if the sweeps of all results start at the same times.
 
-    The view can be played if the sweeps of all results start at the same times. LidarError if a
-    result has no cloud, a damaged cloud, or points in the frames of the sensors.
+    Raises
+    ------
+    LidarError
+        If a result has no cloud, its cloud is damaged, or, with several results, its points are in
+        sensor coordinates.
     """
     return join_views(paths, [open_result(path, downloads) for path in paths], downloads)
 
 
 def join_views(
-    paths: Sequence[Path], views: Sequence[View], downloads: Downloads | None = None
+    paths: Sequence[Path], views: Sequence[View], downloads: DownloadFormats | None = None
 ) -> View:
-    """Return a view of all points of the views of results (`open_results`)."""
+    """Combine the views of several results, as `open_results` does.
+
+    `paths` are the results of the views. Messages and labels use their names.
+    """
     first, *other_views = views
     if not other_views:
         return first
@@ -104,10 +112,15 @@ def join_views(
     )
 
 
-def open_result(path: Path, downloads: Downloads | None = None) -> View:
-    """Open a cloud or the folder of a result, with its scene and sweeps if they are in the folder.
+def open_result(path: Path, downloads: DownloadFormats | None = None) -> View:
+    """Open a point cloud file, or a result folder with its scene and sweeps.
 
-    A scene or sweeps that cannot be read are noted only. LidarError for a missing or damaged cloud.
+    If the scene or the sweeps of a folder cannot be read, the view gets a note and omits them.
+
+    Raises
+    ------
+    LidarError
+        If the cloud is missing or damaged.
     """
     if not path.exists():
         raise MissingFileError(

@@ -1,10 +1,10 @@
-"""Serves a page to browsers of this machine: files, and answers to the questions of the page.
+"""Serve a page to browsers on this machine.
 
-The page asks with GET and gives orders with POST. Its address holds a random token; other addresses
-are answered with 404, so that no website, and no user of the machine who does not know the token,
-sees the page or gives orders. Requests of other websites are refused, whatever they know; only
-links to the page are followed. All addresses within the page are relative, so that the page also
-works behind a proxy.
+The page sends GET requests for files and data, and POST requests for commands. Its URL contains a
+random token; all other URLs return status 404. Websites, and other users of the machine who do not
+know the token, can therefore neither see the page nor send commands. Requests from other websites
+are always refused, except links to the page. All URLs within the page are relative, so the page
+also works behind a proxy.
 """
 
 from __future__ import annotations
@@ -38,49 +38,50 @@ from lidarsim.base.notebook import cell_display
 from lidarsim.base.other_sites import names_of_machine, refusal
 
 from .guarded_server import Refusal, guarded_server
-from .point_selection import Abandoned
+from .point_selection import ClientDisconnected
 
 HOST = "127.0.0.1"
-PORT = 8080  # or the next that is free
+PORT = 8080  # default; the next free port is used if it is taken
 VIEWER = "index.html"
 _PORTS_TRIED = 100
 
-_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable of a hub's kernels: the user's path
+_HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable with the path of a JupyterHub user
 
-MAX_SLOW = 2  # slow answers of a kind that are computed or sent at a time
-MAX_WAITING = 16  # slow questions of a kind that wait; further questions get status 503
-LARGE_POINTS = 1_000_000  # an answer of more points is large
-LONG_TEXT = 1_000  # letters: a question for points of longer lists is slow
-STALL_S = 20.0  # without a byte that the browser reads; then its connection is closed
+MAX_SLOW = 2  # slow requests of a kind that are answered at a time
+MAX_WAITING = 16  # slow requests of a kind that may wait; further requests get status 503
+LARGE_POINTS = 1_000_000  # an answer with more points is large
+LONG_TEXT = 1_000  # a request is slow if its list of scans has more characters
+STALL_S = 20.0  # a connection is closed if the client reads nothing for this time
 
-_ALIGNED = 8  # bytes, that arrays begin at multiples of
+_ALIGNED = 8  # alignment of the arrays in an answer, in bytes
 _PIECE = 1 << 20  # bytes that are written at a time
 
-# What a page may load: files and answers of this server, and pictures and downloads that the page
-# itself makes. No inline script, style or handler of events is allowed. A list of jobs frames the
-# viewers of its jobs.
+# A page may load files and data from this server, and images and downloads that the page itself
+# creates. Inline scripts, styles, and event handlers are not allowed. The job list shows the
+# viewers of its jobs in frames.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'"
 )
-_FRAMES = "; frame-ancestors 'self'"  # pages that may frame a page
+_FRAMES = "; frame-ancestors 'self'"  # only pages of this server may show a page in a frame
 
 _LOGGER = logging.getLogger(__name__)
 
 Arguments = Mapping[str, str]
-Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # content of the JSON text, and arrays
+Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # header, sent as JSON, and arrays by name
 
 
-# Answers a question with its arguments: KeyError or ValueError for an unknown question or a wrong
-# argument, Abandoned once the function (the last argument) says that nobody waits.
-Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
+# Answers a request, given its name, its arguments, and a function that returns True once the client
+# has disconnected. Raises KeyError or ValueError for an invalid request, and ClientDisconnected.
+AnswerSource = Callable[[str, Arguments, Callable[[], bool]], Answer]
 
 
-def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes]:
-    """Write JSON and arrays as a single message.
+def pack_answer(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes]:
+    """Pack a header and arrays into a single message.
 
-    The message starts with the length of the JSON text, uint32. The text lists the arrays: name,
-    type, shape, and first byte after the text. All numbers are little-endian.
+    The message starts with the length of the JSON text as uint32. The text contains the header and,
+    for each array, its name, data type, shape, and byte offset after the text. All numbers are
+    little-endian.
     """
     listed: list[Any] = []
     pieces: list[bytes] = []
@@ -97,26 +98,27 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes
 
 
 def is_large(question: str, arguments: Arguments) -> bool:
-    """Return True if an answer may have millions of points, and hold memory until read.
+    """Return True if the answer may contain millions of points.
 
-    ValueError if the number of points is not a number.
+    Such an answer occupies memory until it is sent. Raises ValueError if the requested number of
+    points is not a number.
     """
     kind = question.rpartition("/")[2]
     return kind == "export" or (kind == "points" and int(arguments.get("most", 0)) > LARGE_POINTS)
 
 
 def is_search(question: str, arguments: Arguments) -> bool:
-    """Return True if an answer may take seconds because all points are searched."""
+    """Return True if the answer may take seconds because all points are searched."""
     long_lists = len(arguments.get("scans", "")) > LONG_TEXT
     return question.rpartition("/")[2] == "points" and (bool(arguments.get("filter")) or long_lists)
 
 
-class SlowQuestions:
-    """Slots for slow questions of a kind, which are answered in separate threads.
+class SlowRequestSlots:
+    """Slots that limit how many slow requests of a kind are answered at a time.
 
-    An answer holds its slot until the browser has read the answer, so that few large answers are in
-    memory. Large answers and searches are two kinds: large answers that nobody reads delay no
-    search.
+    A request holds its slot until the client has received the answer, so only a few large answers
+    are in memory. Large answers and searches use separate slots, so clients that do not read their
+    answers cannot delay searches.
     """
 
     def __init__(self) -> None:
@@ -144,34 +146,35 @@ class SlowQuestions:
 
 
 class _Guarded(RequestHandler):
-    """Answers requests that `_Guard` has let pass."""
+    """A handler of requests that `_Guard` has accepted."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
         self.set_header("Referrer-Policy", "no-referrer")  # the address holds the token
         self.set_header("X-Content-Type-Options", "nosniff")
-        # The cell of a notebook, whose address is unknown here, may frame any page.
+        # A notebook shows pages in frames, and its address is unknown here.
         policy = POLICY if self.settings["in_notebook"] else POLICY + _FRAMES
         self.set_header("Content-Security-Policy", policy)
 
     def log_exception(self, *error: Any) -> None:
-        """Log errors that are not the client's."""
+        """Log an error unless the client caused it."""
         if not isinstance(error[1], HTTPError):
             _LOGGER.error("A request from the page failed", exc_info=error)
 
 
 class _File(_Guarded, StaticFileHandler):
-    """Sends a file that the page consists of."""
+    """Sends one of the files of the page."""
 
 
 class _Question(_Guarded):
-    """Answers a question by `source`, which may take long, in a separate thread.
+    """Answers a data request or a command.
 
-    Slow questions of a kind wait for a slot; the rest are answered meanwhile.
+    Answers are computed in threads, because they may take long. Slow requests wait for a slot,
+    while all other requests are answered at once.
     """
 
-    def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
+    def initialize(self, source: AnswerSource, stop: Callable[[], None] | None) -> None:
         self._source = source
         self._stop = stop
         self._disconnected = threading.Event()
@@ -179,7 +182,7 @@ class _Question(_Guarded):
     async def get(self, question: str) -> None:
         arguments = {name: self.get_query_argument(name) for name in self.request.query_arguments}
         try:
-            slow: SlowQuestions | None = None
+            slow: SlowRequestSlots | None = None
             if is_large(question, arguments):
                 slow = self.settings["large"]
             elif is_search(question, arguments):
@@ -191,21 +194,21 @@ class _Question(_Guarded):
                 await self._answer(None, question, arguments)
         except (KeyError, ValueError) as error:
             raise HTTPError(404, "%s", repr(error)) from error
-        except (Abandoned, StreamClosedError):
+        except (ClientDisconnected, StreamClosedError):
             return
 
     async def _answer(
         self, threads: ThreadPoolExecutor | None, question: str, arguments: Arguments
     ) -> None:
-        """Compute an answer in a thread and send the answer.
+        """Compute an answer in a thread, and send it.
 
-        Raises Abandoned if the browser has left.
+        Raises ClientDisconnected if the client has disconnected or stopped reading.
         """
         if self._disconnected.is_set():
-            raise Abandoned
+            raise ClientDisconnected
 
         def pieces() -> list[bytes]:
-            return bundle(*self._source(question, arguments, self._disconnected.is_set))
+            return pack_answer(*self._source(question, arguments, self._disconnected.is_set))
 
         answer = await asyncio.get_running_loop().run_in_executor(threads, pieces)
         self.set_header("Content-Type", "application/octet-stream")
@@ -216,7 +219,7 @@ class _Question(_Guarded):
                     await asyncio.wait_for(self.flush(), STALL_S)
                 except TimeoutError as error:
                     self.detach().close()
-                    raise Abandoned from error
+                    raise ClientDisconnected from error
 
     def post(self, order: str) -> None:
         if order != "stop" or self._stop is None:
@@ -229,47 +232,50 @@ class _Question(_Guarded):
 
 @dataclass(frozen=True)
 class PageServer:
-    """A page that is served at an address of this machine."""
+    """The address of a page that is being served on this machine."""
 
     port: int
     host: str = HOST
     token: str = field(default_factory=secrets.token_urlsafe, repr=False)
-    good_once: list[str] = field(default_factory=list, repr=False)  # tokens of single use
+    single_use_tokens: list[str] = field(default_factory=list, repr=False)
 
     @property
     def url(self) -> str:
-        """Address of the page, which ends with "/"."""
+        """URL of the page, ending with "/"."""
         return f"{self._root}{self.token}/"
 
     @property
     def _root(self) -> str:
-        """Address of the server, which ends with "/"."""
+        """URL of the server, ending with "/"."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}/"
 
-    def once(self) -> str:
-        """Return an address that leads to the page once.
+    def single_use_url(self) -> str:
+        """Return a URL that leads to the page only once.
 
-        Other users of the machine see the arguments that a browser is started with.
+        It is used to start a browser, because other users of the machine can see the command line.
         """
-        self.good_once.append(secrets.token_urlsafe())
-        return f"{self._root}{self.good_once[-1]}/"
+        self.single_use_tokens.append(secrets.token_urlsafe())
+        return f"{self._root}{self.single_use_tokens[-1]}/"
 
 
 class _Guard:
-    """Checks a request by its address and headers, before its body is read."""
+    """Checks the URL and the headers of a request before its body is read."""
 
     def __init__(self, page: PageServer) -> None:
         self._page = page
-        # The name of a notebook's proxy is unknown here.
+        # The host name of a notebook's proxy is unknown, so it cannot be checked.
         is_proxied = cell_display() is not None or _HUB in os.environ
         self._names = None if is_proxied else names_of_machine(page.host) | {page.host.lower()}
 
     def __call__(self, start_line: RequestStartLine, headers: HTTPHeaders) -> Refusal | None:
-        """Return the refusal of a request, or the page for an address of single use, or None."""
+        """Return a refusal, or None to accept the request.
+
+        A single-use URL is answered with a redirect to the page.
+        """
         path = start_line.path.partition("?")[0]
         token = "".join(path.split("/")[1:2])
-        is_good_once = token in self._page.good_once
+        is_good_once = token in self._page.single_use_tokens
         if not is_good_once and not compare_digest(self._page.token.encode(), token.encode()):
             return Refusal(HTTPStatus.NOT_FOUND, "this page does not exist")
         reason = refusal(
@@ -281,24 +287,35 @@ class _Guard:
         if reason:
             return Refusal(HTTPStatus.FORBIDDEN, reason)
         if is_good_once:
-            self._page.good_once.remove(token)
+            self._page.single_use_tokens.remove(token)
             return Refusal(HTTPStatus.FOUND, headers={"Location": self._page.url})
         return None
 
 
 @contextmanager
 def page_server(
-    source: Source,
+    source: AnswerSource,
     port: int = PORT,
     stop: Callable[[], None] | None = None,
     *,
     index: str = VIEWER,
     host: str = HOST,
 ) -> Iterator[PageServer]:
-    """Serve a page while the body runs, in a separate thread, on a port or the next free port.
+    """Serve a page in a thread while the body runs.
 
-    A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
-    the page's file; the viewer of a job is at ``job/NUMBER/``, and its questions start so.
+    Parameters
+    ----------
+    source
+        Computes the answers to the requests of the page.
+    port
+        Port to use. If it is taken, the next free port is used; 0 selects any free port.
+    stop
+        Called if the user of the page stops the run.
+    index
+        Name of the page's HTML file. The viewer of a job is at ``job/NUMBER/``, and its requests
+        start with the same prefix.
+    host
+        Address to listen on.
     """
     listener = _open_socket(host, port)
     folder = str(files(__package__) / "page")
@@ -316,8 +333,8 @@ def page_server(
         ]
         application = Application(handlers, log_function=lambda _: None)
         application.settings |= {
-            "large": SlowQuestions(),
-            "searches": SlowQuestions(),
+            "large": SlowRequestSlots(),
+            "searches": SlowRequestSlots(),
             "in_notebook": cell_display() is not None,
         }
         server = guarded_server(application, _Guard(served_page))
@@ -340,7 +357,10 @@ def page_server(
 
 
 def _open_socket(host: str, port: int) -> socket.socket:
-    """Listen on a port, or the next free port, or any port for 0 or if no port is free."""
+    """Listen on a port or the next free port.
+
+    If the port is 0 or no port is free, listen on any port.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     candidates = range(port, min(port + _PORTS_TRIED, 65_536)) if port else range(0)
     for candidate in candidates:
@@ -350,33 +370,33 @@ def _open_socket(host: str, port: int) -> socket.socket:
 
 
 @contextmanager
-def announced(
+def announce_page(
     page: PageServer, words: str, browser: bool, *, on_stdout: bool = False
 ) -> Iterator[None]:
-    """Print a page's address while the body runs, or show the page in the cell of a notebook.
+    """Print the URL of a page, or show the page in the cell of a notebook, while the body runs.
 
-    The address is on stderr, beside the progress of a run, or `on_stdout` where it is the result.
-    `browser` opens a browser where there is a desktop, and no notebook.
+    The URL is printed to stderr, or to stdout if `on_stdout` is set. If `browser` is set and there
+    is a desktop, a browser opens the page.
     """
     display = cell_display()
     if display is None:
         click.echo(words, err=not on_stdout)
         if browser:
-            open_browser(page.once())
+            open_browser(page.single_use_url())
         yield
         return
-    shown = display.display(display.HTML(frame_of(page, words)), display_id=True)
+    shown = display.display(display.HTML(notebook_html(page, words)), display_id=True)
     try:
         yield
     finally:
         shown.update(display.HTML(""))
 
 
-def frame_of(page: PageServer, words: str) -> str:
-    """Return HTML for the cell of a notebook: a link of some words, and the page in a frame."""
+def notebook_html(page: PageServer, words: str) -> str:
+    """Return HTML for the cell of a notebook: a link with some text, and the page in a frame."""
     url = page.url
     words = escape(words)
-    if hub := os.environ.get(_HUB):  # 127.0.0.1 in a frame would be the reader's own machine
+    if hub := os.environ.get(_HUB):  # 127.0.0.1 would be the machine of the user's browser
         url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
         words += (
             " The frame requires jupyter-server-proxy. Without it, run ssh -L "
@@ -388,8 +408,8 @@ def frame_of(page: PageServer, words: str) -> str:
 
 
 def open_browser(url: str) -> None:
-    """Open a page in a browser, if there is a desktop."""
+    """Open a page in a browser if there is a desktop."""
     desktop = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if "SSH_CONNECTION" in os.environ or (sys.platform.startswith("linux") and not desktop):
-        return  # a browser in the terminal would take the terminal over
+        return  # a text-mode browser would take over the terminal
     webbrowser.open(url)

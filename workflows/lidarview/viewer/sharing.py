@@ -1,4 +1,4 @@
-"""Writes a result as a single file to share: a film, or a page that needs no server."""
+"""Export a view as a single file to share: a film, or a page that needs no server."""
 
 from __future__ import annotations
 
@@ -30,52 +30,67 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ..picture_file import SensorPositions
 from ..render.coloring import TURBO
 from ..render.film import Film
-from .legends import legend_of
+from .legends import make_legend
 from .packing import pack_column, pack_positions
-from .point_selection import PointFinder, ScanRanges, even_shares, positions
-from .server import VIEWER, Answer, bundle
+from .point_selection import PointFinder, ScanRanges, even_shares, read_positions
+from .server import VIEWER, Answer, pack_answer
 from .view import View
 
-_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colors or quality)}
+# Maximum number of frames, and the number of colors (.gif) or the quality (.webp).
+_FILMS = {".gif": (30, 96), ".webp": (40, 40)}
 _MIN_FRAMES = 30
 _FRAME_MS = 100
-FILM_BYTES = 3_000_000  # maximum of a film
-_WIDTHS = range(960, 320, -80)  # widths of a film, pixels, the widest first
+FILM_BYTES = 3_000_000  # maximum size of a film
+_WIDTHS = range(960, 320, -80)  # widths to try, in pixels
 _FILM_TRIANGLES = 3_000_000
-_FILM_POINTS = 800_000  # points that a film shows at a time
-_FRAME_POINTS = 200_000  # points that a frame adds
-PAGE_BYTES = 25_000_000  # maximum of a page in one file
+_FILM_POINTS = 800_000  # maximum number of points in a frame
+_FRAME_POINTS = 200_000  # maximum number of points that a frame adds
+PAGE_BYTES = 25_000_000  # maximum size of a page
 _PAGE_POINTS = 4_000_000
 _PAGE_TRIANGLES = 60_000
-_SAMPLE_POINTS = 5_000_000  # sample of points; a page's points are chosen among them
-_CELLS = 300  # cells along the diagonal of the points, where their density is counted
+_SAMPLE_POINTS = 5_000_000  # sample from which the points of a page are chosen
+_CELLS = 300  # cells along the diagonal of the points, for estimating their density
 
-# Statements of modules. `_IMPORT` has the names and the file, `_EXPORT` the name.
+# Statements in modules. `_IMPORT` captures the names and the file, `_EXPORT` the name.
 _IMPORT = re.compile(r'^import (\{[^}]*\}|\* as \w+) from "\./([\w.]+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?:async function|function|const|class) (\w+)", re.MULTILINE)
 _EXPORT_LIST = re.compile(r"\bexport\{([^}]*)\};?\s*$")
 
 
 def _show_nothing(output: str, count: int, total: int, unit: str) -> None:
-    """Show no progress."""
+    """Ignore progress reports."""
 
 
-def share(
+def export_view(
     view: View,
     film: Path | None,
     page: Path | None,
     writing: Callable[[str], AbstractContextManager[WritingProgress]] | None = None,
 ) -> None:
-    """Write a view as a film, a page or both, and replace existing files.
+    """Write a view as a film, a page, or both, replacing existing files.
 
-    `writing` opens the display of an output's progress, with a caption; none by default.
+    Parameters
+    ----------
+    view
+        The view.
+    film
+        Path of the film, with the extension .gif or .webp.
+    page
+        Path of the page, with the extension .html.
+    writing
+        Opens a progress display with a caption. By default, no progress is shown.
 
-    LidarError without points, or if a file has another suffix or cannot be written.
+    Raises
+    ------
+    LidarError
+        If the view has no points, or if a file has another extension or cannot be written.
     """
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
             raise LidarError(f"{file} has an unsupported extension. Use {' or '.join(suffixes)}.")
-        if file and not file.parent.is_dir():  # films take seconds to draw
+        if (
+            file and not file.parent.is_dir()
+        ):  # fail before the film is rendered, which takes seconds
             raise LidarError(
                 f"{file} cannot be written, because the folder {file.parent} does not exist."
             )
@@ -88,16 +103,18 @@ def share(
             show: WritingProgress = _show_nothing
             if writing is not None:
                 show = stack.enter_context(writing(f"writing {file.name}"))
-            content = page_of(view, show) if file == page else film_of(view, file.suffix, show)
+            content = (
+                render_page(view, show) if file == page else render_film(view, file.suffix, show)
+            )
         with explained(f"{file} cannot be written", "choose another path"):
             Storage.at(file.parent, durable=False).write(file.name, content)
         click.echo(click.format_filename(file))
 
 
-def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> bytes:
-    """Return a film, ".gif" or ".webp", of at most about 3 MB, and as wide as possible.
+def render_film(view: View, suffix: str, show: WritingProgress = _show_nothing) -> bytes:
+    """Render a film of at most about 3 MB, as wide as this limit allows.
 
-    `show` shows the number of frames that are drawn.
+    `suffix` is ".gif" or ".webp". `show` reports the number of rendered frames.
     """
     max_frames, quality = _FILMS[suffix]
     film = _film(replace(view, triangles=_FILM_TRIANGLES), max_frames)
@@ -113,12 +130,12 @@ def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> b
 
 
 def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) -> bytes:
-    """Encode frames in a width in pixels.
+    """Encode frames with a width in pixels.
 
-    `quality` is the number of colors of a .gif.
+    `quality` is the number of colors for .gif and the quality of the compression for .webp.
     """
     scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
-    if suffix == ".gif":  # colors would flicker with a palette for each frame
+    if suffix == ".gif":  # a palette per frame would make the colors flicker
         pixels = np.concatenate([np.asarray(frame)[::2, ::2] for frame in scaled])
         palette = Image.fromarray(pixels).quantize(quality, Image.Quantize.FASTOCTREE)
         scaled = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in scaled]
@@ -137,46 +154,53 @@ def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) ->
 
 @dataclass(frozen=True, eq=False)
 class _FilmSource:
-    """Points of a view for a film, colored by height."""
+    """The points of a view as they appear in a film, colored by height."""
 
     view: View
     finder: PointFinder
     top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
-        """Return local positions (n, 3) of points below the top."""
+        """Return the local positions (n, 3) of a sample of the points below `top`."""
         rows, _ = self.finder.find(max_points, scans=scans)
-        local = positions(self.view.points, rows) - self.view.origin
+        local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
 
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return local positions (n, 3), and colors (n, 4) by the height in a box (2, 3)."""
+        """Return local positions (n, 3) and RGBA colors (n, 4) of a sample of the points.
+
+        The colors span the height of `box`, which has shape (2, 3).
+        """
         local = self.positions(max_points, scans)
         share = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
-        colors = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colors are lost
+        # The darkest colors are skipped, because they are hard to see on a dark background.
+        colors = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]
         return local, np.pad(colors, ((0, 0), (0, 1)), constant_values=1)
 
     def new_points(
         self, box: Floats, spans: Sequence[ScanRanges]
     ) -> Iterator[tuple[Floats, Floats]]:
-        """Yield the points and colors of each frame's scans."""
+        """Yield the positions and colors of the scans in each frame."""
         for scans in spans:
             yield self.points(box, _FRAME_POINTS, scans)
 
 
-def _never_abandoned() -> bool:
-    """Return False: a file waits for each answer of its view."""
+def _never_disconnected() -> bool:
+    """Return False, because an export waits for every answer."""
     return False
 
 
 def _film(view: View, max_frames: int) -> Film:
-    """Return the film of a view: along its first moving sensor, or around static points."""
+    """Compose the film of a view.
+
+    The camera follows the first moving sensor. If no sensor moves, it circles the points.
+    """
     triangles = np.empty((0, 3, 3))
     top = np.inf
     if view.pictured is not None and len(view.pictured.scene.faces):
-        header, arrays = view.answer("surface", {"color": "gray"}, _never_abandoned)
+        header, arrays = view.answer("surface", {"color": "gray"}, _never_disconnected)
         triangles = arrays["corners"]
         top = header["roof_cut"] or top
     source = _FilmSource(view, PointFinder(view.points, view.origin), top)
@@ -206,22 +230,22 @@ def _film(view: View, max_frames: int) -> Film:
 def _follow(
     film: Film, sensor: SensorPositions, source: _FilmSource, spans: Sequence[ScanRanges]
 ) -> Film:
-    """Return a film that follows a sensor.
+    """Return the film with a camera that follows a sensor.
 
-    `spans` are the scans of each frame.
+    `spans` are the scans in each frame.
     """
     middle = len(spans) // 2
     position = sensor.position_at(film.moments_ns[middle])
     ranges = np.linalg.norm(source.positions(_FRAME_POINTS, spans[middle]) - position, axis=1)
     range_m = float(np.median(ranges)) if len(ranges) else 20.0
     trajectory = (sensor.times_ns, sensor.positions)
-    return replace(film, carrier_trajectory=trajectory, range_m=range_m)
+    return replace(film, platform_trajectory=trajectory, range_m=range_m)
 
 
 def _scans_between(sweeps: Sweeps, start_ns: float, stop_ns: float) -> ScanRanges:
-    """Return the ranges of scans between two times.
+    """Return the ranges of the scans between two times.
 
-    Scans are even over each sweep.
+    The scans of a sweep are assumed to be evenly spaced in time.
     """
     first = sweeps.scans[:-1]
     count = np.diff(sweeps.scans)
@@ -234,10 +258,15 @@ def _scans_between(sweeps: Sweeps, start_ns: float, stop_ns: float) -> ScanRange
     return tuple((start, stop - 1) for start, stop in spans if start < stop)
 
 
-def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
-    """Return a page of at most 25 MB that holds the answers to all its questions.
+def render_page(view: View, show: WritingProgress = _show_nothing) -> bytes:
+    """Render a page of at most 25 MB that contains the answers to all its requests.
 
-    `show` shows the number of answers that are packed.
+    `show` reports the number of packed answers.
+
+    Raises
+    ------
+    LidarError
+        If the page exceeds 25 MB even without points.
     """
     page = _page_with_modules()
     view = replace(view, triangles=_PAGE_TRIANGLES)
@@ -254,9 +283,9 @@ def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
 
 
 def _page_with_modules() -> str:
-    """Return the viewer's page with its styles and modules inside, and a policy that allows these.
+    """Return the viewer's page with inlined style sheets and modules and a matching content policy.
 
-    Scripts and styles are allowed by their hashes; whatever else a page might load is refused.
+    The policy allows scripts and styles by their hashes and blocks everything else.
     """
     folder = files(__package__) / "page"
     page = (folder / VIEWER).read_text("utf-8")
@@ -266,7 +295,7 @@ def _page_with_modules() -> str:
         page = page.replace(
             f'<link rel="stylesheet" href="{name}">', f"<style>{styles[-1]}</style>"
         )
-    script = f"\n{joined_modules(folder, 'page.js')}"
+    script = f"\n{bundle_modules(folder, 'page.js')}"
     page = page.replace(
         '<script type="module" src="page.js"></script>', f'<script type="module">{script}</script>'
     )
@@ -281,16 +310,17 @@ def _page_with_modules() -> str:
 
 
 def _hash_source(text: str) -> str:
-    """Return the source of a content policy that allows an inline script or style."""
+    """Return the source expression of a content policy that allows an inline script or style."""
     digest = hashlib.sha256(text.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
-def joined_modules(folder: Traversable, name: str) -> str:
-    """Join a module of JavaScript and the modules that it imports into a single script.
+def bundle_modules(folder: Traversable, name: str) -> str:
+    """Combine a JavaScript module and its imports into a single script.
 
-    Each module becomes a function that returns its exports. A page in one file cannot import: a
-    content policy allows inline scripts by hash, but modules in addresses only as a whole.
+    Each module becomes a function that returns its exports. A page in a single file cannot use
+    imports: a content policy can allow inline scripts by their hashes, but imported modules only by
+    their addresses.
     """
     modules: dict[str, str] = {}  # {file: script}, imported modules first
 
@@ -300,7 +330,7 @@ def joined_modules(folder: Traversable, name: str) -> str:
             if imported not in modules:
                 add(imported)
         exports = _EXPORT.findall(text)
-        for names in _EXPORT_LIST.findall(text):  # a minified module says "a as Name"
+        for names in _EXPORT_LIST.findall(text):  # minified modules export "a as Name"
             pairs = (entry.strip().partition(" as ") for entry in names.split(","))
             exports += [f"{exported or local}: {local}" for local, _, exported in pairs]
         text = _IMPORT.sub(r'const \1 = modules["\2"];', text).replace("const * as ", "const ")
@@ -314,30 +344,30 @@ def joined_modules(folder: Traversable, name: str) -> str:
 
 
 def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
-    """Return the answers to all questions of a page but for points: {question: packed answer}."""
-    header, arrays = view.answer("state", {}, _never_abandoned)
+    """Return the packed answer to each request of the page, except requests for points."""
+    header, arrays = view.answer("state", {}, _never_disconnected)
     answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
     questions = [("surface", "color", value) for value in header["scene_colors"] or ()]
     questions += [("column", "name", value) for value in view.columns]
     labels = [name for name, column in view.columns.items() if column.kind == "label"]
     questions += [("counts", "name", name) for name in labels]
     for number, (question, key, value) in enumerate(questions, 1):
-        answer = view.answer(question, {key: value}, _never_abandoned)
+        answer = view.answer(question, {key: value}, _never_disconnected)
         answers[f"{question}?{key}={value}"] = _packed(*answer)
         show("page", number, len(questions), "parts")
     return answers
 
 
 def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
-    """Return an answer as text in a page."""
-    return base64.b64encode(zlib.compress(b"".join(bundle(header, arrays)))).decode()
+    """Return an answer as text that can be embedded in a page."""
+    return base64.b64encode(zlib.compress(b"".join(pack_answer(header, arrays)))).decode()
 
 
 def _thinned(view: View, max_points: int) -> Answer:
-    """Choose points, fewer where points are dense, and pack all their columns."""
+    """Sample points, with a lower share where they are dense, and pack all their columns."""
     points = view.shown_points
     rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
-    world = positions(points, rows)
+    world = read_positions(points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]
     _, cell_of_point, counts = np.unique(cells, return_inverse=True, return_counts=True)
@@ -353,20 +383,20 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Return an order with similar neighbors: by sensor and channel, then as they are."""
+    """Return an order of the points that compresses well: by sensor, then by channel."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 
 
 def _packed_points(view: View, local: Floats, columns: Mapping[str, AnyArray]) -> Answer:
-    """Return points with their packed columns, and the colors and legend of each column."""
+    """Return the packed columns of points, with the colors and the legend of each column."""
     packed_columns = dict(zip("xyz", pack_positions(local), strict=True))
     packed_columns |= {name: pack_column(values) for name, values in columns.items()}
     arrays: dict[str, AnyArray] = {name: c.planes for name, c in packed_columns.items()}
     legends = dict[str, Any]()
-    for name in view.answer("state", {}, _never_abandoned)[0]["colors"]:
+    for name in view.answer("state", {}, _never_disconnected)[0]["colors"]:
         coloring = view.coloring(name)
-        legends[name] = legend_of(coloring) | {"column": name, "divisor": coloring.divisor}
+        legends[name] = make_legend(coloring) | {"column": name, "divisor": coloring.divisor}
         if coloring.limits is not None:
             arrays[f"{name} scale"] = as_bytes(coloring.scale)
         elif name in columns:

@@ -1,4 +1,4 @@
-"""A survey or a cloud on a page: answers to the questions of the page, and the command `view`."""
+"""Answer the requests of the page that shows a survey or a cloud."""
 
 from __future__ import annotations
 
@@ -33,89 +33,89 @@ from ..picture_file import (
     SensorPositions,
     moving_positions,
 )
-from ..render.closeup import floor_and_cut, surrounding_box
+from ..render.closeup import floor_and_cut_heights, surrounding_box
 from ..render.coloring import (
     MAX_UNNAMED_LABELS,
     Coloring,
-    colors_of,
-    values_of,
-    with_composed,
-    word_of,
+    add_composed_columns,
+    column_values,
+    label_text,
+    make_coloring,
 )
-from ..render.surface import spiral
+from ..render.surface import golden_spiral
 from ..render.theme import object_colors
-from .legends import Legend, legend_of
+from .display_mesh import HITS_SAMPLE, MAX_TRIANGLES, DisplayMesh, available_colorings
+from .legends import Legend, make_legend
 from .point_selection import (
     BLOCK_ROWS,
     RESULT,
     STATION,
-    Abandoned,
-    Eye,
-    Filter,
-    HeldPoints,
-    OrderedPoints,
+    BrowserCamera,
+    ClientDisconnected,
+    InMemoryPoints,
+    PointFilter,
     PointFinder,
     Points,
+    ScanOrderedPoints,
     ScanRanges,
     StationPoints,
-    corners_of,
-    positions,
-    read_scans,
+    box_corners,
+    parse_scans,
+    read_positions,
 )
-from .range_pictures import are_around, range_image
+from .range_pictures import range_image, surround_object
 from .server import Answer, Arguments
-from .shown_surface import HITS_SAMPLE, MAX_TRIANGLES, ShownSurface, colors_for
 
-MAX_POINTS = 20_000_000  # points in an answer, and in a download
-MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
-_SAMPLE = 100_000  # points for color scales and limits
-_MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
-_CORNERS = 200  # directions whose outermost points of a cloud are in the first picture
-_MAX_BEYOND = 0.5  # points farther outside the middle 99 % than this share of it are outliers
-_MAX_COLORINGS = 64  # color scales that are kept, of columns and filters
-_MAX_NAMES = 2000  # named values of a column that a menu of the page lists
+MAX_POINTS = 20_000_000  # maximum number of points in an answer or a download
+MAX_RAYS = 150  # more rays would hide the surfaces
+_SAMPLE = 100_000  # points for estimating color scales and limits
+_MAX_COUNTED = 20_000_000  # with more points, the labels are counted in a sample
+_CORNERS = 200  # directions in which the first view shows the outermost point of a cloud
+_MAX_BEYOND = 0.5  # outliers are this share of the central 99 % range or more outside of it
+_MAX_COLORINGS = 64  # number of color scales that are kept
+_MAX_NAMES = 2000  # maximum number of named values that a menu of the page lists
 _NS = 1e9
 IN_SENSOR_AXES = "The points are in sensor coordinates, so the scene is not shown."
 CLOUD = "cloud.ply"
 
 
 @dataclass(frozen=True)
-class Downloads:
-    """Formats of files that a page offers for points, and the function that writes a file."""
+class DownloadFormats:
+    """File formats in which a page offers points for download."""
 
-    formats: Sequence[str]  # suffixes of files without a dot, such as "las"
-    save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
+    formats: Sequence[str]  # file extensions without a dot, such as "las"
+    save: Callable[[Cloud, Path], object]  # writes points in the format of the path's extension
 
 
 @dataclass(eq=False)
 class View:
-    """A survey on a page, or a cloud alone.
+    """A survey, or a cloud alone, as a page shows it.
 
-    The page gets coordinates that are local: world coordinates minus `origin`. The scene is left
-    out of a result whose points are in the sensor frame.
+    The page receives local coordinates: world coordinates minus `origin`. The scene is omitted if
+    the points are in the sensor frame.
     """
 
     points: Points
-    pictured: PictureContent | None = None  # scene, sensors, some rays and hit counts; local
+    pictured: PictureContent | None = None  # scene, sensors, sample rays, and hit counts
     sweeps: Sweeps | None = None  # poses and scans of all sweeps
-    note: str = ""  # a remark for the user
+    note: str = ""  # a note for the user
     title: str = "lidarpool"
-    results: Sequence[str] = ()  # names, if the points are of several results
-    # Returns the hits of each triangle of the scene, actors' triangles last, during a run; None
-    # takes `pictured.hit_counts`.
+    results: Sequence[str] = ()  # names of the results if there are several
+    # Returns the current hits on each triangle during a run, the actors' triangles last. If None,
+    # the hits are `pictured.hit_counts`.
     read_hit_counts: Callable[[], AnyArray] | None = None
-    triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
-    downloads: Downloads | None = None  # None if points are not offered as files
-    # {column: names of the values 0, 1, 2, …}, beside the names of the scene and the sweeps.
+    triangles: int = MAX_TRIANGLES  # maximum number of displayed triangles
+    downloads: DownloadFormats | None = None  # None if points cannot be downloaded
+    # {column: names of the values 0, 1, 2, …}, in addition to those of the scene and the sweeps
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    preview: bool = False  # whether the points come from first sweeps, before a run
-    stated_epsg: int | None = None  # EPSG code that the file of a cloud states
+    preview: bool = False  # whether the points come from the first sweeps, before a run
+    stated_epsg: int | None = None  # EPSG code in the point cloud file
 
     def __post_init__(self) -> None:
-        self.version = 0  # counts the replacements of the points by `show`
-        # (n, 2, 3): both ends of sample rays, local, meters
+        self.version = 0  # number of times that the points have been replaced
+        # (n, 2, 3) start and end points of sample rays, local, in meters
         self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
-        self.path: Floats | None = None  # (w, 2): corners of the planned path, local, meters
+        self.path: Floats | None = None  # (w, 2) corners of the planned path, local, in meters
         sources = (source for source in (self.pictured, self.sweeps) if source is not None)
         if any(source.coordinates != "world" for source in sources):
             self.note = f"{self.note} {IN_SENSOR_AXES}".strip()
@@ -127,15 +127,15 @@ class View:
                 self.path = pictured.planning.best.corners
         self.origin, self._bounds, self._corners = self._extent()
         self._lock = threading.Lock()
-        self._surface: ShownSurface | None = None
-        self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
-        self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the last answer
-        self.show(self.points)
+        self._surface: DisplayMesh | None = None
+        self._range_limits: dict[int, tuple[float, float]] = {}  # color scale of each sensor
+        self._label_counts_of: dict[tuple[str, int], dict[str, Any]] = {}  # the latest answer
+        self.replace_points(self.points)
 
-    def show(self, points: Points, *, keep_scales: bool = False) -> None:
+    def replace_points(self, points: Points, *, keep_scales: bool = False) -> None:
         """Replace the points.
 
-        With `keep_scales`, the color scales of earlier points stay.
+        With `keep_scales`, the color scales of the previous points are kept.
         """
         self.points = points
         self._finder = PointFinder(self._with_stations(points), self.origin)
@@ -143,14 +143,14 @@ class View:
             column.name: column for column in self._finder.points.table if column not in POSITION
         }
         self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to color and filter by
-        self._colored = with_composed(self.columns)
+        self._colored = add_composed_columns(self.columns)
         if not keep_scales:
             # {(column, filter, limits of the scale): color scale}
             self._colorings: dict[tuple[Any, ...], Coloring] = {}
         self.version += 1
 
     def _with_stations(self, points: Points) -> Points:
-        """Return points with their stations, if the survey has several."""
+        """Add a station column to the points if the survey has several stations."""
         sweeps = self.sweeps
         names = [column.name for column in points.table]
         if sweeps is None or not sweeps.station_numbers.any() or "scan" not in names:
@@ -168,9 +168,11 @@ class View:
 
     @cached_property
     def sensors(self) -> Sequence[SensorPositions]:
-        """Positions of the sensors, local, meters: as pictured, else at the starts of sweeps.
+        """Positions of the sensors in local coordinates.
 
-        A sensor moves if it is at a new position in more than half of at least three sweeps.
+        The positions come from the picture file if there is one, otherwise from the starts of the
+        sweeps. In the latter case, a sensor counts as moving if it has at least three sweeps and a
+        new position in more than half of them.
         """
         if self.pictured is not None:
             return self.pictured.sensors
@@ -181,7 +183,7 @@ class View:
         for number, name in enumerate(sweeps.sensors):
             of_sensor = sweeps.sensor == number
             local = sweeps.pose.positions[of_sensor] - self.origin
-            if sweeps.coordinates != "world":  # each point is in the frame of its sensor
+            if sweeps.coordinates != "world":  # the sensor is the origin of its points
                 local = np.zeros_like(local)
             is_standing = bool(sweeps.station_numbers.any())
             moves = not is_standing and len(np.unique(local, axis=0)) > len(local) / 2 > 1
@@ -190,7 +192,7 @@ class View:
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the system of the coordinates: of the survey, else of the file, or None."""
+        """EPSG code of the coordinates, from the survey or else from the file; None if unknown."""
         sweeps = self.sweeps
         if sweeps is None:
             return self.stated_epsg
@@ -215,14 +217,14 @@ class View:
 
     @property
     def _station_names(self) -> Sequence[str]:
-        """Names of the stations 0 (none), 1, 2, …, or an empty sequence without stations."""
+        """Names of the stations 1, 2, … after an empty name for 0, or nothing without stations."""
         if self.sweeps is None or not self.sweeps.station_numbers.any():
             return ()
         names = self.names.get(STATION.name) or [""] * (1 + self.sweeps.station_numbers.max())
         return ["", *(name or f"station {k}" for k, name in enumerate(names[1:], 1))]
 
     def _names(self, column: str) -> Sequence[str]:
-        """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
+        """Return the names of the values 0, 1, 2, … in a column, or nothing if they are unnamed."""
         if column == RESULT.name and self.results:
             return self.results
         if column == STATION.name:
@@ -243,35 +245,51 @@ class View:
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _extent(self) -> tuple[Floats, Floats, Floats]:
-        """Return the origin (3,), and what to show: the box (2, 3) and points (k, 3).
+        """Return the local origin, the bounding box, and points that the first view must show.
 
-        The origin is in world meters.
-
-        The box contains the points, local, meters. The points are the corners of the scene, the
-        positions of the sensors unless these are around an object, and both ends of the planned
-        path: closer together than the corners of the box, which around an object is mostly empty.
+        The origin (3,) is in world coordinates; the box (2, 3) and the points (k, 3) are local. The
+        points are the corners of the scene, the ends of a planned path, and the sensor positions
+        unless the sensors surround an object. They fit the image more tightly than the corners of
+        the box, which is mostly empty if the sensors surround an object.
         """
         if self.pictured is None:
             return _cloud_extent(self.points)
         scene = self.pictured.scene
         planning = self.pictured.planning
         sensors = np.concatenate([np.empty((0, 3)), *(s.positions for s in self.pictured.sensors)])
-        corners = corners_of(scene.bounds)
+        corners = box_corners(scene.bounds)
         if planning is not None:
             level = corners[:, 2].min()
             corners = np.vstack([corners, [*planning.start, level], [*planning.target, level]])
         all_corners = np.vstack([corners, sensors])
-        if not are_around(sensors, scene.bounds):
+        if not surround_object(sensors, scene.bounds):
             corners = all_corners
         return scene.origin, np.stack([all_corners.min(axis=0), all_corners.max(axis=0)]), corners
 
     # -- answers -------------------------------------------------------------------------
 
-    def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page: a header for JSON, and arrays by name.
+    def answer(
+        self, question: str, arguments: Arguments, is_disconnected: Callable[[], bool]
+    ) -> Answer:
+        """Answer a request of the page.
 
-        `abandoned` returns True once the browser no longer waits for the answer; then the search
-        for points raises `Abandoned`.
+        Parameters
+        ----------
+        question
+            Name of the request: "state", "points", "point", "column", "counts", "surface", "range",
+            or "export".
+        arguments
+            Arguments in the query of the URL.
+        is_disconnected
+            Returns True once the client has disconnected. The search for points then raises
+            `ClientDisconnected`.
+
+        Returns
+        -------
+        header
+            Content that is sent as JSON.
+        arrays
+            Arrays by name.
         """
         answers: Mapping[str, Callable[[Arguments, Callable[[], bool]], Answer]] = {
             "state": lambda *_: self._state(),
@@ -283,21 +301,22 @@ class View:
             "range": lambda arguments, _: self._range(int(arguments["sweep"])),
             "export": self._export,
         }
-        return answers[question](arguments, abandoned)
+        return answers[question](arguments, is_disconnected)
 
     def _state(self) -> Answer:
-        """Return the header and arrays of the view, without points and surfaces.
+        """Return the description of the view, without points and surfaces.
 
-        In the header, "bounds" contain the scene, and "box" the part to look at first: around the
-        trajectories in a large scene, where "cut" is the z of its top. Local meters, and seconds.
+        In the header, "bounds" contain the scene, and "box" is the part to show first: the
+        surroundings of the trajectories in a large scene, in which case "cut" is the local z of the
+        top of the box. Lengths are in meters and times in seconds.
         """
-        # None: look at all of the scene
+        # None if the page shows the whole scene
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
         box = self._bounds if shown_box is None else shown_box
-        corners = self._corners if shown_box is None else corners_of(shown_box)
-        arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
+        corners = self._corners if shown_box is None else box_corners(shown_box)
+        arrays: dict[str, AnyArray] = {"rays": self.displayed_rays, "corners": corners}
         for number, sensor in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = sensor.times_ns / _NS
             arrays[f"sensor{number}_places"] = sensor.positions
@@ -332,7 +351,7 @@ class View:
             "bounds": self._bounds.tolist(),
             "cut": None if shown_box is None else float(shown_box[1, 2]),
             "scene_colors": pictured
-            and colors_for(pictured.scene, pictured.reflectance, pictured.face_materials),
+            and available_colorings(pictured.scene, pictured.reflectance, pictured.face_materials),
             "sensors": [
                 {
                     "name": sensor.name,
@@ -347,35 +366,35 @@ class View:
                 for number, actor in enumerate(self.actors, static_count)
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
-            # Actors move with the time, which stations alone do not need.
+            # With actors, the page selects times instead of stations.
             "stations": [] if self.actors else self._station_names,
-            "results": legend_of(colors_of(result_numbers, RESULT, self.results))["labels"],
+            "results": make_legend(make_coloring(result_numbers, RESULT, self.results))["labels"],
             "exports": self._export_formats,
             "actor_colors": as_bytes(object_colors(object_count))[static_count:].tolist(),
             "statics": static_count,
             "duration": self.duration_ns / _NS,
-            "path": self.planned,
+            "path": self.planned_path,
             "note": self.note,
             "preview": self.preview,
-            # Sweeps in the axes of a sensor that moves do not fit each other.
+            # Sweeps in sensor coordinates do not fit together, so they are shown one at a time.
             "by_sweep": sweeps is not None and sweeps.coordinates != "world" and len(sweeps) > 1,
         }
         return header, arrays
 
     def _actor_arrays(self) -> dict[str, AnyArray]:
-        """Return the meshes and trajectories of actors as arrays for the page.
+        """Return the meshes and trajectories of the actors.
 
-        Distinct meshes are numbered ``mesh0``, ``mesh1``, …; animated meshes have the vertices
-        (p, v, 3) of each pose of the animation, actors the number of the pose at each time, with
-        fractions (``actor0_frames``). Local meters, seconds.
+        Distinct meshes are numbered ``mesh0``, ``mesh1``, …. Animated meshes have the vertices (p,
+        v, 3) of each pose, and their actors the fractional pose number at each time
+        (``actor0_frames``). Coordinates are local, and times are in seconds.
         """
         meshes, mesh_indices = distinct_meshes(self.actors)
         arrays: dict[str, AnyArray] = {
             "actor_mesh": mesh_indices.astype(np.int32)
-        }  # no int64 in pages
+        }  # browsers lack int64 arrays
         for k, mesh in enumerate(meshes):
             arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
-            if mesh.colors is not None:  # at the corners
+            if mesh.colors is not None:  # repeated for each corner
                 arrays[f"mesh{k}_colors"] = mesh.colors.means().repeat(3, axis=0)
             if mesh.animation is not None:
                 arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
@@ -387,7 +406,8 @@ class View:
             arrays[f"actor{k}_turns"] = rotations
             arrays[f"actor{k}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
             if (animation := actor.mesh.animation) is not None:
-                # Pages repeat all animations: numbers stay below the last pose if it remains.
+                # The page repeats all animations. If an animation ends instead, the pose numbers
+                # stay just below the last pose.
                 pose_numbers = actor.seconds(times)[0] / animation.step_s
                 last = len(animation.vertices) - 1 - 1e-6
                 arrays[f"actor{k}_frames"] = (
@@ -396,15 +416,15 @@ class View:
         return arrays
 
     @property
-    def rays_shown(self) -> Floats32:
-        """Both ends of at most `MAX_RAYS` sample rays, local, meters: (n, 2, 3)."""
+    def displayed_rays(self) -> Floats32:
+        """Local start and end points of at most `MAX_RAYS` sample rays, shape (n, 2, 3)."""
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
-    def planned(self) -> dict[str, Any] | None:
-        """Planned path and discs (x, y, radius) of obstacles, local meters.
+    def planned_path(self) -> dict[str, Any] | None:
+        """Corners of the planned path, and obstacles as discs; None without a path.
 
-        The answer is None without a path.
+        A disc is (x, y, radius). All values are local, in meters.
         """
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
@@ -413,19 +433,18 @@ class View:
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
-        """Return {number of an object: class of one of its points}, from a sample of the points."""
+        """Return the class of each object, according to one of its points in a sample."""
         if not {"object", "class"} <= self.columns.keys():
             return {}
         rows, _ = self._finder.find(_SAMPLE)
         columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
         return dict(zip(*columns, strict=True))
 
-    def _export(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Return a file with the points for a filter and ranges of scans.
+    def _export(self, arguments: Arguments, is_disconnected: Callable[[], bool]) -> Answer:
+        """Return a file with the points that pass a filter.
 
-        Several files are returned as a ZIP.
-
-        The answer has an error instead if points are too many, or the format refuses the points.
+        If the format consists of several files, they are returned as a ZIP archive. If there are
+        too many points, or if the format cannot store them, the answer contains an error instead.
         """
         ending = arguments["format"]
         if self.downloads is None or ending not in self._export_formats:
@@ -433,7 +452,7 @@ class View:
         points = self.points
         sweeps = self.sweeps
         rows, count = self._finder.find(
-            MAX_POINTS, *self._read_selection(arguments), None, abandoned
+            MAX_POINTS, *self._read_selection(arguments), None, is_disconnected
         )
         if count > MAX_POINTS:
             message = f"The selection has {count:,} points; the limit is {MAX_POINTS:,}. Filter or"
@@ -459,71 +478,76 @@ class View:
 
     @property
     def _export_formats(self) -> Sequence[str]:
-        """Formats of a download, or none for a sample of a run under way."""
-        is_sample = isinstance(self.points, HeldPoints) and not isinstance(
-            self.points, OrderedPoints
+        """Formats offered for download, or none if the points are a sample or a preview."""
+        is_sample = isinstance(self.points, InMemoryPoints) and not isinstance(
+            self.points, ScanOrderedPoints
         )
         if self.downloads is None or is_sample or self.preview:
             return ()
         return self.downloads.formats
 
-    def _read_selection(self, arguments: Arguments) -> tuple[Filter, ScanRanges | None]:
-        """Read the filter and the ranges of scans, ``first-last,first-last``, of a question."""
-        point_filter = Filter.read(arguments.get("filter", ""), list(self.columns))
-        return point_filter, read_scans(arguments["scans"]) if "scans" in arguments else None
+    def _read_selection(self, arguments: Arguments) -> tuple[PointFilter, ScanRanges | None]:
+        """Parse the filter and the ranges of scans in the arguments of a request."""
+        point_filter = PointFilter.parse(arguments.get("filter", ""), list(self.columns))
+        return point_filter, parse_scans(arguments["scans"]) if "scans" in arguments else None
 
-    def _points(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Return points for a filter, ranges of scans and a camera (`Eye`), with their colors.
+    def _points(self, arguments: Arguments, is_disconnected: Callable[[], bool]) -> Answer:
+        """Return points with their colors, optionally for a filter, ranges of scans, and a camera.
 
-        Positions are local, meters; rows are indices of the points. "count" is the number of points
-        before the points are thinned out.
+        Positions are local, and "rows" are row indices. "count" is the number of points that pass
+        the filter before they are thinned out.
         """
         finder = self._finder
         version = self.version
         selection = self._read_selection(arguments)
         name = arguments["color"]
         column = self._colored[name]
-        eye = Eye.read(arguments["eye"]) if "eye" in arguments else None
+        camera = BrowserCamera.parse(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
-        rows, count = finder.find(max_points, *selection, eye, abandoned)
+        rows, count = finder.find(max_points, *selection, camera, is_disconnected)
         limits = _read_limits(arguments["limits"]) if "limits" in arguments else None
-        coloring = self._coloring(finder, name, selection[0].without(name), limits, abandoned)
-        values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
+        coloring = self._coloring(
+            finder, name, selection[0].without_column(name), limits, is_disconnected
+        )
+        values = column_values(column, lambda column_name: finder.points.values(column_name, rows))
         colors = np.full((len(rows), 4), 255, np.uint8)
         colors[:, :3] = as_bytes(coloring.paint(values))
         arrays: dict[str, AnyArray] = {
-            "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
+            "positions": (read_positions(finder.points, rows) - self.origin).astype(np.float32),
             "colors": colors,
             "rows": rows.astype(np.uint32),
         }
         legend: Legend | None = None
         if len(finder.points):
-            legend = legend_of(coloring) | {"column": name, "meaning": column.meaning}
+            legend = make_legend(coloring) | {"column": name, "meaning": column.meaning}
         return {"version": version, "count": count, "legend": legend}, arrays
 
     def coloring(self, name: str) -> Coloring:
         """Return the color scale of a column for all points."""
-        return self._coloring(self._finder, name, Filter(), None, _never_abandoned)
+        return self._coloring(self._finder, name, PointFilter(), None, _never_disconnected)
 
     def _coloring(
         self,
         finder: PointFinder,
         name: str,
-        point_filter: Filter,
+        point_filter: PointFilter,
         limits: tuple[float, float] | None,
-        abandoned: Callable[[], bool],
+        is_disconnected: Callable[[], bool],
     ) -> Coloring:
-        """Return the color scale of a column, the same for all scans.
+        """Return the color scale of a column for the points that pass a filter.
 
-        The scale is taken from a sample of all points that the filter keeps, or has given limits.
+        The limits are estimated from a sample unless they are given. The scale is the same for all
+        scans.
         """
         colorings = self._colorings
         coloring = colorings.get((name, point_filter, limits))
         if coloring is None:
-            rows, _ = finder.find(_SAMPLE, point_filter, None, None, abandoned)
+            rows, _ = finder.find(_SAMPLE, point_filter, None, None, is_disconnected)
             column = self._colored[name]
-            values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
-            coloring = colors_of(values, column, self._names(name), limits)
+            values = column_values(
+                column, lambda column_name: finder.points.values(column_name, rows)
+            )
+            coloring = make_coloring(values, column, self._names(name), limits)
             with self._lock:
                 while len(colorings) >= _MAX_COLORINGS:
                     del colorings[next(iter(colorings))]  # the oldest
@@ -531,7 +555,7 @@ class View:
         return coloring
 
     def _column(self, name: str) -> Answer:
-        """Return the limits of a column, or its labels and their values, for the page's filters."""
+        """Return the limits of a column, or its labels, for the filters of the page."""
         column = self.columns[name]
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         values = values[np.isfinite(values)]
@@ -540,7 +564,7 @@ class View:
         is_short = len(distinct) <= (_MAX_NAMES if names else MAX_UNNAMED_LABELS) and name != "scan"
         if column.kind == "label" and len(distinct) and is_short:
             labels = [
-                [word_of(value, column, names), value]
+                [label_text(value, column, names), value]
                 for value in distinct.astype(np.int64).tolist()
             ]
             return {"labels": labels}, {}
@@ -549,10 +573,10 @@ class View:
         is_integer = values.dtype.kind in "iu" and unit == 1.0
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
 
-    def _label_counts(self, name: str, abandoned: Callable[[], bool]) -> Answer:
-        """Return [value, points] of each value of a column of labels, of all points.
+    def _label_counts(self, name: str, is_disconnected: Callable[[], bool]) -> Answer:
+        """Return the number of points with each value of a label column.
 
-        "exact" is False if they are estimated from a sample, because the points are many.
+        If there are many points, the numbers are estimated from a sample, and "exact" is False.
         """
         if self.columns[name].kind != "label":
             raise KeyError(name)
@@ -564,8 +588,8 @@ class View:
             counts = Counter[int]()
             if is_exact:
                 for start in range(0, total, BLOCK_ROWS):
-                    if abandoned():
-                        raise Abandoned
+                    if is_disconnected():
+                        raise ClientDisconnected
                     _add_counts(
                         counts, finder.points.values(name, slice(start, start + BLOCK_ROWS))
                     )
@@ -578,7 +602,7 @@ class View:
         return self._label_counts_of[key], {}
 
     def _point(self, row: int) -> Answer:
-        """Return the position of a point, world coordinates, and all its columns in words."""
+        """Return the world position of a point, and all its columns as text."""
         points = self.shown_points
         if not 0 <= row < len(points):
             raise KeyError(row)
@@ -592,7 +616,7 @@ class View:
         return {"place": position, "columns": shown}, {}
 
     def _in_words(self, column: Column, value: Any) -> str:
-        """Return a value of a column in words, with its unit."""
+        """Return a column value as text with its unit."""
         names = self._names(column.name)
         if column == OBJECT and value < 0:
             return NO_SURFACE
@@ -606,14 +630,14 @@ class View:
     def _scene(self, color: str) -> Answer:
         """Return the static triangles of the scene in their colors.
 
-        The header has the legend, and the heights of the floor and of the cut that takes off a
-        roof. `color` is a name of `colors_for`.
+        `color` is one of the `available_colorings`. The header contains the legend, the height of
+        the floor, and the height at which a roof is cut off.
         """
         pictured = self.pictured
         if pictured is None:
             raise KeyError("surface")
-        with self._lock:  # simplifying may take long: only the first browser's question does so
-            surface = self._surface = self._surface or ShownSurface(
+        with self._lock:  # simplifying may take long, so only the first request does it
+            surface = self._surface = self._surface or DisplayMesh(
                 pictured.scene,
                 pictured.reflectance,
                 self.triangles,
@@ -624,22 +648,24 @@ class View:
         hit_points = np.zeros((0, 3), np.float32)
         if color == "hits":
             hit_counts = hit_counts if self.read_hit_counts is None else self.read_hit_counts()
-            if not len(hit_counts):  # before a run
+            if not len(hit_counts):  # the run has not started
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
             rows, _ = self._finder.find(HITS_SAMPLE)
             if "object" in self.columns:  # points on static objects only
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
-            hit_points = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
-        arrays, legend = surface.colored(color, hit_counts, hit_points)
+            hit_points = (read_positions(self._finder.points, rows) - self.origin).astype(
+                np.float32
+            )
+        arrays, legend = surface.color_by(color, hit_counts, hit_points)
         return {"legend": legend} | self._floor_and_roof_cut, arrays
 
     @cached_property
     def _floor_and_roof_cut(self) -> dict[str, float | None]:
-        """Heights of the floor under the sensors, and of the cut that takes off a roof above them.
+        """Local heights of the floor below the sensors and of a cut that removes the roof.
 
-        Local z, meters. None without sensors, floor or roof. Asked for after `_surface` is set.
+        A height is None without sensors, floor, or roof. `_surface` must be set before.
         """
         surface = self._surface
         pictured = self.pictured
@@ -648,13 +674,14 @@ class View:
             return {"floor": None, "roof_cut": None}
         scene = surface.coarse
         caster = RayCaster(scene.vertices, scene.faces)
-        floor, cut = floor_and_cut(scene, caster, np.concatenate(poses))
+        floor, cut = floor_and_cut_heights(scene, caster, np.concatenate(poses))
         return {"floor": floor, "roof_cut": cut}
 
     def _range(self, sweep: int) -> Answer:
-        """Return the range image of a sweep (number in `sweeps`), as of `range_image`.
+        """Return the range image of a sweep, as `range_image` draws it.
 
-        "low" and "high" are the ends of the scale of ranges, meters, for all sweeps of a sensor.
+        "low" and "high" are the ends of the color scale in meters, which all sweeps of a sensor
+        share.
         """
         sweeps = self.sweeps
         finder = self._finder
@@ -666,12 +693,12 @@ class View:
         limits = (0.0, 1.0)
         sensor = int(sweeps.sensor[sweep])
         if len(rows):
-            local = sweeps.in_sensor(sweep, positions(finder.points, rows))
+            local = sweeps.in_sensor(sweep, read_positions(finder.points, rows))
             channels = None
             if "channel" in self.columns:
                 channels = finder.points.values("channel", rows).astype(np.int64)
             ranges = np.linalg.norm(local, axis=1)
-            if sensor not in self._range_limits:  # one scale for all sweeps of a sensor
+            if sensor not in self._range_limits:  # all sweeps of a sensor share a scale
                 lower, upper = np.percentile(ranges, [1, 99])
                 self._range_limits[sensor] = float(lower), float(upper)
             limits = self._range_limits[sensor]
@@ -679,15 +706,15 @@ class View:
         return {"low": limits[0], "high": limits[1], "sensor": sensor}, {"image": image}
 
 
-def _never_abandoned() -> bool:
-    """Return False: the answer is awaited to its end."""
+def _never_disconnected() -> bool:
+    """Return False, because the caller waits for the answer."""
     return False
 
 
 def _read_limits(text: str) -> tuple[float, float]:
-    """Read the ends of a color scale, ``lowest,highest``.
+    """Parse the ends of a color scale, ``lowest,highest``.
 
-    Raises ValueError if the ends are in disorder.
+    Raises ValueError if the ends are not finite or not in ascending order.
     """
     lower, upper = map(float, text.split(","))
     if not -math.inf < lower < upper < math.inf:
@@ -696,21 +723,22 @@ def _read_limits(text: str) -> tuple[float, float]:
 
 
 def _add_counts(counts: Counter[int], values: AnyArray) -> None:
-    """Add the number of points of each value (n,) to counts."""
+    """Add the number of occurrences of each value (n,) to the counts."""
     labels, numbers = np.unique(values, return_counts=True)
     counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
-    """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), meters.
+    """Return a local origin for points, their box without outliers, and their outermost points.
 
-    The box is without outliers; the points are the outermost of the others in all directions.
-    Each coordinate of the origin is 0, or whole meters for points farther than 10 km from 0.
+    The origin (3,) is in world coordinates; the box (2, 3) and the points (k, 3) are local. A
+    coordinate of the origin is 0 unless the points are more than 10 km from 0, in which case it is
+    rounded to whole meters.
     """
-    sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
+    sample = read_positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
         empty_box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
-        return np.zeros(3), empty_box, corners_of(empty_box)
+        return np.zeros(3), empty_box, box_corners(empty_box)
     lower, upper = np.percentile(sample, [0.5, 99.5], axis=0)
     margin = _MAX_BEYOND * (upper - lower)
     inside = sample[((sample >= lower - margin) & (sample <= upper + margin)).all(axis=1)]
@@ -718,16 +746,22 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     box = np.stack([inside.min(axis=0), inside.max(axis=0)])
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     local = inside - origin
-    outermost = [int((local @ direction).argmax()) for direction in spiral(_CORNERS, -1.0)]
+    outermost = [int((local @ direction).argmax()) for direction in golden_spiral(_CORNERS, -1.0)]
     return origin, box - origin, local[np.unique(outermost)]
 
 
-class GrowingView:
-    """A view of a sample of points, which a view of all points replaces once these are read.
+class ProgressiveView:
+    """A view of a sample of points, replaced by a view of all points once they have been read.
 
-    `read` returns the view of all points; a thread calls it after the first points of the sample
-    are answered. `read` gets a function that shows more points, with the share of the points that
-    has been read. `total` is the number of all points.
+    Parameters
+    ----------
+    sample
+        View of the sample.
+    total
+        Number of all points.
+    read
+        Returns the view of all points. It is called in a thread after the first request for points.
+        It receives a function that displays the points read so far, with their share of all points.
     """
 
     def __init__(
@@ -738,21 +772,23 @@ class GrowingView:
         self._view = sample
         self._read = read
         self._complete = False
-        self._share = 0.0  # of the points that were read
+        self._share = 0.0  # share of the points that has been read
         self._error = ""
         self._reading: threading.Thread | None = None
         self._lock = threading.Lock()
 
-    def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page, as `View.answer`.
+    def answer(
+        self, question: str, arguments: Arguments, is_disconnected: Callable[[], bool]
+    ) -> Answer:
+        """Answer a request of the page, as `View.answer` does.
 
-        The question "growth" asks for the share of the points that was read.
+        The request "growth" returns the share of the points that has been read.
         """
         if question == "growth":
             header = {"complete": self._complete, "error": self._error, "share": self._share}
             return header | {"version": self._view.version}, {}
         is_sample = not self._complete
-        header, arrays = self._view.answer(question, arguments, abandoned)
+        header, arrays = self._view.answer(question, arguments, is_disconnected)
         if question == "state" and is_sample:
             header |= {"growing": True, "points": self.total, "exports": []}
         if question == "points":
@@ -760,7 +796,7 @@ class GrowingView:
         return header, arrays
 
     def _start(self) -> None:
-        """Start to read all points, once."""
+        """Start reading all points, unless reading has already started."""
         with self._lock:
             if self._reading is None:
                 self._reading = threading.Thread(target=self._grow, name="reading", daemon=True)
@@ -778,6 +814,6 @@ class GrowingView:
         self._complete = True
 
     def _show(self, points: Points, share: float) -> None:
-        """Show more points, a share of all of which has been read."""
+        """Display the points that have been read so far, which are a share of all points."""
         self._share = share
-        self._view.show(points, keep_scales=True)
+        self._view.replace_points(points, keep_scales=True)

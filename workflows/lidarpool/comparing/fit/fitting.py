@@ -9,18 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import Field
 
 from lidarsim._version import __version__
+from lidarsim.base.checks import check_number
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.extras import need
-from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.trajectory import Pose
@@ -47,15 +45,12 @@ _MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not on
 class Fit:
     """Result of `fit`, which is printed as a table."""
 
-    __signature__ = ReadableSignature()
-
     figures: dict[str, Any]  # numbers and texts of the page; lengths in meters
     model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:
         return rendered("fit.txt", report=self.figures).rstrip("\n")
 
-    @checked
     def save(self, file: str | Path) -> list[Path]:
         """Write the sensor file and an .html page next to it, and return both paths.
 
@@ -83,7 +78,6 @@ class Fit:
         return [*contents]
 
 
-@checked
 def fit(
     recording: str | Path | Cloud | StoredCloud | Recording,
     *,
@@ -92,7 +86,7 @@ def fit(
     pose: Pose | Sequence[Any] | np.ndarray | None = None,
     sensor: str | None = None,
     intensity: str | None = None,
-    white: Annotated[float, Field(gt=0)] | None = None,
+    white: float | None = None,
 ) -> Fit:
     """Fit the performance parameters of a sensor to recorded sweeps.
 
@@ -132,6 +126,8 @@ def fit(
         If the recording cannot be read, has no sweeps or rings, or contains several sensors; if the
         sensor moves, but the scene or the poses are unknown; or if scipy is missing.
     """
+    if white is not None:
+        check_number("white", white, gt=0)
     need("scipy", "fit", "Fitting sensor models")
     named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):

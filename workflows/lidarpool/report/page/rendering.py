@@ -102,12 +102,8 @@ def put_picture(page: Path, name: str, svg: str) -> None:
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
-class _Mark(NamedTuple):
-    """A station seen from above."""
-
-    column: float  # pixels from the west
-    row: float  # pixels from the north
-    number: int
+# A station seen from above: pixels from the west and from the north, and its number.
+_Mark = tuple[float, float, int]
 
 
 def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
@@ -121,7 +117,7 @@ def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
     pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.corner) / cloud.pixel_m
     is_within = ((pixels >= 0) & (pixels <= (columns, rows))).all(axis=1)
     return [
-        _Mark(float(x), float(rows - y), int(index) + 1)
+        (float(x), float(rows - y), int(index) + 1)
         for (x, y), index in zip(pixels[is_within], indices[is_within], strict=True)
     ]
 
@@ -375,10 +371,7 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters.
-
-    Names in files may contain characters that reverse a line.
-    """
+    """Replace unprintable characters, such as those that reverse a line."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )

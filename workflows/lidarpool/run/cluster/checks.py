@@ -14,11 +14,11 @@ from distributed import Client
 
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
-from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
+from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from lidarsim.simulator.memory import MB, cast_bytes
 from poolpart import Pool, PoolError, WorkerInfo
-from poolpart.task_locations import look_for_tasks
-from poolpart.workers import ask_workers, worker_identities
+from poolpart.task_locations import take_snapshot
+from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
 from ...base.software import describe_difference, software, software_query
@@ -33,10 +33,7 @@ LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """Error for a partition without enough workers or slots.
-
-    More workers may join.
-    """
+    """Error for a partition without enough workers or slots, which may still join."""
 
 
 class SurveyWorkers(NamedTuple):
@@ -49,10 +46,7 @@ class SurveyWorkers(NamedTuple):
 
 
 def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
-    """Return the slots that a run needs in each partition, {name: slots}.
-
-    Writing jobs takes a slot of LIDAR.
-    """
+    """Return the slots that a run needs in each partition, {name: slots}."""
     return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 
@@ -60,7 +54,7 @@ def find_workers(
     client: Client,
     required_slots: Mapping[str, int],
     requested: str,
-    advice: str = AUTO_TAKES,
+    advice: str = AUTO_ADVICE,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
     *,
@@ -101,7 +95,7 @@ def find_workers(
         except TooFewWorkersError as error:
             coming = 0  # jobs in a queue, which does not say which jobs have died
             if waiting is not None:
-                coming = sum(look_for_tasks(client, name).coming for name in required_slots)
+                coming = sum(take_snapshot(client, name).queued_jobs for name in required_slots)
             # A worker that has just died takes half a minute not to answer, which does not count
             # as waiting: the remaining time is taken at the start of this attempt.
             if waiting is None or not waiting.remaining_s(start_s):
@@ -188,7 +182,7 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
     """Check that the workers at these addresses have the driver's Python and sources."""
     driver_version = platform.python_version()
-    for address, python in ask_workers(client, platform.python_version, workers).items():
+    for address, python in run_on_workers(client, platform.python_version, workers).items():
         # Code is sent to workers by value, which needs the same minor version.
         if str(python).split(".")[:2] != driver_version.split(".")[:2]:
             raise LidarError(
@@ -228,7 +222,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
                 "machines, and restart the worker."
             )
     can_write = partial(_check_installed, written)
-    for address, answer in ask_workers(client, can_write, writing).items():
+    for address, answer in run_on_workers(client, can_write, writing).items():
         if isinstance(answer, LidarError):
             raise LidarError(
                 f"The worker at {address} cannot write the results. {answer}"
@@ -266,7 +260,7 @@ def _answers(
     client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
     """Return the answers of workers by address, or raise the first error."""
-    answers = ask_workers(client, question, workers)
+    answers = run_on_workers(client, question, workers)
     if workers and not answers:
         raise TooFewWorkersError(
             "The workers of partition 'GPU' left before the run started. See their logs."
@@ -293,7 +287,7 @@ def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend:
 
 
 def common_backend(
-    client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_TAKES
+    client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_ADVICE
 ) -> str:
     """Return the name of a ray-casting backend that all these workers have.
 

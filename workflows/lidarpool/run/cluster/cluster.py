@@ -157,7 +157,7 @@ class Cluster:
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
             self._request_slots(first, store, required_slots)
-            workers = find_workers(
+            self._workers = find_workers(
                 client,
                 required_slots,
                 store.backend or options.backend,
@@ -166,11 +166,14 @@ class Cluster:
                 waiting,
                 writing=store.only_job is None,
             )
-            self._pool = workers.pool
-            self._casting = workers.casting
-            self.backend = workers.backend
-            self.software = workers.software
-            self._check_jobs(first, store)
+            self.backend = self._workers.backend
+            self.software = self._workers.software
+            only_job = store.only_job
+            if only_job is not None:  # jobs of campaigns are written in formats of the table
+                check_formats(client, self._workers.pool, first.outputs)
+            store.cast_with(self.backend, self.software)
+            if only_job is not None:  # jobs of a campaign are checked when they begin
+                self.check(only_job.job)
         except LidarError:
             self._release_slots()
             raise
@@ -178,11 +181,11 @@ class Cluster:
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._lost_error() from error
             raise
-        names = sorted({name for worker in self._pool for name in worker.partitions})
+        names = sorted({name for worker in self._workers.pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
         # Slots of LIDAR without the long stages, as the slots are at the start.
         self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
-        if note := gpu_note(self._pool, self._casting, self.backend):
+        if note := gpu_note(self._workers.pool, self._workers.casting, self.backend):
             store.notes.append(note)
         self._callers_error: BaseException | None = None
         timeline.mark(timeline.CHECKED)
@@ -195,22 +198,14 @@ class Cluster:
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
         for name, slots in required_slots.items():
-            self.partitions[name].want(max(slots, scan_count) if name == GPU else slots)
-
-    def _check_jobs(self, first: Job, store: RunStore) -> None:
-        """Check formats and memory for a single job, and store the software of the run."""
-        if store.only_job is not None:  # jobs of campaigns are written in formats of the table
-            check_formats(self.client, self._pool, first.outputs)
-        store.cast_with(self.backend, self.software)
-        if store.only_job is not None:  # jobs of a campaign are checked when they begin
-            self.check(store.only_job.job)
+            self.partitions[name].request_slots(max(slots, scan_count) if name == GPU else slots)
 
     def _release_slots(self) -> None:
         """Let partitions shrink that have grown for the run."""
         if self.client.status == "running":
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
-                    partition.want(0)
+                    partition.request_slots(0)
 
     def _lost_error(self) -> LidarError:
         return LidarError(
@@ -228,13 +223,10 @@ class Cluster:
 
     def check(self, job: Job) -> None:
         """Raise JobError if the workers have too little memory for a job."""
-        check_workers(job, self.options, self.backend, self._casting)
+        check_workers(job, self.options, self.backend, self._workers.casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the user.
-
-        Its OSError must not look like an error of the cluster.
-        """
+        """Call a callback of the user, whose OSError must not look like an error of the cluster."""
         try:
             callback(*arguments)
         except BaseException as error:
@@ -251,13 +243,13 @@ class Cluster:
             yield
             return
         with suppress(PoolError):
-            self._screen.tell(f"partitions page: {self._pool.page()}")
+            self._screen.tell(f"partitions page: {self._workers.pool.page()}")
         try:
             yield
         finally:
             if self.client.status == "running":
                 with suppress(PoolError, *_CLUSTER_LOST):
-                    self._pool.leave_page()
+                    self._workers.pool.leave_page()
 
     @contextmanager
     def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:

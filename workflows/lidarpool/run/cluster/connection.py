@@ -170,9 +170,7 @@ class StartedAhead(AbstractContextManager[Client]):
 
 @contextmanager
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Start a cluster and yield its client.
-
-    The cluster ends with the body.
+    """Start the cluster of a file, yield its client, and stop the cluster after the body.
 
     `tell` is called when the cluster has started, and with messages about failing workers.
     LidarError if the cluster does not start.
@@ -188,9 +186,7 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Start a cluster and yield its client.
-
-    The cluster ends with the body.
+    """Start a cluster, yield its client, and stop the cluster after the body.
 
     Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
     all jobs in the queue, and an interrupt while workers are being stopped waits until they are.
@@ -269,10 +265,7 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
 
 
 def _root(error: BaseException) -> BaseException:
-    """Return the first cause of an error.
-
-    The answer of a foreign program may cause any error.
-    """
+    """Return the first cause of an error, which may be any error of a foreign program."""
     cause = error.__cause__ or error.__context__
     # An operation that a time-out has cut off says less than the time-out.
     if cause is None or isinstance(cause, asyncio.CancelledError):

@@ -10,7 +10,7 @@ from distributed import Future
 from lidarsim.base.plugins import Plugin
 from poolpart import Partition
 from poolpart.fetch import fetch_available
-from poolpart.task_locations import TaskLocations, look_for_tasks
+from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...base.software import call_with_plugins, call_with_same_sources
 from ..pipeline.task_book import TaskBook
@@ -19,9 +19,7 @@ T = TypeVar("T")
 
 
 class Tasks(Generic[T]):
-    """Submitted tasks of a partition.
-
-    `book` has the records of finished tasks.
+    """Submitted tasks of a partition, and a `book` with the records of finished tasks.
 
     Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
@@ -57,22 +55,16 @@ class Tasks(Generic[T]):
         return results
 
     def take_failed(self) -> list[tuple[T, Future]]:
-        """Remove failed and cancelled tasks, and return their purposes and futures.
-
-        Dask repeats lost tasks, but not these.
-        """
+        """Remove and return failed and cancelled tasks, which Dask does not repeat."""
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
-    def look(self) -> TaskLocations:
+    def look(self) -> PartitionSnapshot:
         """Return the locations of the running tasks."""
         keys = [future.key for future in self.running]
-        return look_for_tasks(self._client, self.partition.name, keys)
+        return take_snapshot(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Cancel all tasks.
-
-        Tasks that have begun run to their end.
-        """
+        """Cancel all tasks, although tasks that have begun run to their end."""
         self._client.cancel([*self.running])
         self.running.clear()

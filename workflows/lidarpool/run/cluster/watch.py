@@ -13,7 +13,7 @@ from distributed import Client
 from lidarsim.base.errors import LidarError, as_sentence
 from lidarsim.base.vocabulary import PATIENCE_S
 from lidarsim.base.words import plural
-from poolpart.task_locations import look_for_tasks
+from poolpart.task_locations import take_snapshot
 from poolpart.workers import worker_identities
 
 WATCH_EVERY_S = 1.0
@@ -91,10 +91,7 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check the partitions if the last check is old.
-
-        Raises LidarError if workers are missing.
-        """
+        """Raise LidarError if workers are missing, unless the last check is recent."""
         now_s = time.monotonic()
         if now_s - self._looked < WATCH_EVERY_S:
             return
@@ -118,11 +115,10 @@ class Watch:
                 advice = "their memory is nearly full. Start them with a larger `--memory-limit`"
                 waiting.tell(f"paused workers of partition {name}", advice)
             else:
-                coming = look_for_tasks(self.client, name).coming
+                coming = take_snapshot(self.client, name).queued_jobs
                 waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
-        """Report a paused worker at its first appearance."""
         note = (
             f"Dask paused worker {worker['name']} of partition {partition}, because its memory "
             f"is nearly full (limit: {format_bytes(worker['memory_limit'])}). Other workers take "

@@ -20,7 +20,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.survey.survey import Survey
 from poolpart import Partition
 from poolpart.fetch import fetch_available
-from poolpart.task_locations import TaskLocations, look_for_tasks
+from poolpart.task_locations import PartitionSnapshot, take_snapshot
 from poolpart.workers import worker_identities
 
 from ...base.shared_memory import Pickled, SharedHandle, SharedValue
@@ -75,7 +75,7 @@ class CastingWorkers:
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._refreshed_at = float("-inf")
-        self.locations = TaskLocations()
+        self.locations = PartitionSnapshot()
         self._requested_slots = -1  # number that the scheduler knows
         self._adapts = True  # False once the partition is known not to adapt to requests
         self.notes: list[str] = []  # notes for the user
@@ -258,7 +258,7 @@ class CastingWorkers:
 
     # -- checking workers --------------------------------------------------------------------
 
-    def refresh(self) -> TaskLocations | None:
+    def refresh(self) -> PartitionSnapshot | None:
         """Handle workers that have joined or left, or take no tasks, if the last check is old.
 
         Returns the locations of workers and casting tasks, or None if the last check is recent.
@@ -269,7 +269,7 @@ class CastingWorkers:
             return None
         self._refreshed_at = time.monotonic()
         keys = [future.key for future in self.futures]
-        self.locations = look_for_tasks(self._client, self._partition.name, keys)
+        self.locations = take_snapshot(self._client, self._partition.name, keys)
         for address in self._workers.keys() - self.locations.members - self._refused:
             self._remove(address)
         for address in sorted(self.locations.free.keys() - self._workers.keys()):
@@ -310,7 +310,7 @@ class CastingWorkers:
         """
         if slots != self._requested_slots and self._adapts:
             self._requested_slots = slots
-            self._adapts = self._partition.want(slots)
+            self._adapts = self._partition.request_slots(slots)
         if not slots:  # payloads on workers would keep these workers
             for payload in self._payloads:
                 payload.release()

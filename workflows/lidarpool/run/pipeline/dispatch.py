@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 from ...columns.parts import part_name
 from . import policies
@@ -194,7 +194,7 @@ class Dispatcher:
                     self._offer_again(batch, outcome.value)
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
 
-    def reclaim_lost(self, locations: TaskLocations) -> None:
+    def reclaim_lost(self, locations: PartitionSnapshot) -> None:
         """Offer batches again whose workers died, are silent or late, or take no tasks."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)

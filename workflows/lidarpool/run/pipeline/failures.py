@@ -9,7 +9,7 @@ from distributed import Client, Future, KilledWorker
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from poolpart.task_context import WorkerLeft
+from poolpart.task_context import WorkerLeavingError
 
 from .stage_messages import scans_in_words
 
@@ -41,12 +41,12 @@ class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened
 def naming_scans(first: int, stop: int) -> Iterator[None]:
     """Prefix the message of any error with the current scans.
 
-    The error becomes a ScanError, because a ScanError can always be sent through Dask; a WorkerLeft
-    passes unchanged, since the scans are not its cause.
+    The error becomes a ScanError, because a ScanError can always be sent through Dask. A
+    WorkerLeavingError passes unchanged, since the scans are not its cause.
     """
     try:
         yield
-    except WorkerLeft:
+    except WorkerLeavingError:
         raise
     except Exception as error:
         words = scans_in_words(first, stop)
@@ -66,7 +66,7 @@ def error_of(future: Future) -> BaseException | None:
 
 def was_killed(future: Future) -> bool:
     """Return True if a task failed because its workers kept dying or its worker left."""
-    return isinstance(error_of(future), (KilledWorker, WorkerLeft))
+    return isinstance(error_of(future), (KilledWorker, WorkerLeavingError))
 
 
 def raise_if_failed(future: Future, activity: str, kind: type[LidarError] = LidarError) -> None:

@@ -19,9 +19,9 @@ from distributed import Client, secede
 from lidarsim.base.storage import Storage
 from lidarsim.survey.survey import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
-from poolpart.fetch import fetch_available, hold_for_driver
-from poolpart.pipe import advice_of
-from poolpart.task_context import telling_departure
+from poolpart.fetch import fetch_available, hold_bytes
+from poolpart.pipe import get_advice
+from poolpart.task_context import translate_leaving_errors
 
 from ...columns.parts import pack
 from .failures import ScanError, naming_scans, storing
@@ -47,7 +47,7 @@ FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 News = Scans | ColumnsLost | Failed  # message to the driver
 
 
-@telling_departure()
+@translate_leaving_errors()
 def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 1: describe the scans of surveys in order.
 
@@ -76,7 +76,7 @@ def _describe_scans(
                 survey: Survey = pickle.loads(description.survey)  # noqa: S301 - of the run's own driver
             while first < description.stop:
                 item = ScanRange(
-                    description.job, first, min(first + advice_of(outlet), description.stop)
+                    description.job, first, min(first + get_advice(outlet), description.stop)
                 )
                 with naming_scans(item.first, item.stop):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described
@@ -87,7 +87,7 @@ def _describe_scans(
             yield Failed(description.job, GENERATE, str(error))
 
 
-@telling_departure()
+@translate_leaving_errors()
 def sort_frames(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of the scans of each survey into scan order.
 
@@ -137,7 +137,7 @@ class _ScanOrder:
         return ready
 
 
-@telling_departure()
+@translate_leaving_errors()
 def collect(
     start: StageStart, storage: Storage, probe: tuple[str, bytes], inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
@@ -181,7 +181,7 @@ def _write_parts(
                 receipt = Receipt.from_part(batch.part, job, name, size, batch.record)
             start.trace("part", scans)
             if storage is None:
-                yield replace(receipt, held_at=hold_for_driver(name, b"".join(pieces)))
+                yield replace(receipt, held_at=hold_bytes(name, b"".join(pieces)))
                 continue
             with storing(storage):
                 storage.write(name, pieces)

@@ -28,9 +28,9 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural
 from poolpart import Partition, Pipe, PipeFailed
-from poolpart.fetch import fetch_available, take_held
-from poolpart.pipe import advise, forget_pipes, take_news
-from poolpart.task_locations import TaskLocations, look_for_tasks
+from poolpart.fetch import fetch_available, fetch_held_bytes
+from poolpart.pipe import delete_pipes, exchange_items, set_advice
+from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...base.software import call_with_same_sources
 from ...columns.parts import probe_name
@@ -144,7 +144,7 @@ class LongStages:
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
         puts = {name: [orders] for name, orders in self._outbox.items()}
         self._outbox = {}
-        news = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=linger_s)
+        news = exchange_items(self.client, seconds, pipes, keys, puts=puts, linger_s=linger_s)
         return [*chain.from_iterable(news.values())]
 
     def send(self, name: str, messages: Sequence[Order]) -> None:
@@ -159,12 +159,12 @@ class LongStages:
 
     def advise(self, scans: int) -> None:
         """Set the number of scans that stage 1 puts into an item."""
-        advise(self._scans, scans)
+        set_advice(self._scans, scans)
 
     def store_held(self, receipt: Receipt) -> bool:
         """Store a part that its worker holds in memory, and return False if the part is lost."""
         self._hidden.add(receipt.held_at)
-        data = take_held(self.client, receipt.held_at, receipt.name)
+        data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
             return False
         with storing(self._storage):
@@ -236,9 +236,9 @@ class LongStages:
             "repeat the run."
         )
 
-    def _locate(self) -> TaskLocations:
+    def _locate(self) -> PartitionSnapshot:
         keys = [task.future.key for task in self._tasks.values()]
-        return look_for_tasks(self.client, self.partition.name, keys)
+        return take_snapshot(self.client, self.partition.name, keys)
 
     # -- restarting --------------------------------------------------------------------------
 
@@ -294,12 +294,12 @@ class LongStages:
         return died, started
 
     @staticmethod
-    def _is_queued(task: _StageTask, locations: TaskLocations, now_s: float) -> bool:
+    def _is_queued(task: _StageTask, locations: PartitionSnapshot, now_s: float) -> bool:
         """Return True if a task waits behind another, on a worker with more tasks than slots."""
         return (
             task.dead_since is None
             and now_s - task.since > SETTLE_S
-            and not locations.runs_for_long(task.future.key)
+            and not locations.is_long_running(task.future.key)
             and locations.free.get(task.worker, 0) < 0
         )
 
@@ -346,7 +346,7 @@ class LongStages:
         self._submitted += 1
         earlier = self._tasks.get(name)
         if earlier is not None:
-            forget_pipes(self.client, [earlier.inlet.name])
+            delete_pipes(self.client, [earlier.inlet.name])
         inlet = Pipe(
             f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client, fails_with_tasks=False
         ).create()
@@ -414,7 +414,7 @@ class LongStages:
             results = fetch_available(self.client, ended)
             return [results[key] for key in ended if key in results]
         finally:
-            forget_pipes(self.client, [pipe.name for pipe in self._pipes])
+            delete_pipes(self.client, [pipe.name for pipe in self._pipes])
             # Dask would keep the lock; another run may hold it.
             self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
             # In one message: the answer to a second one could miss a client that leaves.

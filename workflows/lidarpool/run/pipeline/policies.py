@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from poolpart.task_locations import TaskLocations
+from poolpart.task_locations import PartitionSnapshot
 
 from .batches import Batch, BatchState, Outcome
 from .stage_names import COLLECT, INTERSECT
@@ -357,7 +357,7 @@ def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
 
 
 def loss(
-    batch: Batch, locations: TaskLocations, prepared_workers: int, now_s: float, late_s: float
+    batch: Batch, locations: PartitionSnapshot, prepared_workers: int, now_s: float, late_s: float
 ) -> Outcome | None:
     """Return why a batch should be offered again although its task has not failed, or None.
 

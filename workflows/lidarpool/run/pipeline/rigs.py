@@ -31,7 +31,7 @@ from lidarsim.simulator.points.device_columns import DevicePoints
 from lidarsim.simulator.rig import Rig
 from lidarsim.survey.survey import Survey
 from poolpart import own_device, own_device_share
-from raybeam.registry import choose
+from raybeam.registry import choose_backend
 
 from ...base.shared_memory import Pickled, SharedHandle
 from ...base.tracing import trace
@@ -219,7 +219,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
             threads = get_worker().state.nthreads
             device = own_device()
             if device is not None:
-                choose(backend).limit_memory(device, own_device_share())
+                choose_backend(backend).limit_memory(device, own_device_share())
             rig = Rig(static_scene.with_actors(actors), survey, backend, threads, device)
         else:
             raise RigMissing(f"This worker has no scene {scene_handle!r}.")

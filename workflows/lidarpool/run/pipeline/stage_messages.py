@@ -13,7 +13,6 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats32, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -183,8 +182,6 @@ class ScanFrame:
     samples
         End points of a few rays, in meters in local coordinates. float32 array of shape (m, 3).
     """
-
-    __signature__ = ReadableSignature()
 
     scan: int
     sensor: str

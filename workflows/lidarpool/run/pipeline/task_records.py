@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from distributed import get_worker
 
-from poolpart.workers import resources_here
+from poolpart.workers import declared_resources
 
 T = TypeVar("T")
 
@@ -58,7 +58,7 @@ class Recorder:
             stage=self.stage,
             partition=self.partition,
             worker=str(worker.name),
-            resources=resources_here(worker),
+            resources=declared_resources(worker),
             start=self.start,
             stop=self.start + (time.perf_counter() - self._start_s),
             items=items,

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
-from lidarsim.base.validation import checked
 from lidarsim.base.words import rounded
 from lidarsim.sensor import Sensor
-from lidarsim.simulator.casting.scene_caster import AUTO_TAKES
+from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 
 from ...base.field_words import describe_changes
 from ...base.fingerprint import fingerprint
@@ -350,7 +349,7 @@ class RunStore:
     def advice(self) -> str:
         """Advice if the backend is not available, for the end of a message."""
         if not self.committed_in_words:
-            return AUTO_TAKES
+            return AUTO_ADVICE
         return (
             f"The scans in {self.location} were cast with this backend. Continue the run where "
             f"this backend is available, or remove the scans with {_DROP}."
@@ -553,7 +552,6 @@ def parts_of(location: Storage, parts_location: str) -> Storage:
     return Storage.at(folder or "/").below(name) if parts_location else location.below(PARTS)
 
 
-@checked
 def remove_run(folder: str | Path | Storage) -> None:
     """Remove a stored run and its parts, but no other files.
 

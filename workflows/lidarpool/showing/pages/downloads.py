@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from lidarview.viewer.view import Downloads
+from lidarview.viewer.view import DownloadFormats
 
 from ...clouds.writing import ExportSpec, save_cloud
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 
 
-def downloads() -> Downloads:
+def downloads() -> DownloadFormats:
     """Return the formats of a download whose packages are installed, and their writer."""
-    return Downloads([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)
+    return DownloadFormats([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)

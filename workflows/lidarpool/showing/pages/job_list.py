@@ -16,9 +16,9 @@ import numpy as np
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural, rounded
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarview.viewer.point_selection import OrderedPoints
+from lidarview.viewer.point_selection import ScanOrderedPoints
 from lidarview.viewer.result_views import wait_for_interrupt
-from lidarview.viewer.server import Answer, Arguments, announced, page_server
+from lidarview.viewer.server import Answer, Arguments, announce_page, page_server
 from lidarview.viewer.view import View
 
 from ...clouds.format_table import data_set_title
@@ -129,7 +129,7 @@ class JobList:
         scans = saved.scans[: len(read)].astype(np.int32).repeat([len(sweep) for sweep in read])
         cloud = joined_cloud(read, scan=scans)
         title = f"job {row.name} - {self.title}"
-        return View(OrderedPoints(cloud), None, saved, title=title, downloads=downloads())
+        return View(ScanOrderedPoints(cloud), None, saved, title=title, downloads=downloads())
 
 
 def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
@@ -137,7 +137,7 @@ def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
     stopped = threading.Event()
     with page_server(jobs.answer, port, stopped.set, index="jobs.html") as page:
         words = f"{page.url} shows {plural(len(jobs.rows), 'job')}. Press Ctrl-C to stop."
-        with announced(page, words, browser, on_stdout=True):
+        with announce_page(page, words, browser, on_stdout=True):
             wait_for_interrupt(stopped)
 
 

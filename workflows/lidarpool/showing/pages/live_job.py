@@ -16,7 +16,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarview.picture_file import PictureContent
-from lidarview.viewer.point_selection import HeldPoints
+from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import Answer
 from lidarview.viewer.view import View
 
@@ -96,7 +96,9 @@ class LiveJob:
         """Show the written cloud, with its sweeps: the parts are gone."""
         view = self.view
         view.sweeps = self._job.sweeps
-        view.show(CloudFile(cloud, () if view.pictured is None else view.pictured.extra_columns))
+        view.replace_points(
+            CloudFile(cloud, () if view.pictured is None else view.pictured.extra_columns)
+        )
         self._end_version += 1
 
     # -- the page's side -----------------------------------------------------------------
@@ -144,7 +146,7 @@ class LiveJob:
                 sweeps = job.sweeps if self._all_read else None
                 title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
                 self._view = View(
-                    HeldPoints(self.cloud), pictured, sweeps, title=title, downloads=downloads()
+                    InMemoryPoints(self.cloud), pictured, sweeps, title=title, downloads=downloads()
                 )
                 self._view.read_hit_counts = lambda: drawn.triangle_hit_counts(self.hit_counts())
             return self._view
@@ -153,7 +155,7 @@ class LiveJob:
         """Show the points in the view, if there is a view."""
         with self._making:
             if self._view is not None:
-                self._view.show(HeldPoints(self.cloud))
+                self._view.replace_points(InMemoryPoints(self.cloud))
 
     def news(self) -> Answer:
         """Return the news of the job, under way or at its end."""
@@ -171,10 +173,10 @@ class LiveJob:
             "hits_version": round(10 * np.log1p(self._hit_count)),
             "rays_version": newest,
             "time": self._job.survey.begins_ns(newest) / 1e9 if frames else None,
-            "path": view.planned,
+            "path": view.planned_path,
             "ends": self._end_version,
         }
-        return header, {"rays": _rays_of(frames) if frames else view.rays_shown}
+        return header, {"rays": _rays_of(frames) if frames else view.displayed_rays}
 
 
 def _rays_of(frames: list[ScanFrame]) -> Floats32:

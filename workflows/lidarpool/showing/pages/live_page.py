@@ -24,7 +24,7 @@ from lidarview.viewer.server import (
     Answer,
     Arguments,
     PageServer,
-    announced,
+    announce_page,
     page_server,
 )
 from poolpart import Partition
@@ -206,6 +206,6 @@ def live_page(
     index = VIEWER if jobs == 1 else "jobs.html"
     with (
         page_server(live.answer, port, live.stopped.set, index=index) as live.page,
-        announced(live.page, f"live page: {live.page.url}", browser),
+        announce_page(live.page, f"live page: {live.page.url}", browser),
     ):
         yield live

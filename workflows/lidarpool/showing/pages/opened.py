@@ -18,7 +18,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.text_cloud import is_text_raster
 from lidarview.viewer.result_views import join_views, open_result
-from lidarview.viewer.view import CLOUD, GrowingView, View
+from lidarview.viewer.view import CLOUD, ProgressiveView, View
 
 from ...datasets.dataset import INDEX_FILE
 from .downloads import downloads
@@ -144,7 +144,7 @@ def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View
         raise LidarError(f"{error} If it is a trajectory, {_TRAJECTORY_ADVICE}.") from error
 
 
-def growing_view(path: Path, *, keep_noise: bool = False) -> GrowingView | None:
+def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | None:
     """Return the view of a large .las or .laz, which shows more points while they are read.
 
     None for other files and folders. LidarError if the file cannot be read.

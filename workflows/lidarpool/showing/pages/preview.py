@@ -16,7 +16,7 @@ from lidarsim.columns.table import AXES, SCAN, TABLE
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarview.picture_file import PictureContent
-from lidarview.viewer.point_selection import OrderedPoints
+from lidarview.viewer.point_selection import ScanOrderedPoints
 from lidarview.viewer.view import View
 
 from ...report.picture_content import planning_picture
@@ -71,7 +71,7 @@ def preview_of(job: Job, note: str, title: str) -> View:
         columns = {name: values for name, values in cloud.columns.items() if name != MATERIAL.name}
         cloud = replace(cloud, columns=columns)
     sweeps = job.sweeps
-    return View(OrderedPoints(cloud), content, sweeps, note, title, preview=True)
+    return View(ScanOrderedPoints(cloud), content, sweeps, note, title, preview=True)
 
 
 def first_sweeps(job: Job) -> Iterator[Cloud]:

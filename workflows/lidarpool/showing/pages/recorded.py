@@ -17,8 +17,8 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Column, Kind, Scale
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
-from lidarview.viewer.point_selection import STATION, HeldPoints, OrderedPoints, Points
-from lidarview.viewer.view import Downloads, GrowingView, View
+from lidarview.viewer.point_selection import STATION, InMemoryPoints, Points, ScanOrderedPoints
+from lidarview.viewer.view import DownloadFormats, ProgressiveView, View
 
 from ...clouds.recording import Recording
 
@@ -98,7 +98,7 @@ def _described(name: str, values: AnyArray) -> Column:
 def recorded_view(
     sensors: Mapping[str, Recording],
     title: str,
-    downloads: Downloads | None,
+    downloads: DownloadFormats | None,
     on_part: OnPart = lambda *_: None,
 ) -> View:
     """Return the view of the sensors of a recording, {name: recording}, with a player of sweeps.
@@ -125,7 +125,7 @@ def recorded_view(
     if sweeps is not None and sweeps.station_numbers.any():
         names[STATION.name] = _station_names(first, sweeps)
     return View(
-        OrderedPoints(cloud),
+        ScanOrderedPoints(cloud),
         None,
         sweeps,
         " ".join(notes),
@@ -152,7 +152,7 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
     """
     sample = shown(recording.read_sample(_SAMPLE_POINTS))
     view = View(
-        HeldPoints(joined_cloud([sample])),
+        InMemoryPoints(joined_cloud([sample])),
         note=" ".join(recording.notes),
         title=title,
         names={"class": ASPRS_CLASSES},
@@ -161,7 +161,9 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
     return view, sample
 
 
-def growing_view(recording: Recording, title: str, read: Callable[[OnPart], View]) -> GrowingView:
+def growing_view(
+    recording: Recording, title: str, read: Callable[[OnPart], View]
+) -> ProgressiveView:
     """Return a view that shows a sample of a cloud, and more points while `read` reads all."""
     total = recording.point_count or 0
     sampled, sample = sampled_view(recording, title)
@@ -171,11 +173,11 @@ def growing_view(recording: Recording, title: str, read: Callable[[OnPart], View
     def grow(show: Callable[[Points, float], None]) -> View:
         def on_part(part: Sweep, share: float) -> None:
             parts.append(part.select(slice(None, None, step)))
-            show(HeldPoints(joined_cloud(parts)), share)
+            show(InMemoryPoints(joined_cloud(parts)), share)
 
         return read(on_part)
 
-    return GrowingView(sampled, total, grow)
+    return ProgressiveView(sampled, total, grow)
 
 
 def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:

@@ -20,9 +20,9 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, AnyFloats, Floats
+from lidarsim.base.checks import check_items
 from lidarsim.base.errors import LidarError
 from lidarsim.base.notebook import cell_display
-from lidarsim.base.validation import checked
 from lidarsim.base.words import rounded
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
@@ -31,12 +31,12 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator import Scanner
 from lidarview.picture_file import PictureContent, SensorPositions
-from lidarview.viewer.point_selection import HeldPoints
+from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import (
     PORT,
     Answer,
     Arguments,
-    frame_of,
+    notebook_html,
     open_browser,
     page_server,
 )
@@ -53,7 +53,6 @@ MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a senso
 _RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
 
 
-@checked
 def show(
     scanner: Scanner | Sequence[Scanner], *, to: str | None = None, browser: bool = False
 ) -> ScannerPage:
@@ -92,7 +91,9 @@ def show(
     ...         pose = Pose((0.1 * number, 0, 1))
     ...         view.show(scanner.sweep(pose), pose)
     """
-    return ScannerPage([scanner] if isinstance(scanner, Scanner) else [*scanner], to, browser)
+    scanners = [scanner] if isinstance(scanner, Scanner) else scanner
+    check_items("scanner", scanners, Scanner)
+    return ScannerPage([*scanners], to, browser)
 
 
 class ScannerPage(ScannerView):
@@ -118,7 +119,7 @@ class ScannerPage(ScannerView):
         if cell_display() is None:
             click.echo(self.description, err=True)
             if browser:
-                open_browser(self._page.once())
+                open_browser(self._page.single_use_url())
 
     @property
     def description(self) -> str:
@@ -134,7 +135,7 @@ class ScannerPage(ScannerView):
         """Return the page in a frame, for the cell of a notebook."""
         if self._is_closed:
             return "<p>This page has been closed.</p>"
-        return frame_of(self._page, f"sweeps of {self._scanner.survey.sensor.model}")
+        return notebook_html(self._page, f"sweeps of {self._scanner.survey.sensor.model}")
 
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
         self._feed.put(scanner, cloud, pose, time_ns)
@@ -248,7 +249,7 @@ class SweepFeed:
                     coordinates="world",
                 )
                 title = f"{scanner.survey.sensor.model} - lidarpool"
-                self._view = View(HeldPoints(self._cloud()), pictured, title=title)
+                self._view = View(InMemoryPoints(self._cloud()), pictured, title=title)
                 self._shown = self._count
             return self._view
 
@@ -291,7 +292,7 @@ class SweepFeed:
             keep_scales = now < self._scales_until
             if not keep_scales:
                 self._scales_until = now + SCALES_S
-            view.show(HeldPoints(self._cloud()), keep_scales=keep_scales)
+            view.replace_points(InMemoryPoints(self._cloud()), keep_scales=keep_scales)
         return view.version
 
     def _cloud(self) -> Cloud:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import count
-from typing import Annotated, Any
-
-from pydantic import Field
+from typing import Any
 
 from lidarsim.base.arrays import Ints
+from lidarsim.base.checks import check_number, check_type
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.trajectory import Pose, Trajectory
@@ -27,19 +25,16 @@ from .transmitter import Transmitter, sensor_streams
 _AHEAD = 16  # sweeps that are cast before they are due, of a trajectory that is known
 _START_NS = 20e6  # time between the start of the schedule and the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
-Rate = Annotated[float, Field(ge=0.001, le=1000)]
-Seconds = Annotated[float | None, Field(gt=0)]
 
 
-@checked
 def play(
     scanner: Scanner,
     trajectory: Pose | Trajectory | Callable[[float], Any] | Sequence[float],
     *,
     to: str = LOOPBACK,
     api: str = "",
-    rate: Rate = 1.0,
-    duration_s: Seconds = None,
+    rate: float = 1.0,
+    duration_s: float | None = None,
     start: Any = None,
     ready: Callable[[str], Any] | None = None,
     note: Callable[[str], Any] | None = None,
@@ -91,8 +86,12 @@ def play(
     >>> lateness.sent
     242
     """
+    check_type("scanner", scanner, Scanner)
+    check_number("rate", rate, ge=0.001, le=1000)
+    if duration_s is not None:
+        check_number("duration_s", duration_s, gt=0)
     keep_freed_memory()
-    packets = Packets.of_scanner(scanner, start)
+    packets = Packets.for_scanner(scanner, start)
     names = {column.name for column in scanner.survey.stored_columns}
     if missing := [name for name in packets.columns if name not in names]:
         columns = "column" if len(missing) == 1 else "columns"

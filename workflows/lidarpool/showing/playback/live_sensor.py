@@ -43,7 +43,7 @@ class PacketsBridge(Bridge):
         if options.period_ns and instruments is not None:
             instruments = RepeatedInstruments.of(instruments, options.period_ns)
         sources = [
-            PacketSource.of_sensor(replace(sweeps, instruments=instruments), number)
+            PacketSource.for_sensor(replace(sweeps, instruments=instruments), number)
             for number in range(len(sweeps.sensors))
         ]
         self._encoders = [encoder_of(source) for source in sources]
@@ -61,7 +61,7 @@ class PacketsBridge(Bridge):
 
     def prepare(self, sweep: int, points: Cloud) -> None:
         """Encode a sweep by an encoder that is thrown away, which compiles loops."""
-        source = PacketSource.of_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
+        source = PacketSource.for_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
         encoder = encoder_of(replace(source, instruments=None))
         encoder.encode(self._shots(encoder, sweep, points))
 
@@ -69,7 +69,7 @@ class PacketsBridge(Bridge):
         """Hand the packets of a sweep to the process that sends them."""
         number = int(self.sweeps.sensor[sweep])
         encoder = self._encoders[number]
-        shots = self._shots(encoder, sweep, points).later(shift_ns)
+        shots = self._shots(encoder, sweep, points).shifted(shift_ns)
         self._transmitter.sender.send(number, encoder.encode(shots), self.schedule.deadlines_ns)
 
     def finish(self) -> None:

@@ -89,7 +89,7 @@ def recorded_streams(
             f"{recording.path.name} of {source}",
             {f"port {port}": port for port in recording.ports[source]},
             _service_of(recording),
-            told_apart=True,
+            distinguished_by_receivers=True,
         )
         for source in recording.sources
     ]

@@ -13,7 +13,7 @@ from typing import Self
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.words import did_you_mean, joined
 from lidarsim.packets.encoders import PacketEncoder
-from lidarsim.packets.send import LOOPBACK, Address, Sender, check_reachable
+from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
 
 # Returns the service of a sensor (`PacketEncoder.service`).
@@ -28,16 +28,17 @@ class Stream:
     model: str
     kinds: Mapping[str, int]  # {kind of datagrams: port}, the returns first
     make_service: MakeService
-    told_apart: bool = False  # see `PacketEncoder`
+    distinguished_by_receivers: bool = False  # see `PacketEncoder`
     has_own_address: bool = False
     destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
-    address: Address = field(default_factory=lambda: Address(LOOPBACK))  # address of the interface
+    # Address of the interface
+    address: ReceiverAddress = field(default_factory=lambda: ReceiverAddress(LOOPBACK))
     api_given: bool = False  # whether a user gives the address of the interface
 
     @property
     def source_address(self) -> str:
         """The address that datagrams come from: the interface's, or no text for any."""
-        to_this_machine = Address(self.destination.host).is_loopback
+        to_this_machine = ReceiverAddress(self.destination.host).is_loopback
         return self.address.host if to_this_machine or not self.address.is_loopback else ""
 
     @property
@@ -51,7 +52,7 @@ class Stream:
         ports = " and ".join(map(str, self.ports))
         return f"{words}, port {ports}" if ports else words
 
-    def to(self, receiver: Address) -> Stream:
+    def to(self, receiver: ReceiverAddress) -> Stream:
         """Return the stream to a receiver.
 
         Raises LidarError if its datagrams cannot go there.
@@ -71,7 +72,7 @@ class Stream:
                 f"With `--to {receiver}`, other packets of {self.name} would be sent to port "
                 f"{beyond[0]}, which is out of range. Use a port closer to {first}."
             )
-        check_reachable(Address(receiver.host, numbers.get(first)))
+        check_reachable(ReceiverAddress(receiver.host, numbers.get(first)))
         return replace(self, destination=Destination(receiver.host, numbers))
 
 
@@ -85,7 +86,7 @@ def sensor_streams(
             encoder.source.sensor.model,
             encoder.ports,
             encoder.service,
-            encoder.told_apart,
+            encoder.distinguished_by_receivers,
             encoder.has_own_address,
         )
         for encoder in encoders
@@ -108,7 +109,7 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
     for number, stream in enumerate(streams):
         name = stream.name
         moved = replace(
-            stream.to(receivers.get(name, Address(LOOPBACK))),
+            stream.to(receivers.get(name, ReceiverAddress(LOOPBACK))),
             address=interfaces.get(name, _loopback_address(number, stream.has_own_address)),
             api_given=name in interfaces,
         )
@@ -118,17 +119,19 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
     return placed
 
 
-def _loopback_address(number: int, has_own_address: bool) -> Address:
+def _loopback_address(number: int, has_own_address: bool) -> ReceiverAddress:
     """Return the default address of the interface of a sensor, by its number."""
-    return Address(f"127.0.0.{number + (2 if has_own_address else 1)}")
+    return ReceiverAddress(f"127.0.0.{number + (2 if has_own_address else 1)}")
 
 
-def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[str, Address]:
+def _by_sensor(
+    texts: Sequence[str], names: Sequence[str], option: str
+) -> dict[str, ReceiverAddress]:
     """Return the address of each sensor by its name.
 
     An address without a name is for all.
     """
-    addresses: dict[str, Address] = {}
+    addresses: dict[str, ReceiverAddress] = {}
     for text in texts:
         name, separator, address = text.rpartition("=")
         if separator and name not in names:
@@ -136,7 +139,7 @@ def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[
                 f"{option} {text} refers to the sensor {name!r}, which does not "
                 f"exist.{did_you_mean(name, names)} The sensors are {joined(names)}."
             )
-        parsed = Address.parse(address)
+        parsed = ReceiverAddress.parse(address)
         for sensor in [name] if separator else names:
             addresses[sensor] = parsed
     return addresses
@@ -148,7 +151,7 @@ def _check_apart(stream: Stream, other: Stream) -> None:
     host = stream.destination.host
     if host != other.destination.host or not shared:
         return
-    if stream.told_apart and stream.source_address != other.source_address:
+    if stream.distinguished_by_receivers and stream.source_address != other.source_address:
         return
     port = min(stream.ports[0], 60_000)
     raise LidarError(

@@ -11,8 +11,8 @@ import click
 import numpy as np
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import check_type
 from lidarsim.base.errors import LidarError
-from lidarsim.base.validation import checked
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Pose, Trajectory, pose_of, presence_ns
@@ -55,7 +55,6 @@ class ScannerView(ABC):
     def _end(self) -> None:
         """Disconnect all programs."""
 
-    @checked
     def show(
         self,
         cloud: Cloud,
@@ -149,8 +148,8 @@ class Foxglove(_InViewer):
         address can be reached from other machines.
     """
 
-    @checked
     def __init__(self, scanner: Scanner, to: str | None = None) -> None:
+        check_type("scanner", scanner, Scanner)
         super().__init__(open_viewer("foxglove", to), scanner)
 
 
@@ -162,8 +161,8 @@ class Rerun(_InViewer):
     (extra `rerun`).
     """
 
-    @checked
     def __init__(self, scanner: Scanner, to: str | None = None) -> None:
+        check_type("scanner", scanner, Scanner)
         super().__init__(open_viewer("rerun", to), scanner)
 
 

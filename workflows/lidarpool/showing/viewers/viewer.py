@@ -10,10 +10,11 @@ from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from ipaddress import ip_address
-from types import TracebackType
+from types import NoneType, TracebackType
 from typing import Any, NamedTuple, Self
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.checks import check_type
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import install_command
 from lidarsim.base.ports import port_number
@@ -107,6 +108,7 @@ class Address(NamedTuple):
 
         LidarError for other text, or if a server cannot listen there.
         """
+        check_type("to", text, str, NoneType)
         if text:
             address = cls._parse(text, port)
             address._check_free(count)

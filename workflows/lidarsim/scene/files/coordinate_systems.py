@@ -21,7 +21,7 @@ from ...base.arrays import Floats
 from ...base.elementary import sin_cos
 from ...base.errors import LidarError
 from ...base.extras import install_command
-from ...base.vectors import turned
+from ...base.vectors import rotate
 from ...base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
@@ -478,7 +478,7 @@ def _middle(item: SceneMesh | SceneInstance) -> Floats:
     if isinstance(item, SceneMesh):
         return np.asarray(item.bounds.mean(axis=0))
     middle = item.mesh.bounds.mean(axis=0)
-    return np.asarray(turned(middle[None], item.matrix[:3, :3])[0] + item.matrix[:3, 3])
+    return np.asarray(rotate(middle[None], item.matrix[:3, :3])[0] + item.matrix[:3, 3])
 
 
 def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:

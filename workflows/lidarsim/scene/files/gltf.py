@@ -19,7 +19,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import Floats
-from ...base.vectors import applied, length, matmul
+from ...base.vectors import matmul, matvec, norm
 from ...base.words import listed, plural, printable
 from ...motion.rotations import matrices
 from ..animation import RATE_HZ
@@ -343,7 +343,7 @@ class _NodeReader:
         ]
         total[unweighted] = 1.0
         blend /= total[:, None, None]
-        moved = applied(blend[:, :3, :3], vertices) + blend[:, :3, 3]
+        moved = matvec(blend[:, :3, :3], vertices) + blend[:, :3, 3]
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
@@ -396,7 +396,7 @@ def _matrices(
         return None
     transforms = np.tile(np.eye(4), (len(rows), 1, 1))
     if rotation is not None:
-        unit = rotation / length(rotation)[:, None]
+        unit = rotation / norm(rotation)[:, None]
         transforms[:, :3, :3] = matrices(unit)
     if scale is not None:
         transforms[:, :3, :3] *= scale[:, None]

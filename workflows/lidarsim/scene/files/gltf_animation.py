@@ -9,7 +9,7 @@ import numpy as np
 
 from ...base.arrays import AnyArray, Floats
 from ...base.elementary import arctan2, sin
-from ...base.vectors import length
+from ...base.vectors import norm
 from ...base.words import did_you_mean
 from .scene_graph import MeshFileError
 
@@ -113,14 +113,14 @@ def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotation
         sampled = _slerp(share, start_values, stop_values)
     else:
         sampled = (1 - share) * start_values + share * stop_values
-    return sampled / length(sampled)[:, None] if are_rotations else sampled
+    return sampled / norm(sampled)[:, None] if are_rotations else sampled
 
 
 def _slerp(u: Floats, start: Floats, stop: Floats) -> Floats:
     """Return quaternions (t, 4) at shares (t, 1) of the shorter rotation (Shoemake, 1985)."""
-    start, stop = (q / length(q)[:, None] for q in (start, stop))
+    start, stop = (q / norm(q)[:, None] for q in (start, stop))
     stop = np.where((start * stop).sum(axis=1, keepdims=True) < 0, -stop, stop)
-    angle = 2 * arctan2(length(stop - start), length(stop + start))[:, None]
+    angle = 2 * arctan2(norm(stop - start), norm(stop + start))[:, None]
     sine = sin(angle)
     small = sine < 1e-9
     sine = np.where(small, 1.0, sine)

@@ -18,9 +18,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from ...base.checks import check_fields
 from ...base.errors import LidarError, prefixed
 from ...base.plugins import Plugin, find_plugin, plugins_of
-from ...base.section_fields import is_section
 from ...base.words import did_you_mean, joined
 from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions
@@ -112,8 +112,8 @@ class MeshFormat:
 
 def _flaw(options: type) -> str:
     """Return why a class cannot be the options of a format, as a clause, empty if it can."""
-    if not (is_dataclass(options) and is_section(options)):
-        return "are not a dataclass with checked_fields"
+    if not is_dataclass(options):
+        return "are not a dataclass"
     for entry in fields(options):
         if entry.default is MISSING:
             return f"have no default for {entry.name}"
@@ -290,8 +290,13 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
     own_values = {name: value for name, value in values.items() if name not in _SHARED}
     shared_values = {name: value for name, value in values.items() if name in _SHARED}
     kind = row.own_options
+    shared = MeshOptions(**shared_values)
+    own = None if kind is None else kind(**own_values)
     with prefixed(path):
-        return MeshOptions(**shared_values), None if kind is None else kind(**own_values)
+        check_fields(shared)
+        if own is not None:
+            check_fields(own)
+    return shared, own
 
 
 def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:

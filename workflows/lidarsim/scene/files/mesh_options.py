@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ...base.declared import about
-from ...base.validation import checked_fields
 from ..transform import Transform
 
 LengthUnit = Annotated[
@@ -36,7 +35,6 @@ Opacity = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-@checked_fields
 class MeshOptions:
     """Options for reading a mesh file of any format.
 

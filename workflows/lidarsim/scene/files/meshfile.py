@@ -26,8 +26,7 @@ from ...base.errors import (
 )
 from ...base.extras import install_command
 from ...base.input_files import not_found, open_input, read_input
-from ...base.validation import checked
-from ...base.vectors import determinant, matmul, turned
+from ...base.vectors import determinant, matmul, rotate
 from ...base.vocabulary import UNITS_M
 from ...base.words import as_python, listed, plural, printable, rounded
 from ...motion.rotations import quaternions_of
@@ -97,7 +96,6 @@ class Objects(NamedTuple):
         return (*self.static, *map(_mesh_at_start, self.actors))
 
 
-@checked
 def load_objects(
     path: str | Path,
     *,
@@ -487,7 +485,7 @@ def _actor_of_part(
         )
     objects = [item.moved(name, scale * upright.linear, np.zeros(3)) for item in part.objects]
     linear = matmul(placement.linear, upright.linear)
-    positions = turned(part.positions, linear) + placement.offset
+    positions = rotate(part.positions, linear) + placement.offset
     reach_m = float(np.abs(positions).max())
     if not reach_m <= MAX_COORDINATE_M:
         return None, reach_m
@@ -508,4 +506,4 @@ def _corners(item: SceneMesh | SceneInstance) -> Floats:
     if isinstance(item, SceneMesh):
         return (item.animation or item).bounds
     box = np.array(list(product(*item.mesh.bounds.T)))
-    return np.asarray(turned(box, item.matrix[:3, :3]) + item.matrix[:3, 3])
+    return np.asarray(rotate(box, item.matrix[:3, :3]) + item.matrix[:3, 3])

@@ -6,7 +6,7 @@ import mapbox_earcut
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Ints
-from ...base.vectors import applied, length, turned
+from ...base.vectors import matvec, norm, rotate
 
 # For an outline that crosses itself everywhere, the clipper's time grows with the cube of the
 # corners: 20 s for this number. Larger outlines are probably broken files.
@@ -137,12 +137,10 @@ def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
     points = points - points[0]
     size = np.abs(points).max()
     normal = _newell(points)
-    deviation = np.ptp(applied(points, normal))
+    deviation = np.ptp(matvec(points, normal))
     a, b, c = np.moveaxis(triangles, 1, 0)
     missing = normal - np.cross(b - a, c - a).sum(axis=0)
-    return bool(
-        deviation > _WARPED * size * length(normal) and length(missing) > _WARPED * size * size
-    )
+    return bool(deviation > _WARPED * size * norm(normal) and norm(missing) > _WARPED * size * size)
 
 
 def _all_triangles(points: Floats) -> Ints:
@@ -153,15 +151,15 @@ def _all_triangles(points: Floats) -> Ints:
     count = len(points)
     points = points - points[0]
     normal = _newell(points)
-    normal = normal / length(normal)
+    normal = normal / norm(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    clipped = _clipped(turned(points, np.stack([across, np.cross(normal, across)])), [count])
+    clipped = _clipped(rotate(points, np.stack([across, np.cross(normal, across)])), [count])
     if len(clipped) == count - 2:
         return clipped
 
     def area(start: int) -> float:
         rotated = np.roll(points, -start, axis=0) - points[start]
-        return float(length(np.cross(rotated[1:-1], rotated[2:])).sum())
+        return float(norm(np.cross(rotated[1:-1], rotated[2:])).sum())
 
     best = min(range(count), key=area)
     return fanned((best + np.arange(count)) % count)
@@ -192,5 +190,5 @@ def _reflex_corners(points: Floats) -> Bools:
     bend = np.cross(into, out_of)
     normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
     bend_along_normal = (bend * normal[:, None]).sum(axis=2)
-    scale = length(into) * length(out_of)
-    return np.asarray(bend_along_normal < -_FLAT * scale * length(normal)[:, None])
+    scale = norm(into) * norm(out_of)
+    return np.asarray(bend_along_normal < -_FLAT * scale * norm(normal)[:, None])

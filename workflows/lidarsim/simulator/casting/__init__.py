@@ -1,1 +1,1 @@
-"""Casting: rays of a survey against a scene whose actors move, and the surfaces that they hit."""
+"""Cast the rays of a survey into a scene with moving actors, and look up the surfaces they hit."""

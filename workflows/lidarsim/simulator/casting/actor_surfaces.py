@@ -1,4 +1,4 @@
-"""Surfaces of actors, which move and may deform: their corners, and points on them."""
+"""Geometry of the triangles of actors, which move and may deform."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...base.arrays import Floats, Indices, Integers, Ints
-from ...base.vectors import applied, into_axes, products
+from ...base.vectors import dot, matvec, rotate_into_frames
 from ...motion.trajectory import velocities
 from .actor_trajectories import ActorTrajectories
 from .stored_triangles import StoredTriangles
@@ -16,32 +16,33 @@ _NO_ROWS = np.zeros(0, np.intp)
 
 
 class DeformedCorners(NamedTuple):
-    """Corners of triangles of actors that deform, in the frames of the actors: (n, 3, 3) each."""
+    """Corners of triangles of deforming actors, in the actors' frames. Each has shape (n, 3, 3)."""
 
     corners: Floats  # meters
     velocities: Floats  # m/s
-    at_rest: Floats  # corners of the mesh at rest
+    at_rest: Floats  # corners in the undeformed mesh
 
 
 class ActorSurfaces:
-    """Triangles of the actors of a scene, at times."""
+    """Positions and velocities of the actors' triangles at given times."""
 
     def __init__(self, triangles: StoredTriangles) -> None:
         self._triangles = triangles
 
-    def deformed(
+    def deformed_corners(
         self,
         triangle_indices: Indices,
         actors: Integers,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> DeformedCorners:
-        """Return the corners of triangles of actors that deform, at times (n,), nanoseconds.
+        """Return the corners of triangles of deforming actors at given times.
 
-        `triangle_indices` (n,) are rows of stored triangles, and `actors` (n,) their actors.
+        `triangle_indices` (n,) are rows of the stored triangles, `actors` (n,) are the actors that
+        they belong to, and `times` (n,) are in nanoseconds.
         """
         corners, corner_velocities, at_rest = np.empty((3, len(triangle_indices), 3, 3))
-        frames, frame_rates = trajectories.played(actors, times)
+        frames, frame_rates = trajectories.animation_frames(actors, times)
         mesh_numbers = self._triangles.actor_mesh[actors]
         for mesh_number in np.unique(mesh_numbers).tolist():
             mesh = self._triangles.meshes[mesh_number]
@@ -58,9 +59,10 @@ class ActorSurfaces:
     def _actor_rows(
         self, triangle: Integers, trajectories: ActorTrajectories
     ) -> tuple[Indices, Integers]:
-        """Return the indices in `triangle` (n,) of actors' triangles, and the actors: (k,) each.
+        """Return which of the given triangles belong to actors, and to which actors.
 
-        Without trajectories, nothing is an actor, and the arrays are empty.
+        The result is a pair of arrays (k,): indices into `triangle`, and actor numbers. Both are
+        empty if there are no trajectories.
         """
         if not trajectories:
             return _NO_ROWS, _NO_ROWS
@@ -76,27 +78,28 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> None:
-        """Move the points on actors, among points (n, 3), to the actors' meshes at rest, in place.
+        """Transform points on actors to the actors' undeformed meshes, in place.
 
-        Points are in the scene frame before, and in the frames of the actors afterwards. `triangle`
-        (n,) are the triangles of all points, `triangle_indices` (n,) the rows of the stored
-        triangles, and `times` (n,) are nanoseconds.
+        `points` (n, 3) are in the scene frame. Points on actors are replaced by the corresponding
+        points in the actors' frames; other points do not change. `triangle` (n,) are the triangles
+        of all points, `triangle_indices` (n,) are the rows of the stored triangles, and `times`
+        (n,) are in nanoseconds.
         """
         on_actors, actor = self._actor_rows(triangle, trajectories)
         if not len(on_actors):
             return
         positions, rotations = trajectories.poses(actor, times[on_actors].astype(np.float64))
-        points[on_actors] = into_axes(points[on_actors] - positions, rotations)
-        if len(deforming := trajectories.deforming(actor)):
+        points[on_actors] = rotate_into_frames(points[on_actors] - positions, rotations)
+        if len(deforming := trajectories.deforming_rows(actor)):
             deformed_rows = on_actors[deforming]
-            deformed = self.deformed(
+            deformed = self.deformed_corners(
                 triangle_indices[deformed_rows],
                 actor[deforming],
                 times[deformed_rows],
                 trajectories,
             )
             weights = _weights(deformed.corners, points[deformed_rows])
-            points[deformed_rows] = applied(deformed.at_rest.transpose(0, 2, 1), weights)
+            points[deformed_rows] = matvec(deformed.at_rest.transpose(0, 2, 1), weights)
 
     def velocities(
         self,
@@ -105,9 +108,9 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities of points (n, 3) on triangles (n,) in the scene frame, m/s: (n, 3).
+        """Return the velocities in m/s of points on triangles, in the scene frame.
 
-        Actors have their poses at times (n,), nanoseconds.
+        `points` have shape (n, 3). Actors have their poses at `times` (n,) in nanoseconds.
         """
         result = np.zeros((len(triangle), 3))
         on_actors, actor = self._actor_rows(triangle, trajectories)
@@ -119,7 +122,7 @@ class ActorSurfaces:
                 positions, _ = trajectory.poses(0, times_ns)
                 velocity, rate = velocities(trajectory, 0, times_ns)
                 result[row_indices] = velocity + np.cross(rate, points[row_indices] - positions)
-        if len(deforming := trajectories.deforming(actor)):
+        if len(deforming := trajectories.deforming_rows(actor)):
             row_indices = on_actors[deforming]
             result[row_indices] += self._deformation_velocities(
                 triangle[row_indices],
@@ -138,30 +141,31 @@ class ActorSurfaces:
         actor: Integers,
         trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities of points by the deformation of actors: (n, 3), m/s.
+        """Return the velocities in m/s that points have because their actors deform.
 
-        Points (n, 3) and velocities are in the scene frame; `actor` (n,) are the deforming actors.
+        Points (n, 3) and velocities (n, 3) are in the scene frame. `actor` (n,) are the numbers of
+        the deforming actors.
         """
         times_ns = times.astype(np.float64)
         positions, rotations = trajectories.poses(actor, times_ns)
-        deformed = self.deformed(
+        deformed = self.deformed_corners(
             self._triangles.locate(triangle).row, actor, times_ns, trajectories
         )
-        weights = _weights(deformed.corners, into_axes(points - positions, rotations))
-        return applied(rotations, applied(deformed.velocities.transpose(0, 2, 1), weights))
+        weights = _weights(deformed.corners, rotate_into_frames(points - positions, rotations))
+        return matvec(rotations, matvec(deformed.velocities.transpose(0, 2, 1), weights))
 
 
 def _weights(corners: Floats, points: Floats) -> Floats:
-    """Return weights (n, 3) of the corners (n, 3, 3) of triangles at points (n, 3) on triangles."""
+    """Return the barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3)."""
     a, b, c = corners.transpose(1, 2, 0)
     edge_1 = b - a
     edge_2 = c - a
     offset = points.T - a
-    square_1 = products(edge_1, edge_1)
-    edge_product = products(edge_1, edge_2)
-    square_2 = products(edge_2, edge_2)
-    product_1 = products(offset, edge_1)
-    product_2 = products(offset, edge_2)
+    square_1 = dot(edge_1, edge_1)
+    edge_product = dot(edge_1, edge_2)
+    square_2 = dot(edge_2, edge_2)
+    product_1 = dot(offset, edge_1)
+    product_2 = dot(offset, edge_2)
     area = np.maximum(square_1 * square_2 - edge_product * edge_product, 1e-300)
     v = (square_2 * product_1 - edge_product * product_2) / area
     w = (square_1 * product_2 - edge_product * product_1) / area

@@ -1,4 +1,4 @@
-"""Poses of all actors together: actor by actor, poses would take longer than casting."""
+"""Compute the poses of all actors at once; one by one would take longer than casting."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ if TYPE_CHECKING:
 
 
 class _StraightTracks(NamedTuple):
-    """Tracks of straight segments of n actors, with a single segment if an actor stands."""
+    """Piecewise linear tracks of n actors. A stationary actor has a single segment."""
 
-    actors: Sequence[int]  # (n,): numbers of the actors
+    actors: Sequence[int]  # (n,): actor numbers
     counts: Ints  # (n,): number of segments of each track
     limits: Floats  # (n, 4), as in `TrackTable`
-    times_s: Floats  # (s,): start of each segment, by the track's clock, seconds
-    segments: Sequence[Floats]  # the fields of `trajectory.Segments`; the first four are used
+    times_s: Floats  # (s,): start of each segment on the track's clock, seconds
+    segments: Sequence[Floats]  # fields of `trajectory.Segments`, of which the first four are used
 
 
 def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTracks]:
-    """Yield the straight tracks of trajectories, together for a batch and for standing actors.
+    """Yield the piecewise linear tracks of trajectories, grouped by batch.
 
-    Smooth tracks and trajectories of other classes have none.
+    All stationary actors form one group. Smooth tracks and trajectories of other classes are
+    skipped.
     """
     static: list[int] = []
-    batches: dict[int, list[int]] = {}  # {id of a batch: numbers of actors}
+    batches: dict[int, list[int]] = {}  # {id of a batch: actor numbers}
     for actor, trajectory in enumerate(trajectories):
         batch = batch_of(trajectory)
         if batch is not None:
@@ -57,13 +58,13 @@ def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTr
 
 
 def _limits_of(track: Track) -> tuple[float, float, float, float]:
-    """Return a row of `TrackTable.limits`."""
+    """Return a row of `TrackTable.limits` for a track."""
     first_s, last_s = track.times_s[[0, -1]].tolist()
     return float(track.start_s or 0), first_s, last_s, track.slack_s
 
 
 def _single_track(actor: int, track: Track) -> _StraightTracks:
-    """Return the straight track of an actor."""
+    """Return the piecewise linear track of one actor."""
     track = track.with_turns
     counts = np.array([len(track.times_s) - 1], np.int64)
     limits = np.array([_limits_of(track)])
@@ -71,7 +72,7 @@ def _single_track(actor: int, track: Track) -> _StraightTracks:
 
 
 def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
-    """Return the straight tracks of actors whose tracks are of one batch."""
+    """Return the piecewise linear tracks of actors whose tracks belong to the same batch."""
     batch = tracks[0].batch
     steps = len(batch.times_s) - 1
     return _StraightTracks(
@@ -84,7 +85,7 @@ def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
 
 
 def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightTracks:
-    """Return the tracks of actors that stand: of the first of `Stations`, or of a `StaticPose`."""
+    """Return the tracks of stationary actors, whose trajectories are `Stations` or `StaticPose`."""
     count = len(actors)
     positions = np.empty((count, 3))
     rotations = np.empty((count, 3, 3))
@@ -108,17 +109,17 @@ def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightT
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of actors, by their numbers, or of a carrier alone.
+    """Trajectories of all actors by actor number, or the trajectory of a platform alone.
 
-    Only `from_actors` sets `animated`.
+    Only trajectories made by `from_actors` have deforming actors in `animated`.
     """
 
-    # {number of the actor: actor whose mesh an animation deforms}
+    # {actor number: actor whose mesh is deformed by an animation}
     animated: Mapping[int, Actor] = MappingProxyType({})
 
     @classmethod
     def from_actors(cls, actors: Iterable[Actor]) -> ActorTrajectories:
-        """Return the trajectories of actors, with the actors that deform."""
+        """Return the trajectories of actors, and record which actors deform."""
         actor_list = list(actors)
         trajectories = cls(actor.trajectory for actor in actor_list)
         trajectories.animated = {
@@ -126,18 +127,19 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         }
         return trajectories
 
-    def deforming(self, actors: Integers) -> Indices:
-        """Return the rows (k,) of `actors` (n,), numbers, whose mesh an animation deforms."""
+    def deforming_rows(self, actors: Integers) -> Indices:
+        """Return the rows of `actors` whose mesh is deformed by an animation."""
         animated = list(self.animated)
         if not animated:
             return np.zeros(0, np.intp)
         return np.flatnonzero(np.isin(actors, animated))
 
-    def played(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
-        """Return the positions in the animations of actors at times, and their rates: (2, n).
+    def animation_frames(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
+        """Return the animation frames that actors show at given times, and the frame rates.
 
-        `actors` (n,) are numbers of actors with an animation; times (n,) are nanoseconds since the
-        survey's start. Positions are animation frames, with fractions; rates are frames per second.
+        `actors` (n,) are numbers of actors with an animation, and `times_ns` (n,) are nanoseconds
+        since the start of the survey. The result has shape (2, n): fractional frame numbers, and
+        frames per second.
         """
         frames = np.zeros((2, len(actors)))
         for actor in np.unique(actors).tolist():
@@ -149,7 +151,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def presence_ns(self) -> Floats:
-        """First and last time of each of w actors in the scene, nanoseconds: (w, 2)."""
+        """First and last time at which each actor is in the scene, in nanoseconds. Shape (w, 2)."""
         presence = [
             presence_ns(trajectory) if batch_of(trajectory) is None else ALWAYS
             for trajectory in self
@@ -157,17 +159,18 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """Return the poses of trajectories `number` (n,) at times (n,), nanoseconds: (12, n).
+        """Return the poses of trajectories at given times, as an array of shape (12, n).
 
-        A pose is a position, meters, and a rotation matrix by rows, with the bits of
-        `Trajectory.poses`. Times count from the start of the trajectory: for actors, the survey's.
+        `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds since the start of
+        the trajectory, which for actors is the start of the survey. Each pose is a position in
+        meters and a rotation matrix in row-major order, bit-identical to `Trajectory.poses`.
 
         Raises
         ------
         LidarError
-            If a time is not within its trajectory.
+            If a time is outside its trajectory.
         """
-        from . import surface_loops  # not before: numba takes half a second to import
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         tracks = self._tracks
         table = np.empty((12, len(number)))
@@ -176,7 +179,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         outside = surface_loops.poses_on_tracks(
             owned(number, np.int64), owned(times_ns), tracks, table
         )
-        if outside >= 0:  # `poses` raises the LidarError
+        if outside >= 0:  # let `poses` raise the LidarError
             self[number[outside]].poses(0, times_ns[number == number[outside]])
         not_straight = np.flatnonzero(tracks.member[number] < 0)
         for trajectory in np.unique(number[not_straight]).tolist():
@@ -189,23 +192,24 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the positions (n, 3) and rotations (n, 3, 3) of trajectories `number` (n,).
+        """Return the positions (n, 3) and rotations (n, 3, 3) of trajectories at given times.
 
-        Times (n,) are nanoseconds.
+        `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds.
 
         Raises
         ------
         LidarError
-            If a time is not within its trajectory.
+            If a time is outside its trajectory.
         """
         table = self.table(number, times_ns)
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
-    def runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Return the poses (12, m) of runs of rows, as `table`, and the run of each row (n,).
+    def pose_runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
+        """Return one pose per run of equal rows, and the run that each row belongs to.
 
-        A run is rows that follow each other, with the same trajectory and time, and thus the same
-        pose. Rows with numbers below 0 have no trajectory: they have the run -1, and end no run.
+        A run consists of consecutive rows with the same trajectory and time, which therefore have
+        the same pose. The poses have shape (12, m), as in `table`. Rows with a negative number have
+        no trajectory; they get run -1 and do not interrupt a run.
         """
         from . import surface_loops
 
@@ -217,7 +221,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def _tracks(self) -> TrackTable:
-        """Straight tracks among the trajectories, for compiled loops."""
+        """Piecewise linear tracks among the trajectories, as arrays for compiled loops."""
         from .surface_loops import TrackTable
 
         tracks = [_no_tracks(), *_straight_tracks(self)]
@@ -227,7 +231,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         counts = np.concatenate([group.counts for group in tracks])
 
         def joined(part: int) -> Floats:
-            """Concatenate field `part` of the segments of all tracks: (..., s)."""
+            """Concatenate field `part` of the segments of all tracks along the last axis."""
             return np.concatenate([group.segments[part] for group in tracks], axis=-1)
 
         return TrackTable(
@@ -244,5 +248,5 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
 
 def _no_tracks() -> _StraightTracks:
-    """Return no tracks, with the shapes of tables."""
+    """Return an empty set of tracks, whose arrays have the right shapes for concatenation."""
     return _static_tracks([], [])

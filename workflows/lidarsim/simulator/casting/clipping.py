@@ -1,8 +1,8 @@
-"""Triangles cut to a box around sensors.
+"""Clip triangles to a box around the sensors.
 
-Ray casters compute in single precision by the size of the scene: planes of ± 200 km would make a
-cast 140 times slower. Within the box, the cut triangles cover the same points; new corners are off
-by about 1e-16 of the size of the triangle.
+Ray casters compute in single precision relative to the size of the scene. Ground planes that extend
+to ± 200 km would make a cast 140 times slower. Within the box, the clipped triangles cover the same
+points; the relative error of new corners is about 1e-16 of the triangle's size.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Indices, Integers, Ints
 
-_Corner = tuple[float, float, float]  # corner of a triangle that is cut: x, y, z
+_Corner = tuple[float, float, float]  # x, y, z of a corner
 
 
-class CutMesh(NamedTuple):
-    """The parts of triangles within a box."""
+class ClippedMesh(NamedTuple):
+    """A mesh clipped to a box."""
 
     vertices: Floats  # (v, 3)
     faces: Ints  # (f, 3)
-    origin: Indices  # (f,): ascending, the triangle of the mesh that each is a part of
+    origin: Indices  # (f,): original triangle that each triangle is a part of, ascending
 
 
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
-    """Return the planes (6, 4) of a box (2, 3): a point p is inside if all normals @ p <= offset.
+    """Return the six planes that bound a box.
 
-    A row is a normal and an offset. With a transform (3, 4) from the frame of a mesh to the frame
-    of the box, the planes are in the frame of the mesh.
+    `region` has the lower and upper corner. Each row of the result has a normal and an offset; a
+    point p is inside the box if ``normal @ p <= offset`` for all rows. If `transform` (3, 4) maps a
+    mesh frame to the frame of the box, the planes are in the mesh frame.
     """
     matrix = np.eye(3, 4) if transform is None else transform
     lower, upper = region
@@ -39,8 +40,8 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
     return np.concatenate([above, below])
 
 
-def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
-    """Return the parts of triangles (f, 3) within all planes, or None if all are within."""
+def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> ClippedMesh | None:
+    """Clip triangles (f, 3) to the inside of all planes, or return None if none is cut."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
@@ -56,7 +57,7 @@ def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
     new_faces = len(vertices) + np.arange(3 * len(cut_triangles)).reshape(-1, 3)
     origin = np.append(face_indices, np.array([part.face for part in cut_triangles], np.intp))
     order = np.argsort(origin, kind="stable")
-    return CutMesh(
+    return ClippedMesh(
         np.concatenate([vertices, new_vertices]),
         np.concatenate([faces[face_indices], new_faces])[order].astype(np.int64),
         origin[order],
@@ -64,28 +65,28 @@ def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
 
 
 class _Part(NamedTuple):
-    """A triangle of the parts of a face."""
+    """A triangle that is a part of a clipped face."""
 
     face: int
     corners: tuple[_Corner, _Corner, _Corner]
 
 
 def _outside(vertices: Floats, planes: Floats) -> Bools:
-    """Return whether vertices (v, 3) are outside of planes (6, 4): (v, 6)."""
+    """Return for each vertex (v, 3) and plane (6, 4) whether the vertex is outside the plane."""
     x, y, z = vertices.T[:, :, None]
     a, b, c, offset = planes.T
     return np.asarray(a * x + b * y + c * z > offset)
 
 
 def _parts_of(face: int, polygon: Sequence[_Corner], planes: Floats) -> list[_Part]:
-    """Return the triangles of a polygon within planes (Sutherland and Hodgman, 1974)."""
+    """Clip a polygon to the inside of planes, and triangulate it (Sutherland and Hodgman 1974)."""
     for plane in planes.tolist():
         polygon = _cut_polygon(polygon, plane)
     return [_Part(face, (polygon[0], second, third)) for second, third in pairwise(polygon[1:])]
 
 
 def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner]:
-    """Return the part of a polygon within a plane."""
+    """Return the part of a polygon on the inner side of a plane."""
     a, b, c, offset = plane
     heights = [a * x + b * y + c * z - offset for x, y, z in polygon]
     corners: list[_Corner] = []
@@ -100,9 +101,9 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the point of an edge on a plane, for `first` and `second`, corners with heights.
+    """Return the point where an edge crosses a plane, from corners with their signed heights.
 
-    Neighboring triangles get the same point of their common edge: its corners are sorted.
+    The corners are sorted so that both triangles that share the edge get the same point.
     """
     (start, start_height), (stop, stop_height) = sorted((first, second))
     share = start_height / (start_height - stop_height)

@@ -1,4 +1,4 @@
-"""Bodies that hold a medium: closed surfaces of water, glass or leaves."""
+"""Bodies that contain a medium: closed surfaces of water, glass or leaves."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers
-from ...base.vectors import applied, inverse, length
+from ...base.vectors import inverse, matvec, norm
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from .triangle_kinds import TriangleKinds
 
 
 class MediaBodies:
-    """Bodies of a scene that hold a medium, by kinds of surfaces."""
+    """Bodies of a scene that contain a medium, by kind of surface."""
 
     def __init__(self, scene: Scene, kinds: TriangleKinds, table: MaterialTable) -> None:
         self._scene = scene
@@ -24,9 +24,9 @@ class MediaBodies:
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
-        """Whether surfaces that hold a medium are closed, and whether they point inwards: (kinds,).
+        """Whether surfaces of media are closed, and whether they are inside out.
 
-        Surfaces point inwards if they are closed and have a negative volume.
+        Both are arrays of shape (kinds,). A closed surface is inside out if its volume is negative.
         """
         table = self._table
         scene = self._scene
@@ -54,18 +54,18 @@ class MediaBodies:
 
     @cached_property
     def static_kinds(self) -> tuple[int, ...]:
-        """Kinds of surfaces of closed static objects, instances included, that hold a medium."""
+        """Kinds of surfaces of closed static bodies that contain a medium, including instances."""
         table = self._table
         closed, _ = self.solids
         holds_medium = (table.leafy | table.refracts) & closed
         holds_medium &= self._kinds.material_kinds.object < self._static_objects
         return tuple(np.flatnonzero(holds_medium).tolist())
 
-    def spread_out(self, by_m: float) -> Floats:
-        """Return the vertices of the scene's faces, with surfaces of media moved outwards.
+    def offset_vertices(self, by_m: float) -> Floats:
+        """Return the vertices of the scene with the surfaces of media moved outwards by `by_m`.
 
-        Water that touches its basin, or leaves that touch other leaves, would share a surface with
-        the basin, and light that meets one surface would miss the other.
+        Water that touches its basin, or leaves that touch other leaves, would otherwise coincide
+        with the other surface, and light that hits one of the two surfaces would miss the other.
         """
         if not self.static_kinds:
             return self._scene.vertices
@@ -83,23 +83,23 @@ class MediaBodies:
             corners = vertex_position[corners.reshape(-1)].reshape(-1, 3)
             a, b, c = positions[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[kind] else 1)
-            normals /= np.maximum(length(normals)[:, None], 1e-300)
-            # Least squares: a vertex moves to where all its triangles are `by_m` further out.
+            normals /= np.maximum(norm(normals)[:, None], 1e-300)
+            # Least squares: move each vertex so that all its triangles are `by_m` further out.
             squares = np.zeros((len(positions), 3, 3))
             sums = np.zeros((len(positions), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
             np.add.at(sums, corners, normals[:, None])
             squares += 1e-3 * np.eye(3)
-            step = by_m * applied(inverse(squares), sums)
+            step = by_m * matvec(inverse(squares), sums)
             positions += np.clip(step, -4 * by_m, 4 * by_m)
             vertices[vertex_rows] = positions[vertex_position]
         return vertices
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:
-    """Return whether a surface has no gaps: two triangles that wind alike share each edge."""
+    """Return whether a surface is closed: each edge joins two consistently wound triangles."""
     vertex_rows, corners = np.unique(faces, return_inverse=True)
-    # With flat shading, triangles share positions, not vertices.
+    # With flat shading, triangles share positions but not vertices.
     _, vertex_position = np.unique(vertices[vertex_rows], axis=0, return_inverse=True)
     corners = vertex_position.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
     starts = corners.reshape(-1)
@@ -113,6 +113,6 @@ def _closed(vertices: Floats, faces: Integers) -> bool:
 
 
 def _volume(vertices: Floats, faces: Integers) -> float:
-    """Return the volume within a closed surface, m³, negative if its triangles wind inwards."""
+    """Return the volume in m³ inside a closed surface, which is negative if it is inside out."""
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)

@@ -1,4 +1,4 @@
-"""Poses of a carrier or of a sensor's head at each firing, and the motion until the next firing."""
+"""Poses of a platform or of a sensor head at each firing, and the motion until the next firing."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ import raybeam.poses
 from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ...base.arrays import Floats, Indices, Integers, Ints, owned
-from ...base.vectors import into_axes, matmul
+from ...base.vectors import matmul, rotate_into_frames
 from ...motion.trajectory import Trajectory, velocities
 from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories
 
-RING_FIRINGS = 16  # firings whose rays `along_rings` orders by rings
+RING_FIRINGS = 16  # number of firings whose rays `order_along_rings` sorts by ring
 
 
 @dataclass(frozen=True)
-class Clock:
-    """Firing times of rays, in nanoseconds, and the trajectories that are followed meanwhile.
+class FiringClock:
+    """Firing times of rays, and the trajectories that are evaluated at these times.
 
-    The times count from the start of the survey if the trajectories are of actors, and from the
-    start of the station if the trajectory is of the carrier.
+    Times are nanoseconds since the start of the survey for trajectories of actors, and since the
+    start of the station for the trajectory of the platform.
     """
 
     firing_starts: Floats  # (f,): start of each firing, nanoseconds
-    delays: Floats  # (m,): of each of the m rays of a firing after its start, nanoseconds
-    trajectories: ActorTrajectories  # trajectories of the actors, or of the carrier alone
-    start: int = 0  # number of the ray that `times` counts from, 0 at the first firing
-    subrays: int = 1  # sub-rays of a ray, as `times` numbers them
+    delays: Floats  # (m,): delay of each ray within a firing, nanoseconds
+    trajectories: ActorTrajectories  # trajectories of the actors, or of the platform alone
+    start: int = 0  # ray that sub-ray 0 of `times` belongs to; ray 0 is the first of the firings
+    subrays: int = 1  # number of sub-rays per ray
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of sub-rays (n,), nanoseconds: (n,).
+        """Return the firing times of sub-rays (n,) in nanoseconds.
 
-        Sub-ray k is of ray ``start + k // subrays``.
+        Sub-ray k belongs to ray ``start + k // subrays``.
         """
-        from . import surface_loops  # not before: numba takes half a second to import
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         times_ns = np.empty(len(ray))
         surface_loops.firing_times(
@@ -54,33 +54,33 @@ class Clock:
         )
         return times_ns
 
-    def part(self, start: int, subrays: int) -> Clock:
-        """Return a clock whose `times` takes sub-rays, from 0 at ray `start`, `subrays` a ray."""
+    def for_subrays(self, start: int, subrays: int) -> FiringClock:
+        """Return a clock for sub-rays that are numbered from 0 at ray `start`."""
         return replace(self, start=start, subrays=subrays)
 
 
 @dataclass(frozen=True, eq=False)
 class Firings:
-    """Consecutive firings of a sensor at a station, or their repetitions, in the order of rays."""
+    """Consecutive firings of a sensor at one station, possibly repeated several times."""
 
     sensor: Sensor
-    numbers: Ints  # (f,): counted from the start of the station
+    numbers: Ints  # (f,): firing numbers, counted from the start of the station
     spec: ScanSpec  # scan of the first firing
 
     @classmethod
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
-        """Return the firings of consecutive scans, the whole sequence `repetitions` times."""
+        """Return the firings of consecutive scans, repeated `repetitions` times as a whole."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         if repetitions > 1:
             numbers = np.tile(numbers, repetitions)
         return cls(sensor, numbers, specs[0])
 
     def times(self, ray: Integers) -> Ints:
-        """Return the firing times of rays (n,), nanoseconds since the survey's start: (n,).
+        """Return the firing times of rays (n,) in nanoseconds since the start of the survey.
 
         Rays are numbered from 0 at the first firing.
         """
-        clock = Clock(
+        clock = FiringClock(
             self.sensor.begins_ns(self.numbers), self.sensor.beams.time_ns, ActorTrajectories()
         )
         times = clock.times(ray)
@@ -89,26 +89,26 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier.
+    """Poses for `RayCaster.scan`, either of the sensor's head or of its platform.
 
-    Rotations are from the frame of the head or carrier to the scene frame.
+    Rotations map the frame of the head or platform to the scene frame.
     """
 
     positions: Floats  # (p, 3), or (3,) for all rays, meters
     rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays; None for the identity
     rays_per_pose: int | None = None  # None for a single pose
     motion: PoseMotion | None = None  # motion from each pose to the next
-    clock: Clock | None = None  # clock of the actors; None without actors
-    by_head: bool = False  # whether the poses are of the head
-    carrier: Clock | None = None  # clock of a carrier that moves, for its velocities; else None
-    station: int = 0  # station of the trajectory of `carrier`
+    clock: FiringClock | None = None  # clock of the actors; None without actors
+    by_head: bool = False  # whether the poses are poses of the head
+    platform: FiringClock | None = None  # clock of a moving platform, to compute its velocity
+    station: int = 0  # station in the trajectory of `platform`
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
         """Arguments of `RayCaster.scan` and `pattern_rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
-        # `check_trajectory` has checked them: again would take a fortieth of the casting time.
+        # Use poses that `check_trajectory` has checked. Another check would cost 2.5 % of casting.
         return {
             "positions": raybeam.poses.Poses(
                 self.positions, self.rotations, self.rays_per_pose, self.motion
@@ -121,24 +121,25 @@ class CastPoses:
         return ActorTrajectories() if self.clock is None else self.clock.trajectories
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of rays (n,) for actors, nanoseconds since the survey's start.
+        """Return the firing times of rays, or zeros without actors.
 
-        Zeros without actors.
+        Times are nanoseconds since the start of the survey.
         """
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
-    def part(self, start: int, stop: int, subrays: int) -> CastPoses:
-        """Return the poses of the sub-rays of rays `start` to `stop`, `subrays` of each ray.
+    def for_subrays(self, start: int, stop: int, subrays: int) -> CastPoses:
+        """Return the poses for `subrays` sub-rays of each of the rays `start` to `stop`.
 
-        Sub-rays are numbered from 0 at ray `start`. The rays belong to complete poses: `start`
-        is the first ray of a pose, and `stop` follows the last ray of a pose or of all rays.
+        Sub-rays are numbered from 0 at ray `start`. The range must consist of complete poses:
+        `start` is the first ray of a pose, and `stop` follows the last ray of a pose or of all
+        rays.
         """
         rays_per_pose = self.rays_per_pose
         motion = self.motion
-        clock = None if self.clock is None else self.clock.part(start, subrays)
-        carrier = None if self.carrier is None else self.carrier.part(start, subrays)
+        clock = None if self.clock is None else self.clock.for_subrays(start, subrays)
+        platform = None if self.platform is None else self.platform.for_subrays(start, subrays)
         if rays_per_pose is None:
-            return replace(self, clock=clock, carrier=carrier)
+            return replace(self, clock=clock, platform=platform)
         poses = slice(start // rays_per_pose, -(-stop // rays_per_pose))
         if motion is not None:
             delays = np.repeat(motion.delays, subrays)
@@ -151,47 +152,47 @@ class CastPoses:
             rays_per_pose=rays_per_pose * subrays,
             motion=motion,
             clock=clock,
-            carrier=carrier,
+            platform=platform,
         )
 
-    def drift(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities of points of the carrier at origins of rays (n, 3), m/s: (n, 3).
+    def platform_velocities(self, ray: Integers, origins: Floats) -> Floats:
+        """Return the velocities in m/s that the platform's motion gives to the origins of rays.
 
-        `ray` (n,) are the numbers of the rays, which have the times; origins and velocities are in
-        the scene frame; zeros if the carrier stands. The motion of a rotating head is left out: a
-        sensor corrects its own rotation.
+        `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
+        Origins and velocities are in the scene frame. The velocities are zero if the platform is
+        stationary. The rotation of the head is not included, because a sensor corrects for its own
+        rotation.
         """
-        if self.carrier is None:
+        if self.platform is None:
             return np.zeros((len(ray), 3))
-        (path,) = self.carrier.trajectories
-        times = self.carrier.times(ray)
+        (path,) = self.platform.trajectories
+        times = self.platform.times(ray)
         velocity, rate = velocities(path, self.station, times)
         positions, _ = path.poses(self.station, times)
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays (n,) of a pattern, in the scene frame: (n, 3) each.
+        """Return origins and directions of rays (n,) of a pattern, in the scene frame.
 
-        Origins are (1, 3) if all rays share one.
-
-        Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`).
+        Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`). Both
+        arrays have shape (n, 3), but the origins have shape (1, 3) if all rays share one.
         """
         return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
 
-def along_rings(ray: Ints, channels: int) -> Indices:
-    """Return the order of rays (n,) that puts neighbors along a ring behind each other.
+def order_along_rings(ray: Ints, channels: int) -> Indices:
+    """Return an order in which rays of the same ring follow each other.
 
-    `ray` (n,) are numbers of rays, in the order of firings and channels. The rays of every
-    `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbors
-    are near each other in the scene.
+    `ray` (n,) are ray numbers sorted by firing and channel. Within each block of `RING_FIRINGS`
+    firings, rays are sorted by channel and keep their order within a channel. Consecutive rays are
+    then close to each other in the scene.
     """
     ring = ray // (RING_FIRINGS * channels) * channels + ray % channels
     return np.argsort(ring.astype(np.uint16), kind="stable")  # uint16: a tenth of the time
 
 
 def check_trajectory(path: Trajectory) -> None:
-    """Check the first pose of each station of a trajectory, which may be a user's class.
+    """Check the first pose of each station of a trajectory, which may be a user-defined class.
 
     Raises
     ------
@@ -207,58 +208,61 @@ def poses_of_firings(
 ) -> CastPoses:
     """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
 
-    If a head rotates all beams (`Sensor.spins`), the poses are of the head, and the rays of one
-    firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
-    the first beam of a firing. If all beams start at the same point of a head, the positions are
-    this point's, `Sensor.center`, else of the head frame's origin.
+    If a head rotates all beams (`Sensor.spins`), these are poses of the head, and the rays of one
+    firing are valid for all firings. Otherwise they are poses of the platform. Each pose is taken
+    at the time of the first beam in a firing. If all beams start at the same point of a head, the
+    positions are those of this point (`Sensor.center`), otherwise of the origin of the head frame.
 
-    Later beams of a firing start from the carrier's position at the time of the beam: the carrier
-    moves evenly from each firing to the next. A pose for each beam would take as long as casting.
+    Later beams of a firing start from the platform's position at their own time, which is
+    interpolated linearly between firings. Computing a pose for each beam would take as long as
+    casting.
 
-    `motion` is None if the carrier stands, or if all beams of a firing are fired at once.
-    `late_ns` nanoseconds are added to the times of the firings to find the carrier's poses.
+    `motion` is None if the platform is stationary, or if all beams of a firing are fired at once.
+    `late_ns` nanoseconds are added to the firing times to find the platform's poses.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns + late_ns, path.duration_ns)
-    positions, carrier_rotations = path.poses(station, times)
-    positions = raybeam.poses.by_component(positions)
-    carrier_rotations = (
+    positions, platform_rotations = path.poses(station, times)
+    positions = raybeam.poses.component_major(positions)
+    platform_rotations = (
         np.broadcast_to(np.eye(3), (len(times), 3, 3))
-        if carrier_rotations is None
-        else carrier_rotations
+        if platform_rotations is None
+        else platform_rotations
     )
-    carrier_rotations = raybeam.poses.by_component(carrier_rotations)
+    platform_rotations = raybeam.poses.component_major(platform_rotations)
     spins = sensor.spins(firings[:-1])
-    rotations = carrier_rotations[:-1]
+    rotations = platform_rotations[:-1]
     if spins is not None:
         mount_position = carried.mount.position
         if any(mount_position):
             mount_positions = np.broadcast_to(mount_position, positions.shape)
-            positions = positions + into_axes(mount_positions, carrier_rotations.transpose(0, 2, 1))
+            positions = positions + rotate_into_frames(
+                mount_positions, platform_rotations.transpose(0, 2, 1)
+            )
         rotations = _head_rotations(carried, rotations, spins)
     ray_positions = positions[:-1]
     if spins is not None and sensor.center is not None and sensor.center.any():
         center = np.broadcast_to(sensor.center, ray_positions.shape)
-        ray_positions = ray_positions + into_axes(center, rotations.transpose(0, 2, 1))
+        ray_positions = ray_positions + rotate_into_frames(center, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
         return CastPoses(ray_positions, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
-    seconds[seconds == 0] = np.inf  # a last firing at the very end: the carrier stands
+    seconds[seconds == 0] = np.inf  # the last firing is at the very end; the platform stops
     motion = PoseMotion(
         delays,
         np.diff(positions, axis=0) / seconds,
-        _rotation_vectors(carrier_rotations[:-1], carrier_rotations[1:]) / seconds,
+        _rotation_vectors(platform_rotations[:-1], platform_rotations[1:]) / seconds,
     )
     return CastPoses(ray_positions, rotations, sensor.channels, motion, by_head=spins is not None)
 
 
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
-    """Return the rotations (k, 3, 3) from the head, turned to its azimuths, to the scene frame.
+    """Return the rotations from the head, at its current azimuth, to the scene frame.
 
-    `rotations` (k, 3, 3) are those from the carrier frame; `spins` (2, k) are the cosines and sines
-    of the head's azimuths.
+    `rotations` (k, 3, 3) map the platform frame to the scene frame. `spins` (2, k) are the cosines
+    and sines of the head's azimuths.
     """
     if carried.mount.rotation is not None:
         rotations = matmul(rotations, carried.mount.rotation)
@@ -268,7 +272,7 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Return matrices (k, 3, 3) times rotations about z, of cosines and sines `spins` (2, k)."""
+    """Multiply rotations (k, 3, 3) by rotations about z with cosines and sines `spins` (2, k)."""
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
@@ -281,10 +285,10 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 
 
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
-    """Return the rotation vectors (k, 3), radians, from matrices to close matrices (k, 3, 3).
+    """Return the rotation vectors in radians between pairs of nearly equal rotations.
 
-    The vectors are in the scene frame, the target of the matrices. They are half the sum of the
-    cross products of corresponding axes, whose length is the sine of the angle.
+    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each is half the
+    sum of the cross products of corresponding axes; its length is the sine of the rotation angle.
     """
     vectors = np.empty((3, len(earlier))).T
     for axis in range(3):

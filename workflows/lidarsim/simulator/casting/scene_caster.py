@@ -1,6 +1,6 @@
-"""The ray caster of a whole scene: the static scene, its instances, and moving actors.
+"""Cast rays against a whole scene: its faces, its instances and its moving actors.
 
-Each ray is transformed to the frame of an actor at the time of the ray, so that no tree is ever
+Each ray is transformed into the frame of an actor at the firing time of the ray, so trees are never
 rebuilt (`raybeam.moving`).
 """
 
@@ -13,9 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from raybeam import Deforming, Instance, Moving, Pattern, RayCaster, ScanReturns, available_backends
-from raybeam.device import OtherHits
-from raybeam.moving import hits_on, listed_hits_on
+from raybeam import (
+    DeformingMesh,
+    Instance,
+    MovingBodies,
+    Pattern,
+    RayCaster,
+    ScanReturns,
+    available_backends,
+)
+from raybeam.device import ExternalHits
+from raybeam.moving import body_hits, nearest_body_hits
 from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import Bools, Floats, Indices, Ints, Ints32
@@ -27,48 +35,48 @@ from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, parts_of
 from ...survey.survey import Survey
 from .actor_trajectories import ActorTrajectories
-from .motion import CastPoses, Clock
+from .motion import CastPoses, FiringClock
 from .static_bodies import StaticBodies, largest_range_m, mesh_of
-from .surfaces import Surfaces
+from .surfaces import SceneSurfaces
 from .visibility import static_key, unseen_objects
 
-AUTO_TAKES = "The backend 'auto' selects one that is available."
-_MAX_ROOM_RAYS = 1 << 18  # rays that are stored for casts on static bodies and on actors: 13 MB
-_NEVER_NS = np.array([np.inf, -np.inf])  # first and last time of an actor that is never present
-REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
+AUTO_ADVICE = "The backend 'auto' selects one that is available."
+_MAX_ROOM_RAYS = 1 << 18  # largest number of rays that are stored for both casts: 13 MB
+_NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
+REACHED = 1e-3  # a ray reaches a point if it gets this close, as a share of the distance
 
 
 class _NearestHits(NamedTuple):
-    """Nearest hits of the rays that hit: arrays (k,), in the order of rays."""
+    """Nearest hits of the k rays that hit something, sorted by ray."""
 
-    ray: Ints  # number of the ray, from 0 at the window's start
+    ray: Ints  # ray number, counted from the start of the window
     distance: Floats  # meters
     triangle: Ints32
 
 
 class _ActorShapes(NamedTuple):
-    """The s shapes of the a actors of a scene, where actors of the same mesh share a shape.
+    """The s distinct shapes of the a actors in a scene.
 
-    A mesh has a part for its opaque triangles, and a part for each mask (`parts_of`); a part is
-    an instance of the shape's caster.
+    Actors with the same mesh share a shape. A mesh has a part for its opaque triangles and a part
+    for each mask (`parts_of`). Each part is an instance in the shape's caster.
     """
 
-    casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
-    boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, meters
-    part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
+    casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the mesh frame
+    boxes: Floats  # (s, 2, 3): bounds of the shapes over all animation frames, meters
+    part_triangles: Ints32  # (s, p): first triangle of each part, numbered within its mesh
     shape: Indices  # (a,): shape of each actor
 
 
 class CastBodies(NamedTuple):
-    """Trees of the static bodies of a scene, and shapes of its actors."""
+    """Trees of the static bodies of a scene, and the shapes of its actors."""
 
     static: StaticBodies
-    key: tuple[object, ...]  # static bodies of the same scene with the same key are the same
+    key: tuple[object, ...]  # identifies the static bodies within a scene
     shapes: _ActorShapes | None  # None without actors
 
 
-def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
-    """Raise LidarError if this machine lacks a backend of casting, with `advice` at the end."""
+def check_backend_here(backend: str, advice: str = AUTO_ADVICE) -> None:
+    """Raise LidarError, ending with `advice`, if a backend is not available on this machine."""
     # An interrupt during the import of an extension module would look like a missing module.
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
@@ -80,41 +88,43 @@ def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
 
 
 class SceneCaster:
-    """Casts scans like `RayCaster.scan`, including hits on actors.
+    """Casts scans like `RayCaster.scan`, but also returns hits on actors.
 
-    Triangles of instances are numbered after the faces of the scene, triangles of actors after
-    both. Rays that touch no actor give the same bits as without actors. The poses of a scan have
-    the trajectories of the actors. `casters_of_sensors` makes the casters of a survey.
+    Triangles of instances are numbered after the faces of the scene, and triangles of actors after
+    both. Rays that hit no actor return bit-identical results with and without actors. The poses of
+    a scan include the trajectories of the actors. Use `casters_of_sensors` to create the casters of
+    a survey.
 
     Parameters
     ----------
     scene
-        Faces, instances and actors to hit.
+        Faces, instances and actors to cast rays at.
     surfaces
-        Surfaces of the scene; a tally counts hits by `StoredTriangles.counter`.
+        Surfaces of the scene, whose `StoredTriangles.counter` defines the hit counters.
     bodies
-        Trees of the static bodies and shapes of the actors.
+        Trees of the static bodies, and shapes of the actors.
     range_m
-        Largest range of the sensors, meters: of a scene of hundreds of kilometers, what is far
-        beyond the range is left out. Before scans, `cover` says where sensors are.
+        Largest range of the sensors in meters. In a scene of hundreds of kilometers, bodies far
+        beyond this range are omitted. Call `ensure_trees` before
+        each scan.
     unseen
-        (objects,): True for objects that rays pass through; `bodies` lacks the static objects among
-        them. None for no object.
+        (objects,): True for objects that rays pass through. `bodies` does not contain the static
+        objects among them. None if all objects are visible.
     """
 
     def __init__(
         self,
         scene: Scene,
-        surfaces: Surfaces,
+        surfaces: SceneSurfaces,
         bodies: CastBodies,
         range_m: float = np.inf,
         unseen: Bools | None = None,
     ) -> None:
         self.bodies = bodies
         self.unseen = unseen
-        # Casters of all sensors of the survey, by their numbers; set by `casters_of_sensors`.
-        self.of_sensors: Sequence[SceneCaster] = ()
-        self.clear_m = _clear_m(scene)
+        # Casters of all sensors of the survey by sensor number, set by `casters_of_sensors`.
+        self.by_sensor: Sequence[SceneCaster] = ()
+        self.clear_m = _clearance_m(scene)
         self._surfaces = surfaces
         self._instances = scene.instances
         self._face_count = static_triangles = len(scene.faces)
@@ -132,31 +142,31 @@ class SceneCaster:
         # First triangle of each actor.
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
-    def with_moved_instances(self, surfaces: Surfaces, instances: Instances) -> None:
-        """Take surfaces and instances from the scene with moved instances.
+    def update_instances(self, surfaces: SceneSurfaces, instances: Instances) -> None:
+        """Update the surfaces and instances after instances of the scene have moved.
 
-        `move_instances` moves the trees.
+        This does not update the trees; use the function `move_instances` for that.
         """
         self._surfaces = surfaces
         self._instances = instances
 
-    def cover(self, positions: Floats) -> None:
-        """Build the trees of all bodies in the range of sensors at positions (p, 3), if missing."""
-        self._static.cover(positions, self._range_m)
+    def ensure_trees(self, positions: Floats) -> None:
+        """Build any missing trees of bodies within range of sensors at positions (p, 3)."""
+        self._static.ensure_trees(positions, self._range_m)
 
     @property
     def caster(self) -> RayCaster:
-        """Caster of the static bodies, with some triangles cut or left out."""
+        """Caster of the static bodies, in which some triangles may be clipped or omitted."""
         return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
-        """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
+        """Return the counter table for `RayCaster.scan_on_device`, and the number of counters.
 
-        The table is int64 (bodies, 2): a hit of triangle t of body i counts in the counter
-        ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the
-        scene, if any, with a counter for each triangle; then each instance, with one counter; and
-        last all actors as one body, whose triangles are numbered after the scene's faces alone.
-        Bodies that the caster leaves out have no row.
+        The table is an int64 array (bodies, 2). A hit on triangle t of body i increments counter
+        ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the scene,
+        if any, with one counter per triangle; then each instance, with a single counter; and
+        finally all actors as one body, whose triangles are numbered after the faces of the scene.
+        Bodies that the caster omits have no row.
         """
         instance_count = 0 if self._instances is None else len(self._instances)
         table = [[0, 1]] * bool(self._face_count) + [
@@ -167,9 +177,10 @@ class SceneCaster:
 
     @property
     def body_rows(self) -> Indices:
-        """Rows in `StoredTriangles.bodies` of instances that are cast, and of all actors.
+        """Rows of `StoredTriangles.bodies` for the bodies that this caster contains.
 
-        Shape (instances + 1,). The static bodies that no ray hits are missing.
+        These are the faces of the scene, the instances that are cast, and all actors as one body.
+        Static bodies that no ray can hit are omitted.
         """
         trees = self._static.trees
         first_instance = min(1, self._face_count)
@@ -199,32 +210,33 @@ class SceneCaster:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
-        room: Floats | None = None,
+        out: Floats | None = None,
     ) -> ScanReturns:
-        """Cast rays of a pattern as `RayCaster.scan`, at actors too.
+        """Cast rays of a pattern at static bodies and actors.
 
-        The arguments are as in `RayCaster.scan`; if there are actors, `poses` have a clock.
-        `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
-        `t_min` to `t_max`, meters; of each group of rays every n-th is returned, by `keep_every`.
-        `groups` are the first rays of the groups. `room` (6, n) receives origins and
-        directions of all rays; without actors also (3, n), directions alone.
+        The arguments are those of `RayCaster.scan`. If there are actors, `poses` must have a clock.
+        `window` has the start and stop of the pattern rows to cast, by default all rows. Hits are
+        accepted at distances from `t_min` to `t_max` in meters. Of each group of rays, every
+        `keep_every`-th hit is returned; `groups` has the first ray of each group. The origins and
+        directions of all rays are written to `out` (6, n). Without actors, `out` can also have
+        shape (3, n) and then receives only directions.
 
         Returns
         -------
         ScanReturns
-            Ray numbers are from 0 at the window's start. Triangles are numbered as in
-            `SceneCaster`, and the tally is by `StoredTriangles.counter`. With instances or actors,
-            `instance` is 0.
+            Rays are numbered from 0 at the start of the window. Triangles are numbered as described
+            in `SceneCaster`, and the tally as in `StoredTriangles.counter`. With instances or
+            actors, `instance` is 0.
         """
         window = (0, len(pattern)) if window is None else window
-        if room is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
-            room = np.empty((6, window[1] - window[0]))  # so that the rays are computed once
+        if out is None and self._shapes is not None and window[1] - window[0] <= _MAX_ROOM_RAYS:
+            out = np.empty((6, window[1] - window[0]))  # computes the rays only once
         common: dict[str, Any] = {
             **poses.caster_arguments,
             "window": window,
             "t_min": t_min,
             "t_max": t_max,
-            "room": room,
+            "out": out,
         }
         trees = self._static.trees
         if self._instances is None and self._shapes is None and not trees.origins:
@@ -251,7 +263,7 @@ class SceneCaster:
             ray = ray[row_indices]
             distance = distance[row_indices]
             triangle = triangle[row_indices]
-        instance = np.zeros(len(ray), np.int32)  # not needed: triangles tell the instance
+        instance = np.zeros(len(ray), np.int32)  # not needed, because triangles imply instances
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, instance)
 
     def is_visible(
@@ -262,30 +274,33 @@ class SceneCaster:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Return whether points are visible from origins (n, 3), in the scene frame: (n,).
+        """Return whether points are visible from origins (n, 3) in the scene frame.
 
-        `towards` are vectors from the origins to the points, (n, 3), of lengths `distance` (n,),
-        meters. `times` (n,) are the times of the actors, nanoseconds since the survey's start.
+        `towards` (n, 3) are vectors from the origins to the points, and `distance` (n,) their
+        lengths in meters. `times` (n,) determine the poses of actors, in nanoseconds since the
+        start of the survey.
         """
         visible = np.ones(len(distance), np.bool_)
         if len(distance):
-            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            poses = CastPoses(
+                np.zeros(3), clock=FiringClock(times, np.zeros(1), actor_trajectories)
+            )
             hits = self.scan(Pattern(towards / distance[:, None], origins), poses)
             visible[hits.ray] = hits.distance > distance[hits.ray] * (1 - REACHED)
         return visible
 
     def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
-        """Return the nearest hits of a scan on static bodies, which are known, and on actors."""
-        from . import surface_loops  # not before: numba takes half a second to import
+        """Combine hits of a scan on static bodies with hits on actors, keeping the nearest."""
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         static_distance = np.full(len(scan), np.inf)
         static_distance[static_hits.ray] = static_hits.distance
         moving, shapes = self._moving_actors(poses)
-        nearest = hits_on(moving, scan, poses.times, static_distance)
+        nearest = nearest_body_hits(moving, scan, poses.times, static_distance)
         joined = surface_loops.JoinedHits(
             np.empty(len(scan), np.int64), np.empty(len(scan)), np.empty(len(scan), np.int32)
         )
-        count = surface_loops.merge(
+        count = surface_loops.merge_hits(
             static_hits.ray,
             static_hits.triangle,
             nearest,
@@ -296,30 +311,30 @@ class SceneCaster:
         )
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
-    def on_actors(self, scan: Scan, poses: CastPoses) -> OtherHits:
-        """Find the nearest hits of rays on actors, whether or not static bodies are nearer."""
+    def find_actor_hits(self, scan: Scan, poses: CastPoses) -> ExternalHits:
+        """Find the nearest hits of rays on actors, including actors hidden by static bodies."""
         if self._shapes is None:
-            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
+            return ExternalHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         moving, shapes = self._moving_actors(poses)
-        ray, distance, actor, instance, triangle = listed_hits_on(moving, scan, poses.times)
+        ray, distance, actor, instance, triangle = body_hits(moving, scan, poses.times)
         part_triangle = shapes.part_triangles[shapes.shape[actor], instance]
         triangle = triangle + part_triangle + self._actor_triangles[actor]
-        return OtherHits(ray.astype(np.uint32), distance, triangle)
+        return ExternalHits(ray.astype(np.uint32), distance, triangle)
 
-    def _moving_actors(self, poses: CastPoses) -> tuple[Moving, _ActorShapes]:
-        """Return the actors as moving bodies, and their shapes."""
+    def _moving_actors(self, poses: CastPoses) -> tuple[MovingBodies, _ActorShapes]:
+        """Return the actors as moving bodies, together with their shapes."""
         shapes = self._shapes
         assert shapes is not None, "without actors"
         trajectories = poses.actor_trajectories
 
         def frames(actor: Ints, times: Floats) -> Floats:
-            """Return the positions in the animations of actors at times, in animation frames."""
-            return trajectories.played(actor, times)[0]
+            """Return the animation frames of actors at given times."""
+            return trajectories.animation_frames(actor, times)[0]
 
         presence_ns = trajectories.presence_ns
         if self._unseen_actors is not None:
             presence_ns = np.where(self._unseen_actors[:, None], _NEVER_NS, presence_ns)
-        moving = Moving(
+        moving = MovingBodies(
             shapes.casters,
             shapes.boxes,
             shapes.shape,
@@ -333,30 +348,30 @@ class SceneCaster:
 def casters_of_sensors(
     scene: Scene,
     survey: Survey,
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     known: Iterable[SceneCaster] = (),
     **options: Any,
 ) -> tuple[SceneCaster, ...]:
-    """Return the casters of the sensors of a survey, shared by sensors that see the same objects.
+    """Return the casters of a survey's sensors, shared by sensors that see the same objects.
 
     Parameters
     ----------
     scene
-        Faces, instances and actors to hit.
+        Faces, instances and actors to cast rays at.
     survey
-        The sensors.
+        Survey whose sensors need casters.
     surfaces
         Surfaces of the scene.
     known
-        Casters of the same scene, possibly with other actors. Their trees of static bodies are
-        shared if the same surfaces enclose media, and if the same static objects are unseen.
+        Casters of the same scene, possibly with different actors. Their trees of static bodies are
+        reused if the same surfaces enclose media and the same static objects are unseen.
     options
         Arguments of `RayCaster`.
 
     Raises
     ------
     LidarError
-        If a sensor does not see an object that is not in the scene.
+        If a sensor lists an unseen object that is not in the scene.
     """
     range_m = largest_range_m(survey)
     media = surfaces.media_bodies.static_kinds
@@ -365,15 +380,15 @@ def casters_of_sensors(
 
     @cache
     def vertices() -> Floats:
-        # Surfaces of media are moved outwards, so that light meets both surfaces that touch.
-        return surfaces.media_bodies.spread_out(1.5 * _clear_m(scene))
+        # Surfaces of media are moved outwards so that light hits both of two touching surfaces.
+        return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
-        """Return the bodies of the scene without the static objects of a mask (objects,)."""
+        """Return the bodies of the scene without the static objects in a mask (objects,)."""
         objects = static_key(scene, unseen)
         key = media, objects
         if key not in static_bodies:
-            # Media are searched beyond the range: their bodies stay whole.
+            # Light in media can travel beyond the range, so their bodies must stay whole.
             cut_range_m = np.inf if media else range_m
             unseen_static = unseen[: len(scene.names)] if objects and unseen is not None else None
             static_bodies[key] = StaticBodies(
@@ -382,59 +397,59 @@ def casters_of_sensors(
         return CastBodies(static_bodies[key], key, shapes)
 
     casters: dict[bytes, SceneCaster] = {}  # {unseen objects: caster}
-    of_sensors = []
+    by_sensor = []
     for unseen in unseen_objects(scene, survey):
         key = b"" if unseen is None else unseen.tobytes()
         if key not in casters:
             bodies = bodies_without(unseen)
             casters[key] = SceneCaster(scene, surfaces, bodies, range_m, unseen)
-        of_sensors.append(casters[key])
+        by_sensor.append(casters[key])
     for caster in casters.values():
-        caster.of_sensors = of_sensors
-    return tuple(of_sensors)
+        caster.by_sensor = by_sensor
+    return tuple(by_sensor)
 
 
 def move_instances(
     casters: Sequence[SceneCaster],
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     instances: Instances,
     instance_indices: Indices,
 ) -> None:
-    """Move instances to their transforms in `instances`, while no scan is under way.
+    """Move instances to their transforms in `instances`; no scan may be in progress.
 
     Parameters
     ----------
     casters
         Casters of the sensors of a survey.
     surfaces, instances
-        Of the scene with the moved instances.
+        Surfaces and instances of the scene after the move.
     instance_indices
         (m,): rows of the instances that have moved.
     """
     for static in dict.fromkeys(caster.bodies.static for caster in casters):
         static.move(instances, instance_indices)
     for caster in dict.fromkeys(casters):
-        caster.with_moved_instances(surfaces, instances)
+        caster.update_instances(surfaces, instances)
 
 
-def _clear_m(scene: Scene) -> float:
-    """Return the distance behind a surface at which light continues, meters.
+def _clearance_m(scene: Scene) -> float:
+    """Return the distance in meters behind a surface at which transmitted light continues.
 
-    At this distance a ray does not hit the surface again, wherever its start is rounded to.
+    At this distance, rounding the ray's start cannot make the ray hit the same surface again.
     """
     reach = np.float32(np.abs(scene.bounds).max())
     return max(1e-5, 4 * float(np.spacing(reach)))
 
 
 def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
-    """Return the rows of the first and then every n-th hit of groups with `counts` (g,) hits."""
+    """Return the first and then every n-th row of groups that have `counts` (g,) hits."""
     starts = np.cumsum(counts) - counts
     number_in_group = np.arange(int(counts.sum())) - np.repeat(starts, counts)
     return np.flatnonzero(number_in_group % keep_every == 0)
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
-    """Build the casters of the shapes of actors, or return None without actors.
+    """Build the casters of the actors' shapes, or return None without actors.
 
     `options` are arguments of `RayCaster`.
     """
@@ -446,7 +461,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):
         row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]
     casters = tuple(
-        Deforming(mesh.animation.vertices, mesh.faces)
+        DeformingMesh(mesh.animation.vertices, mesh.faces)
         if mesh.animation
         else RayCaster.from_instances([Instance(mesh_of(part)) for part in mesh_parts], **options)
         for mesh, mesh_parts in zip(meshes, parts_of_meshes, strict=True)

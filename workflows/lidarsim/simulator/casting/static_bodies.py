@@ -1,7 +1,7 @@
-"""The ray caster of the static bodies of a scene: of its faces and instances.
+"""Cast rays against the static bodies of a scene, which are its faces and instances.
 
-Bodies that a sensor does not see are left out. Bodies far beyond the range of all sensors are left
-out as well, and triangles that reach there are cut (`clipping`). Triangles keep their numbers.
+Bodies that a sensor cannot see are omitted, and so are bodies far beyond the range of all sensors.
+Triangles that extend far beyond the range are clipped (`clipping`). Triangle numbers do not change.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
-from raybeam.registry import choose
+from raybeam.registry import choose_backend
 
 from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, MeshPart
 from ...survey.survey import Survey
-from .clipping import CutMesh, box_planes, cut
+from .clipping import ClippedMesh, box_planes, clip_triangles
 
 _log = logging.getLogger(__name__)
 
-# Half of the longest side of a scene above which bodies beyond the range are cut, meters: up to
-# here the size of a scene costs no time.
+# Half the longest side of a scene, in meters, above which bodies beyond the range are omitted. In
+# smaller scenes, the size does not slow down casting.
 MAX_REACH_M = 50_000.0
-# Distance, beyond twice the range of the sensors, at which triangles are cut, meters: sensors may
-# move that far before trees are built again.
+# Triangles are clipped at twice the range of the sensors plus this distance in meters. Sensors may
+# move this far before trees are rebuilt.
 MARGIN_M = 10_000.0
 _NO_ROWS = np.zeros(0, np.int64)
-_SLACK_M = 200.0  # part of the margin for sensors beside their carrier
+_SLACK_M = 200.0  # part of the margin reserved for sensors mounted away from their platform
 
 
 def largest_range_m(survey: Survey) -> float:
-    """Return the largest range of the sensors of a survey, meters."""
+    """Return the largest range of the sensors of a survey in meters."""
     return max(carried.sensor.max_range_m for carried in survey.carried)
 
 
 def warn_of_reach(scene: Scene, survey: Survey) -> None:
-    """Warn that a part of a scene is left out, since no sensor can reach it."""
+    """Log a warning if a part of the scene is omitted because no sensor can reach it."""
     range_m = largest_range_m(survey)
     reach_m = _half_side(scene.bounds)
     if reach_m > MAX_REACH_M and _is_short(range_m):
@@ -54,34 +54,34 @@ def warn_of_reach(scene: Scene, survey: Survey) -> None:
 
 
 def _half_side(bounds: Floats) -> float:
-    """Return half of the longest side of a box (2, 3)."""
+    """Return half of the longest side of a box, given as its lower and upper corner."""
     return float(np.ptp(bounds, axis=0).max(initial=0.0)) / 2
 
 
 def _is_short(range_m: float) -> bool:
-    """Return whether bodies beyond a range may be left out: whether a region around it is small."""
+    """Return whether a region around sensors with this range is small enough to omit the rest."""
     return 2 * (2 * range_m + MARGIN_M) <= MAX_REACH_M
 
 
 class _Trees(NamedTuple):
-    """A caster of the static bodies, or of those within a region, with numbers of the scene."""
+    """A caster of the static bodies, possibly within a region, and its triangle numbering."""
 
     caster: RayCaster
     region: Floats | None  # (2, 3), meters; None for the whole scene
     # (b,): first triangle of each instance of the caster; None for a caster of faces alone
     first_triangles: Ints32 | None
-    # (r,): indices in the scene's instances of the last r instances of the caster, ascending
+    # (r,): rows of the scene's instances that are the last r instances of the caster, ascending
     instance_indices: Ints
-    # {instance of the caster: the triangle of its mesh that each triangle is a part of}
+    # {instance of the caster: original triangle that each clipped triangle is a part of}
     origins: dict[int, Indices]
 
     @property
     def face_bodies(self) -> int:
-        """Number of instances of the caster that are the scene's faces: 0 or 1."""
+        """Number of instances of the caster that represent the faces of the scene, 0 or 1."""
         return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
-        """Return the triangles of hits (k,), by the numbers of the scene."""
+        """Return the triangles of hits (k,) in the numbering of the scene."""
         triangle = hits.triangle
         if self.origins:
             triangle = triangle.copy()
@@ -101,15 +101,16 @@ class StaticBodies:
     Parameters
     ----------
     scene
-        Faces and instances.
+        Scene with the faces and instances.
     vertices
-        (v, 3): vertices of the scene's faces, meters.
+        (v, 3): vertices of the scene's faces in meters.
     range_m
-        Largest range of the sensors, meters; inf leaves out no body for its distance.
+        Largest range of the sensors in meters. If it is inf, no body is omitted because of its
+        distance.
     options
         Arguments of `RayCaster`.
     unseen
-        (objects,): True for the static objects that are left out; None for no object.
+        (objects,): True for the static objects to omit. None if no object is omitted.
     """
 
     def __init__(
@@ -125,10 +126,10 @@ class StaticBodies:
         self._instances = scene.instances
         self._has_faces = len(scene.faces) > 0
         self._sees_all_faces = unseen is None
-        # (n,): whether the instances are seen; None if all are.
+        # (n,): whether each instance is visible; None if all are.
         self._instance_is_seen: Bools | None = None
         if unseen is not None:
-            # A triangle without an area is never hit, and the other triangles keep their numbers.
+            # A degenerate triangle is never hit, and the other triangles keep their numbers.
             self._faces = np.where(unseen[scene.face_object, None], 0, scene.faces)
             self._has_faces = _have_area(vertices, self._faces)
             if scene.instances is not None:
@@ -136,8 +137,8 @@ class StaticBodies:
         self._options = options
         self._lock = threading.Lock()
         self._center = scene.bounds.mean(axis=0)
-        on_device = choose(options.get("backend", "auto")).on_device
-        # Whether bodies may be left out once some are remote, and whether some are.
+        on_device = choose_backend(options.get("backend", "auto")).on_device
+        # Whether bodies may be omitted in a large scene, and whether this scene is large.
         self._can_cut = _is_short(range_m) and not on_device
         self._may_cut = self._can_cut and _half_side(scene.bounds) > MAX_REACH_M
         self._trees: _Trees | None = None
@@ -146,7 +147,7 @@ class StaticBodies:
 
     @property
     def trees(self) -> _Trees:
-        """The trees: of the whole scene, or of the region that was covered last."""
+        """The trees of the whole scene, or of the region that was covered last."""
         if self._trees is None:
             with self._lock:
                 self._trees = self._trees or self._build(None)
@@ -156,7 +157,7 @@ class StaticBodies:
     def backend(self) -> str:
         """Name of the backend in use."""
         if self._trees is None:
-            return choose(self._options.get("backend", "auto")).name
+            return choose_backend(self._options.get("backend", "auto")).name
         return self._trees.caster.backend
 
     @property
@@ -164,10 +165,10 @@ class StaticBodies:
         """Whether hits can stay on a CUDA device."""
         return not self._may_cut and self.trees.caster.on_device
 
-    def cover(self, positions: Floats, range_m: float) -> None:
-        """Build trees of all bodies that sensors at positions (p, 3) reach, unless there are.
+    def ensure_trees(self, positions: Floats, range_m: float) -> None:
+        """Build trees of all bodies within range of sensors at positions (p, 3), if needed.
 
-        Trees of a smaller region stay valid for casts under way.
+        Casts in progress can continue to use the trees of an earlier region.
         """
         if not self._may_cut:
             return
@@ -188,10 +189,10 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move(self, instances: Instances, instance_indices: Indices) -> None:
-        """Move instances by their indices (m,) to their transforms in `instances`. No cast may run.
+        """Move instances, given by their rows (m,), to their transforms in `instances`.
 
-        Trees are built again if an instance leaves for where no sensor reaches, such as a body that
-        falls for ever, if it comes from there, or if it was cut.
+        No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
+        that sensors can reach, as a body that falls forever does, or if it was clipped.
         """
         self._instances = instances
         if self._instance_is_seen is not None:
@@ -203,15 +204,17 @@ class StaticBodies:
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
         if trees.region is None and is_remote.any() and self._can_cut:
             self._may_cut = True
-            self._trees = None  # `cover` builds them
+            self._trees = None  # `ensure_trees` builds them
             return
         first = trees.face_bodies
-        if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
-            trees.caster.move(first + instance_indices, instances.transforms[instance_indices])
+        if trees.region is None and self._instance_is_seen is None:  # the tree has all instances
+            trees.caster.set_transforms(
+                first + instance_indices, instances.transforms[instance_indices]
+            )
             return
         numbers = first + np.searchsorted(trees.instance_indices, instance_indices)
         if trees.region is None:
-            trees.caster.move(numbers, instances.transforms[instance_indices])
+            trees.caster.set_transforms(numbers, instances.transforms[instance_indices])
             return
         has_tree = np.isin(instance_indices, trees.instance_indices)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
@@ -219,12 +222,14 @@ class StaticBodies:
         if (is_cut | comes | (has_tree & is_remote)).any():
             self._trees = self._build(trees.region)
             return
-        trees.caster.move(numbers[has_tree], instances.transforms[instance_indices[has_tree]])
+        trees.caster.set_transforms(
+            numbers[has_tree], instances.transforms[instance_indices[has_tree]]
+        )
 
     def _build(self, region: Floats | None) -> _Trees:
-        """Build the trees of the bodies within a region (2, 3), or of all bodies.
+        """Build the trees of the bodies within a region.
 
-        If the region has no body, the trees have all bodies.
+        If `region` is None or contains no body, the trees contain all bodies.
         """
         faces = None if region is None else self._cut_faces(region)
         if self._instances is not None:
@@ -239,18 +244,19 @@ class StaticBodies:
         caster = RayCaster(faces.vertices, faces.faces, **self._options)
         return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
 
-    def _cut_faces(self, region: Floats) -> CutMesh | None:
-        """Return the parts of the seen faces within a region (2, 3), or None if all are within."""
-        cut_mesh = cut(self._vertices, self._faces, box_planes(region))
+    def _cut_faces(self, region: Floats) -> ClippedMesh | None:
+        """Clip the visible faces to a region, or return None if all faces are inside."""
+        cut_mesh = clip_triangles(self._vertices, self._faces, box_planes(region))
         if cut_mesh is None or self._sees_all_faces:
             return cut_mesh
         seen = np.flatnonzero((cut_mesh.faces != cut_mesh.faces[:, :1]).any(axis=1))
         return cut_mesh._replace(faces=cut_mesh.faces[seen], origin=cut_mesh.origin[seen])
 
     def _build_transparent(self) -> _Trees:
-        """Build the tree of a single triangle through which all rays pass: nothing is seen.
+        """Build a tree with a single triangle that lets all rays pass, because nothing is visible.
 
-        A caster needs a triangle with an area. The triangles are as many as the scene's faces.
+        A caster requires a triangle with a nonzero area. The other triangles are degenerate and
+        make up the number of faces in the scene.
         """
         count = max(1, len(self._faces))
         faces = np.zeros((count, 3), np.int64)
@@ -261,9 +267,9 @@ class StaticBodies:
         return _Trees(caster, None, None, _NO_ROWS, {})
 
     def _build_nested(
-        self, instances: Instances, region: Floats | None, faces: CutMesh | None
+        self, instances: Instances, region: Floats | None, faces: ClippedMesh | None
     ) -> _Trees:
-        """Build the trees of faces, cut or not, and of instances."""
+        """Build the trees of faces, which may be clipped, and of instances."""
         bodies: list[Instance] = []
         origins: dict[int, Indices] = {}
         if faces is None and self._has_faces:
@@ -301,11 +307,12 @@ class StaticBodies:
 
 def _parts_in(
     instances: Instances, region: Floats | None, is_seen: Bools | None
-) -> Iterator[tuple[int, CutMesh | None]]:
-    """Yield the rows of the seen instances within a region (2, 3), and the parts of cut instances.
+) -> Iterator[tuple[int, ClippedMesh | None]]:
+    """Yield the rows of visible instances within a region, with the clipped mesh or None.
 
-    `is_seen` (n,) tells which instances are seen; None if all are. Parts with a mask are not cut:
-    single precision of the corners' coordinates in the texture would move the mask.
+    `is_seen` (n,) states which instances are visible; None means all. Parts with an opacity mask
+    are not clipped, because rounding their texture coordinates to single precision would shift the
+    mask.
     """
     if region is None:
         instance_indices = (
@@ -323,24 +330,24 @@ def _parts_in(
         part = instances.mesh_parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
             planes = box_planes(region, instances.transforms[row])
-            cut_part = cut(part.vertices, part.faces, planes)
+            cut_part = clip_triangles(part.vertices, part.faces, planes)
         if cut_part is None or len(cut_part.faces):
             yield row, cut_part
 
 
 def _have_area(vertices: Floats, faces: Integers) -> bool:
-    """Return True if a triangle (f, 3) has an area."""
+    """Return whether any triangle has a nonzero area."""
     a, b, c = vertices[faces[(faces != faces[:, :1]).any(axis=1)]].transpose(1, 0, 2)
     return bool(np.cross(b - a, c - a).any())
 
 
 def _is_near(instances: Instances, region: Floats) -> Bools:
-    """Return whether the box of each instance meets a region (2, 3): (n,)."""
+    """Return for each instance whether its bounding box intersects a region."""
     lower, upper = instances.bounds.transpose(1, 0, 2)
     return np.asarray(((lower <= region[1]) & (region[0] <= upper)).all(axis=1))
 
 
 def mesh_of(part: MeshPart) -> Mesh:
-    """Return the mesh of a part, with the mask of its texture, if any."""
+    """Return the mesh of a part, including the opacity mask of its texture if it has one."""
     opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
     return Mesh(part.vertices, part.faces, opacity)

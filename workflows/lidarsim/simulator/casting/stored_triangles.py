@@ -1,4 +1,4 @@
-"""Triangles of a scene: their numbers, owners, and the stored triangles that copies share."""
+"""Numbering of the triangles in a scene, and the geometry that copies share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...base.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
-from ...base.vectors import inverse, length
+from ...base.vectors import inverse, norm
 from ...scene.actors import distinct_meshes
 from ...scene.colors import Colors
 from ...scene.scene import Scene
@@ -17,52 +17,53 @@ from ...scene.scene import Scene
 if TYPE_CHECKING:
     from .surface_loops import TriangleNumbers, TriangleOwners
 
-BLOCK_FACES = 1 << 18  # triangles whose normals are computed at a time
+BLOCK_FACES = 1 << 18  # number of triangles whose normals are computed at a time
 
 
 class StoredTriangles:
-    """Numbers and owners of the triangles of a scene, and the triangles that are stored.
+    """Numbers and owners of the triangles in a scene, and the triangles that are stored once.
 
-    Triangles are numbered by the scene's faces, then instance by instance, then by actors. Stored
-    triangles are the scene's faces, then the distinct meshes of actors, then the parts of meshes
-    that instances place, each once: instances of a part share its stored triangles. Objects of
-    actors follow the static objects.
+    Triangles are numbered in this order: the faces of the scene, the triangles of each instance,
+    and the triangles of each actor. Stored triangles are the faces of the scene, the distinct
+    meshes of actors, and the distinct mesh parts of instances; instances of the same part share its
+    stored triangles. The objects of actors are numbered after the static objects.
     """
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self.static_objects = len(scene.names)  # objects
+        self.static_objects = len(scene.names)  # number of static objects
         self.counters = scene.counters
         instances = scene.instances
         face_count = len(scene.faces)
         instance_sizes = np.zeros(0, np.int64) if instances is None else instances.sizes
-        # First triangle of each instance, and of actors.
+        # First triangle of each instance, followed by the first triangle of the actors.
         self.instance_starts = face_count + np.cumsum([0, *instance_sizes])
         actor_sizes = [len(actor.mesh.faces) for actor in scene.actors]
         self.meshes, self.actor_mesh = distinct_meshes(scene.actors)
         mesh_sizes = [len(mesh.faces) for mesh in self.meshes]
         self.mesh_starts = mesh_starts = face_count + np.cumsum([0, *mesh_sizes])
         actor_starts = self.instance_starts[-1] + np.cumsum([0, *actor_sizes])[:-1]
-        # (actors,): add to the number of an actor's triangle for its row among stored triangles.
+        # (actors,): offset from an actor's triangle numbers to its rows among the stored triangles.
         self._actor_shifts = mesh_starts[self.actor_mesh] - actor_starts
         self._parts_start = int(mesh_starts[-1])
         owners = np.arange(
             self.static_objects, self.static_objects + len(actor_sizes), dtype=np.int32
         )
-        # Objects of the triangles of faces and of actors; the last is of no triangle.
+        # Objects that the triangles of faces and actors belong to; the last entry is for no
+        # triangle.
         objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(objects)
 
     @cached_property
     def normal_matrices(self) -> Floats:
-        """Matrices (n, 3, 3) from normals of parts to normals of instances, of any length."""
+        """Matrices (n, 3, 3) from normals of parts to unnormalized normals of instances."""
         instances = self._scene.instances
         if instances is None:
             return np.zeros((0, 3, 3))
         return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
 
-    def moved(self, scene: Scene) -> StoredTriangles:
-        """Return the triangles of a scene with new transforms of instances."""
+    def with_moved_instances(self, scene: Scene) -> StoredTriangles:
+        """Return the triangles of a scene in which instances have new transforms."""
         triangles = copy(self)
         triangles._scene = scene
         vars(triangles).pop("normal_matrices", None)
@@ -70,7 +71,7 @@ class StoredTriangles:
 
     def locate(self, triangle: Integers) -> TriangleOwners:
         """Return the stored rows, objects and instances of triangles (n,)."""
-        from . import surface_loops  # not before: numba takes half a second to import
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         count = len(triangle)
         row, instance = np.empty((2, count), np.int64)
@@ -80,7 +81,7 @@ class StoredTriangles:
 
     @cached_property
     def _triangle_numbers(self) -> TriangleNumbers:
-        """Numbers of triangles, objects and instances, for loops."""
+        """Numbers of triangles, objects and instances, as arrays for compiled loops."""
         from .surface_loops import TriangleNumbers
 
         instances = self._scene.instances
@@ -99,18 +100,18 @@ class StoredTriangles:
         )
 
     def bodies(self) -> tuple[Ints, Floats]:
-        """Return the bodies that triangles belong to, in the order of `SceneCaster`.
+        """Return the bodies that triangles belong to, in the order used by `SceneCaster`.
 
         Returns
         -------
         bodies
-            (b, 3): the scene's faces, if any, each instance, and all actors as
-            one body. Columns are the first triangle; the object, or -1 if `owners` has the object
-            of each triangle; and the row of the first normal in `unit_normals`, or -1 for actors,
-            which share normals. In `owners`, actors follow the scene's faces.
+            (b, 3): a row for the faces of the scene, if any, for each instance, and for all actors
+            as one body. The columns are the first triangle; the object, or -1 if `owners` has an
+            object for each triangle; and the row of the first normal in `unit_normals`, or -1 for
+            actors, which share normals. In `owners`, actors follow the faces of the scene.
         normal_matrices
-            (b, 3, 3): matrices from normals in `unit_normals` to normals in the scene frame, of any
-            length.
+            (b, 3, 3): matrices that transform rows of `unit_normals` to unnormalized normals in the
+            scene frame.
         """
         face_count, actors_start = self.instance_starts[[0, -1]]
         identity = np.eye(3)[None]
@@ -128,37 +129,38 @@ class StoredTriangles:
         return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
 
     def objects(self, triangle: Integers) -> Ints32:
-        """Return the objects of triangles (n,): (n,), or -1 without a surface."""
+        """Return the objects that triangles (n,) belong to, or -1 for `NO_SURFACE`."""
         if self._scene.instances is None:
             return self.owners[triangle]
         return self.locate(triangle).object
 
     def instances(self, triangle: Integers) -> Indices:
-        """Return the instances of triangles (n,), which all belong to instances: (n,)."""
+        """Return the instances of triangles (n,), all of which must belong to instances."""
         return np.searchsorted(self.instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
-        """Return the rows of hit counters (n,) that count hits on triangles (n,).
+        """Return the hit counter of each triangle (n,).
 
-        Each of the scene's faces has a counter, each instance has a single counter for all its
-        triangles, and each triangle of an actor has a counter, in this order: `Scene.counters`.
+        The counters are sorted as in `Scene.counters`: one for each face of the scene, then one for
+        each instance, which counts the hits on all of its triangles, then one for each triangle of
+        an actor.
         """
         if self._scene.instances is None:
             return triangle
         face_count, actors_start = self.instance_starts[[0, -1]]
         instance = self.locate(triangle).instance
-        # Triangles of instances, less one counter for each instance.
+        # Number of triangles of instances minus one counter for each instance.
         shift = actors_start - face_count - (len(self.instance_starts) - 1)
         face_or_actor = np.where(triangle >= actors_start, triangle - shift, triangle)
         return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def count(self, triangle: Integers) -> Ints:
-        """Return the number of hits on triangles (n,) by counters: (counters,)."""
+        """Count the hits on triangles (n,) by hit counter. Shape (counters,)."""
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property
     def stored_bodies(self) -> list[tuple[Floats, Integers, Colors | None]]:
-        """Vertices, faces and colors of stored triangles: scene, meshes of actors, and parts."""
+        """Vertices, faces and colors of the scene, of the actors' meshes, and of instance parts."""
         scene = self._scene
         bodies: list[tuple[Floats, Integers, Colors | None]] = [
             (scene.vertices, scene.faces, scene.colors)
@@ -171,7 +173,7 @@ class StoredTriangles:
 
     @cached_property
     def unit_normals(self) -> Floats32:
-        """Unit normals of the stored triangles: (f, 3)."""
+        """Unit normals of the stored triangles. Shape (f, 3)."""
         bodies = self.stored_bodies
         normals = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
         row = 0
@@ -184,14 +186,14 @@ class StoredTriangles:
 
     @cached_property
     def part_starts(self) -> Indices:
-        """Stored row of the first triangle of each part of instances."""
+        """Stored row of the first triangle of each mesh part of instances."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.mesh_parts]
         return self._parts_start + np.cumsum([0, *sizes[:-1]])
 
 
 def normals_of(corners: Floats) -> Floats32:
-    """Return unit normals (n, 3) of triangles (n, 3, 3), in single precision."""
+    """Return the unit normals of triangles (n, 3, 3) in single precision."""
     a, b, c = corners.transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
-    return (normals / np.maximum(length(normals)[:, None], 1e-300)).astype(np.float32)
+    return (normals / np.maximum(norm(normals)[:, None], 1e-300)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Loops over hits: surfaces of hits, their normals, and the light that surfaces send back or on."""
+"""Compiled loops over hits, for surfaces, normals, and reflected and transmitted light."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -22,95 +22,95 @@ within_water = inlined(within_water_of_arrays)
 
 
 class TriangleNumbers(NamedTuple):
-    """Numbers of triangles: faces of the scene, then of instances, then of actors."""
+    """Numbering of triangles: the scene's faces, then instances, then actors."""
 
-    instance_starts: Ints  # (i + 1,): first triangle of each instance, and of actors
-    owners: (
-        Ints32  # (f + a + 1,): objects of the triangles of faces and actors; -1 for no triangle, -1
-    )
+    instance_starts: Ints  # (i + 1,): first triangle of each instance, then of the actors
+    # (f + a + 1,): objects of the triangles of faces and actors; the last is -1, for `NO_SURFACE`
+    owners: Ints32
     instance_objects: Ints32  # (i,)
-    instance_rows: Ints  # (i,): stored row of the first triangle of each instance
-    actor_shifts: Ints  # (actors,): from numbers of an actor's triangles to stored rows
+    instance_rows: Ints  # (i,): stored row of each instance's first triangle
+    actor_shifts: Ints  # (actors,): offset from an actor's triangle numbers to stored rows
     static_objects: int  # number of objects that are not actors
 
 
 class TriangleOwners(NamedTuple):
-    """Owners of triangles: (n,) each."""
+    """Owners of n triangles."""
 
-    row: Ints  # among the stored triangles, which actors and instances share
+    row: Ints  # row of the stored triangles, which actors and instances share
     object: Ints32
-    instance: Ints  # or -1
+    instance: Ints  # -1 if the triangle does not belong to an instance
 
 
 class HitSurfaces(NamedTuple):
-    """Surfaces of hits: (n,) each."""
+    """Surfaces of n hits."""
 
     row: Ints  # row of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
-    kind: Ints32  # number of a material of an object (`Scene.surface_kinds`)
-    instance: Ints  # or -1
+    kind: Ints32  # kind of surface, a number of a material of an object (`Scene.surface_kinds`)
+    instance: Ints  # -1 if the surface does not belong to an instance
     run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
 
 
 class NormalTables(NamedTuple):
-    """Normals of triangles, and the rotations of instances and actors."""
+    """Normals of triangles, and rotations of instances and actors."""
 
     stored: Floats32  # (f, 3): unit normals of stored triangles
-    deformed: Floats32  # (d, 3): unit normals of triangles of actors that deform
-    # (i, 3, 3): from normals of an instance's mesh to normals in the scene, of any length.
+    deformed: Floats32  # (d, 3): unit normals of triangles of deforming actors
+    # (i, 3, 3): from normals of an instance's mesh to unnormalized normals in the scene.
     instances: Floats
-    # (12, m): poses of actors, position and rotation by rows; a column for each run of hits that
-    # have equal actors and times.
+    # (12, m): poses of actors as position and row-major rotation; one column for each run of
+    # consecutive hits with the same actor and time.
     poses: Floats
 
 
 class Incidence(NamedTuple):
-    """Incidence of rays on surfaces."""
+    """How rays meet surfaces."""
 
-    normals: Floats  # (3, n): unit normals, scene frame
-    cosines: Floats  # (n,): products of normals and directions, of either sign
-    back: Floats  # (n,): energy that is received from the surface at a distance of 10 m
+    normals: Floats  # (3, n): unit normals in the scene frame
+    cosines: Floats  # (n,): dot products of normals and directions, of either sign
+    back: Floats  # (n,): energy that the sensor would receive from a distance of 10 m
 
 
 class WaterFilm(NamedTuple):
-    """Water on surfaces."""
+    """A film of water on surfaces."""
 
-    level: float  # smallest z of the normal, on the visible side, of surfaces that hold water
-    wet: float  # share of these surfaces that is below water
+    level: float  # smallest z of a normal, on the visible side, for surfaces that hold water
+    wet: float  # share of these surfaces that is covered by water
     dry: Bools  # (kinds,): whether a kind of surface stays dry
 
 
 class OnwardOptics(NamedTuple):
-    """Optics of kinds of surfaces: (kinds,) each."""
+    """Optical properties of n kinds of surfaces for light that continues beyond a hit."""
 
-    specular: Floats  # share of light that is mirrored at normal incidence
-    passes: Bools  # whether light passes as through glass
-    straight: Bools  # whether the surface bounds no refracting medium, so that light is not bent
-    leafy: Bools  # whether the surface bounds leaves, and sends nothing back
+    specular: Floats  # share of light that is reflected specularly at normal incidence
+    passes: Bools  # whether light passes through, as through glass
+    # Whether light is not refracted because the surface bounds no refracting medium.
+    straight: Bools
+    leafy: Bools  # whether the surface bounds leaves and reflects nothing itself
 
 
 class OnwardHits(NamedTuple):
-    """Hits where light goes on: (n,) each."""
+    """Hits at which light continues, as arrays of shape (n,)."""
 
     kind: Ints32
-    cosines: Floats  # cosines of either sign
+    cosines: Floats  # cosines of incidence, of either sign
     film: Bools  # whether there may be water; empty without water
-    share: Floats  # share of the energy, after the earlier surfaces: light passes each out and back
-    distance: Floats  # optical path from the sensor, meters
+    share: Floats  # share of the energy that is left, because light crosses each surface twice
+    distance: Floats  # optical path length from the sensor, meters
 
 
 class OnwardLimits(NamedTuple):
-    """Water and detection of light that goes on."""
+    """Thresholds for light that continues beyond a hit."""
 
-    wet: float  # share of surfaces with a film that is below water
-    brightest: float  # largest energy that any surface returns at a distance of 10 m
+    wet: float  # share of surfaces with a film that is covered by water
+    brightest: float  # largest energy that any surface returns from a distance of 10 m
     extinction: float  # 1/m
-    faintest: float  # light that can return no more energy is dropped
+    faintest: float  # light is dropped if it cannot return more energy than this
 
 
 class ActorTriangles(NamedTuple):
-    """Numbers of the triangles of actors.
+    """Numbering of the triangles of actors.
 
-    A shape is a distinct mesh, which actors may share; its parts are cast separately.
+    A shape is a distinct mesh, which several actors may share. Its parts are cast separately.
     """
 
     # (shapes, parts): first triangle of each part of a shape, numbered within the shape
@@ -120,7 +120,7 @@ class ActorTriangles(NamedTuple):
 
 
 class JoinedHits(NamedTuple):
-    """Arrays that the nearest hits are written to: (n,) each."""
+    """Output arrays for the nearest hits, each of shape (n,)."""
 
     ray: Ints
     distance: Floats  # meters
@@ -128,32 +128,32 @@ class JoinedHits(NamedTuple):
 
 
 class TrackTable(NamedTuple):
-    """Straight tracks among trajectories, with their segments in the order of tracks."""
+    """Piecewise linear tracks among trajectories, with their segments sorted by track."""
 
-    member: Ints  # (w,): for each trajectory its track, 0 to t - 1; -1 for curved trajectories
+    member: Ints  # (w,): track of each trajectory, from 0 to t - 1; -1 for curved trajectories
     first: Ints  # (t,): first segment of each track
     segments: Ints  # (t,): number of segments of each track
-    # (4, t): seconds: start by the track's clock, first and last time of its poses, and how far
-    # outside these a time may be; inf for any time.
+    # (4, t), seconds: start on the track's clock, first and last time of its poses, and the
+    # tolerance for times outside this interval; inf if any time is valid.
     limits: Floats
     times: Floats  # (s,): start of each segment, seconds
     start: Floats  # (3, s): position at the start of each segment, meters
     speed: Floats  # (3, s): velocity, m/s
-    # (3, 9, s): a rotation, by rows, is term 0 + sin(a) term 1 + cos(a) term 2, where a is the
-    # angle since the start of the segment (`Segments`).
+    # (3, 9, s): terms of the row-major rotation, which is term 0 + sin(a) term 1 + cos(a) term 2; a
+    # is the angle since the start of the segment (`Segments`).
     rotation: Floats
-    rates: Floats  # (s,): growth of the angle a, rad/s
+    rates: Floats  # (s,): derivative of the angle a, rad/s
 
 
 @inlined
 def _product(x, y, z, a, b, c):
-    """Return a scalar product, in the order of `vectors.products`."""
+    """Return a dot product, with the order of operations of `vectors.dot`."""
     return (x * a + y * b) + z * c
 
 
 @inlined
 def _instance_of(t, instance_starts):
-    """Return the instance that contains a triangle, by binary search."""
+    """Return the instance that a triangle belongs to, by binary search."""
     lower = 0
     upper = len(instance_starts) - 1
     while upper - lower > 1:
@@ -167,9 +167,9 @@ def _instance_of(t, instance_starts):
 
 @compiled()
 def find_owners(triangle, numbers, output):
-    """Write the stored rows, objects and instances of triangles (n,) to `output`, `TriangleOwners`.
+    """Write the stored rows, objects and instances of triangles (n,) to `output`.
 
-    `numbers` are `TriangleNumbers`.
+    `numbers` is a `TriangleNumbers`, and `output` a `TriangleOwners`.
     """
     starts = numbers.instance_starts
     owners = numbers.owners
@@ -197,7 +197,7 @@ def find_owners(triangle, numbers, output):
 
 @inlined
 def _instance_normal(matrices, i, x, y, z):
-    """Return the unit normal of an instance, rounded in the order of columns.cu."""
+    """Return the unit normal of an instance, rounded in the same order as in columns.cu."""
     a = _product(matrices[i, 0, 0], matrices[i, 0, 1], matrices[i, 0, 2], x, y, z)
     b = _product(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2], x, y, z)
     c = _product(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2], x, y, z)
@@ -207,7 +207,7 @@ def _instance_normal(matrices, i, x, y, z):
 
 @inlined
 def _actor_normal(poses, run, x, y, z):
-    """Return a normal rotated by the pose (12, m) of a run."""
+    """Return a normal rotated by column `run` of the poses (12, m)."""
     a = _product(poses[3, run], poses[4, run], poses[5, run], x, y, z)
     b = _product(poses[6, run], poses[7, run], poses[8, run], x, y, z)
     c = _product(poses[9, run], poses[10, run], poses[11, run], x, y, z)
@@ -215,13 +215,13 @@ def _actor_normal(poses, run, x, y, z):
 
 
 @compiled()
-def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
-    """Write how rays with directions (3, n) meet surfaces to `output`, `Incidence`.
+def compute_incidence(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
+    """Write to `output` how rays with directions (3, n) meet surfaces.
 
-    `hits` are `HitSurfaces`, `tables` `NormalTables`; `reflectance` and `retro` are by kinds of
-    surfaces. The light that is sent back suits surfaces that are neither textured nor rough.
-    No view of an array is made: a view would be counted, which takes five times as long as the
-    rest of the loop.
+    `hits` is a `HitSurfaces`, `tables` a `NormalTables`, and `output` an `Incidence`. `reflectance`
+    and `retro` have one value per kind of surface. The reflected light is computed for surfaces
+    that are neither textured nor rough. The loop creates no array views, because reference counting
+    for a view would take five times as long as the rest of the loop.
     """
     row_indices = hits.row
     kinds = hits.kind
@@ -265,7 +265,7 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
 def at_right_angles(distance, extinction):
     """Return the energy from a white surface at normal incidence, as `materials.at_right_angles`.
 
-    `distance` is in meters, `extinction` in 1/m.
+    `distance` is in meters, and `extinction` in 1/m.
     """
     range_m = max(distance, NEAREST_M)
     nearer = REFERENCE_M / range_m
@@ -274,19 +274,20 @@ def at_right_angles(distance, extinction):
 
 
 @compiled()
-def fade(distance, extinction, energy):
-    """Multiply energies (n,) by `at_right_angles` of their distances (n,)."""
+def attenuate_energies(distance, extinction, energy):
+    """Multiply energies (n,) by `at_right_angles` at the given distances (n,)."""
     for k in range(len(energy)):
         energy[k] *= at_right_angles(distance[k], extinction)
 
 
 @compiled()
-def soak(normals_z, cosines, kinds, shares, water, film, back):
-    """Mark hits where there may be water in `film`, and reduce their energies `back` by the water.
+def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
+    """Reduce the energies of hits on wet surfaces, and mark these hits in `film`.
 
-    `normals_z` are z of the normals, `shares` the shares of light that surfaces scatter, and `back`
-    the received energies: (n,) each. `water` is a `WaterFilm`. The share `WaterFilm.wet` of marked
-    surfaces scatters as below water, which mirrors a part of the light on the way in and out.
+    `normals_z` are the z components of the normals, `shares` are the shares of light that surfaces
+    scatter, and `back` are the received energies, each of shape (n,). `water` is a `WaterFilm`. The
+    share `WaterFilm.wet` of each marked surface scatters light through water, whose surface
+    reflects a part of the light on the way in and on the way out.
     """
     level = water.level
     wet = water.wet
@@ -301,16 +302,17 @@ def soak(normals_z, cosines, kinds, shares, water, film, back):
 
 @compiled()
 def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_share):
-    """Write the share of light that goes on from rows of hits, through surfaces or reflected.
+    """Compute the light that continues from hits, transmitted or reflected, and drop faint light.
 
-    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`. `row_indices`
-    (k,) are rows of the hits. For each, `reflected` (k,) is True for light that the surface
-    mirrors, False for light that passes the surface, and `shares` (k,) is the share of light that
-    the surface scatters. At surfaces of refracting media, light is not divided here into mirrored
-    and transmitted light: `LightInMedia.cross` divides it. Light that is too faint is dropped:
-    overwrites `row_indices` and `reflected` by the remaining light, and writes its `onward_share`:
-    of the energy, since light passes the surface out and back. Returns the number of remaining
-    rows.
+    `row_indices` (k,) are rows of the hits, `reflected` (k,) is True for light that the surface
+    reflects and False for light that it transmits, and `shares` (k,) are the shares of light that
+    the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits` an
+    `OnwardLimits`. Surfaces of refracting media do not divide light here; `LightInMedia.cross` does
+    that.
+
+    The function overwrites `row_indices` and `reflected` with the light that is bright enough,
+    writes its share of the energy to `onward_share`, and returns the number of remaining rows. The
+    share counts each surface twice, because light crosses it on the way out and back.
     """
     count = 0
     for j in range(len(row_indices)):
@@ -342,10 +344,10 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
 
 @compiled()
 def start_behind(origins, directions, step_m, clear_m, starts, onward):
-    """Write where light starts `clear_m` (n,) behind its ends, and normalize its directions.
+    """Write where light continues, `clear_m` (n,) beyond its ends, and normalize its directions.
 
-    The light ends `step_m` (n,) from `origins` along `directions`, and goes on along `onward`,
-    which becomes unit vectors; `starts` is written. Vectors are (3, n).
+    The light ends at distances `step_m` (n,) from `origins` along `directions`. It continues from
+    `starts` along `onward`, which is normalized in place. Vectors have shape (3, n).
     """
     for k in range(len(step_m)):
         for axis in range(3):
@@ -354,7 +356,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
         x = onward[0, k]
         y = onward[1, k]
         z = onward[2, k]
-        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # `Pattern` does so for all rays
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does for all rays
             largest = max(max(abs(x), abs(y)), abs(z))
             x = x / largest
             y = y / largest
@@ -367,15 +369,15 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of sub-rays `ray` (n,) to `times`, all times in nanoseconds.
+    """Write the firing times of sub-rays `ray` (n,) to `times`, in nanoseconds.
 
     Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
-    times of firings, and `delays` the times of the beams of a firing after its start.
+    start times of firings, and `delays` are the delays of beams within a firing.
     """
     first_beam = 0
     firing = -1
     channels = len(delays)
-    for k in range(len(ray)):  # mostly, rays are consecutive
+    for k in range(len(ray)):  # rays are mostly consecutive
         beam = start + ray[k] // subrays
         if firing < 0 or not first_beam <= beam < first_beam + channels:
             firing = int(beam // channels)
@@ -384,14 +386,14 @@ def firing_times(ray, start, subrays, firing_starts, delays, times):
 
 
 @compiled()
-def merge(ray, triangle, nearest, actors, output):
+def merge_hits(ray, triangle, nearest, actors, output):
     """Merge hits on static bodies with hits on actors, and return the number of hits.
 
     The nearest hit of each ray is written to `output`, which is a `JoinedHits`. `ray` and
     `triangle` (k,) are the hits on static bodies, in ray order. `nearest` is a
-    `raybeam.crossing.Nearest` with one entry per ray. In `nearest`, the body is the actor, or
+    `raybeam.body_rays.NearestHits` with one entry per ray. In `nearest`, the body is the actor, or
     negative if the ray hits no actor or hits a static body first. For such rays, the distance is
-    that to the static body. `actors` is an `ActorTriangles`.
+    the distance to the static body. `actors` is an `ActorTriangles`.
     """
     hit_actors = nearest.body
     i = 0
@@ -414,10 +416,10 @@ def merge(ray, triangle, nearest, actors, output):
 
 @compiled()
 def find_runs(trajectory, times, first_rows, run_numbers):
-    """Write each row's run number and each run's first row, and return the number of runs.
+    """Write the run number of each row and the first row of each run, and return the run count.
 
-    In a run, trajectories and times are equal. `trajectory` (n,) are numbers of trajectories; rows
-    with numbers below 0 have the run -1, and do not end a run.
+    The rows of a run have the same trajectory and time. `trajectory` (n,) are trajectory numbers.
+    Rows with a negative number get run -1 and do not interrupt a run.
     """
     count = 0
     last = -1
@@ -435,7 +437,7 @@ def find_runs(trajectory, times, first_rows, run_numbers):
 
 @inlined
 def _segment_at(tracks, track, time_s):
-    """Return the last segment of a track that has started at a time, by binary search."""
+    """Return the last segment of a track that starts at or before a time, by binary search."""
     segment = tracks.first[track]
     later_segments = tracks.segments[track] - 1
     while later_segments:
@@ -462,10 +464,11 @@ def _write_pose(tracks, segment, elapsed_s, poses, k):
 
 @compiled()
 def poses_on_tracks(trajectory, times_ns, tracks, poses):
-    """Write poses (12, n) of trajectories on straight tracks, with the operations of `Track.poses`.
+    """Write the poses (12, n) of trajectories on piecewise linear tracks.
 
-    `trajectory` (n,) are numbers of trajectories, and `tracks` is a `TrackTable`; columns of curved
-    trajectories are not written. Returns the first row whose time is outside of its track, or -1.
+    The operations are those of `Track.poses`. `trajectory` (n,) are trajectory numbers, and
+    `tracks` is a `TrackTable`. Columns of curved trajectories are not written. Returns the first
+    row whose time is outside its track, or -1.
     """
     limits = tracks.limits
     for k in range(len(trajectory)):

@@ -1,4 +1,4 @@
-"""Surfaces: normals and colors of triangles, and the light that materials send back."""
+"""Surfaces of a scene: normals, colors, and the light that materials reflect."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
-from ...base.vectors import into_axes
+from ...base.vectors import rotate_into_frames
 from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
 from ...scene.scene import Scene
@@ -30,39 +30,39 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-LEVEL = math.sqrt(0.75)  # smallest z of the normals of surfaces that hold water: 30 degrees
-BLOCK_HITS = 1 << 14  # hits whose colors are looked up at a time, to fit a cache
+LEVEL = math.sqrt(0.75)  # smallest z of normals of surfaces that hold water: 30 degrees of slope
+BLOCK_HITS = 1 << 14  # number of hits whose colors are looked up at a time, to fit a cache
 _NO_NORMALS = np.zeros((0, 3), np.float32)
 
 
 class SensorLight(NamedTuple):
-    """Wavelength of a sensor, and the air and water that its light meets."""
+    """Wavelength of a sensor, and the air and water in the path of its light."""
 
     wavelength_nm: float
     extinction: float  # 1/m
-    wet: float = 0.0  # share of surfaces that face up that is below a film of water
+    wet: float = 0.0  # share of upward-facing surfaces that is covered by water
 
 
-class LitHits(NamedTuple):
-    """Hits of rays on surfaces."""
+class IlluminatedHits(NamedTuple):
+    """Hits of rays on surfaces, with the energy that the sensor receives."""
 
     normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
     cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
-    kinds: Ints32  # (n,): kinds of surfaces, rows of the table of materials
-    energy: Floats  # (n,), as `Surfaces.energy`; less below a film of water
+    kinds: Ints32  # (n,): kinds of surfaces, which are rows of the material table
+    energy: Floats  # (n,), as in `SceneSurfaces.energy`, but reduced by a film of water
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 
 def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
     """Return the light of a sensor in the air of a survey.
 
-    Values are floats: for an int, loops would be compiled once more.
+    All values are floats, because an int would cause the compiled loops to be compiled again.
     """
     return SensorLight(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
 
 
 def warn_of_gray(scene: Scene, survey: Survey) -> None:
-    """Warn if a survey takes colors for reflectance, and the scene has no colors."""
+    """Log a warning if materials use colors as reflectance but the scene has no colors."""
     if not scene.colored and any(m.reflectance == "texture" for m in survey.materials):
         _log.warning(
             "a material has reflectance: texture, but the scene has no colors, so all surfaces "
@@ -70,16 +70,17 @@ def warn_of_gray(scene: Scene, survey: Survey) -> None:
         )
 
 
-class Surfaces:
-    """Optical properties of triangles.
+class SceneSurfaces:
+    """Optical properties of the triangles in a scene.
 
-    `StoredTriangles` numbers the triangles, and `TriangleKinds` has the kinds of their surfaces,
-    rows of the table of materials. `wavelengths` are the wavelengths of all sensors, nanometers.
+    `StoredTriangles` numbers the triangles, and `TriangleKinds` maps them to kinds of surfaces,
+    which are rows of the material table. `wavelengths` are the wavelengths of all sensors in
+    nanometers.
 
     Raises
     ------
     LidarError
-        If there are materials, and an object has none, or a name fits no object.
+        If `materials` is not empty and an object has no material, or a name matches no object.
     """
 
     def __init__(
@@ -101,35 +102,36 @@ class Surfaces:
 
     @property
     def materials(self) -> MaterialTable:
-        """Materials of kinds of surfaces, at all wavelengths the same but for reflectance."""
+        """Materials by kind of surface. Only the reflectance depends on the wavelength."""
         return next(iter(self._tables.values()))
 
     def at_wavelength(self, wavelength_nm: float) -> MaterialTable:
-        """Materials of kinds of surfaces at the wavelength of a sensor."""
+        """Return the materials by kind of surface at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
-    def moved(self, scene: Scene) -> Surfaces:
-        """Return the surfaces of a scene with new transforms of instances."""
+    def with_moved_instances(self, scene: Scene) -> SceneSurfaces:
+        """Return the surfaces of a scene in which instances have new transforms."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
-        surfaces.triangles = self.triangles.moved(scene)  # the others do not depend on transforms
-        surfaces.grids = self.grids and self.grids.moved(scene.instances)
+        # Nothing else depends on transforms.
+        surfaces.triangles = self.triangles.with_moved_instances(scene)
+        surfaces.grids = self.grids and self.grids.with_moved_instances(scene.instances)
         return surfaces
 
     def normals(
         self, triangle: Integers, times: Floats | Ints, trajectories: ActorTrajectories
     ) -> Floats:
-        """Return the unit normals of triangles (n,) in the scene frame: float64 (n, 3).
+        """Return the unit normals of triangles (n,) in the scene frame, as float64.
 
-        The normals are as exact as single precision. Normals of actors are rotated by the poses of
-        the actors at times (n,), nanoseconds.
+        The normals are accurate to single precision. Normals of actors are rotated by the actors'
+        poses at `times` (n,) in nanoseconds.
         """
         directions = np.zeros((len(triangle), 3))
-        incidence, _ = self._meet(triangle, directions, self.materials, times, trajectories)
+        incidence, _ = self._incidence(triangle, directions, self.materials, times, trajectories)
         return incidence.normals.T
 
-    def _meet(
+    def _incidence(
         self,
         triangle: Integers,
         directions: Floats,
@@ -137,13 +139,13 @@ class Surfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> tuple[Incidence, Ints32]:
-        """Return the incidence of rays on triangles (n,), and the kinds of their surfaces (n,).
+        """Return how rays meet triangles (n,), and the kinds of the triangles' surfaces (n,).
 
-        `directions` (n, 3) are in the scene frame, and `times` (n,) are nanoseconds, for the poses
-        of actors. `Incidence.back`, the energy received from 10 m, assumes surfaces that
-        are neither textured nor rough.
+        `directions` (n, 3) are in the scene frame. `times` (n,) determine the poses of actors, in
+        nanoseconds. `Incidence.back`, the energy received from 10 m, is valid for surfaces that are
+        neither textured nor rough.
         """
-        from . import surface_loops  # not before: numba takes half a second to import
+        from . import surface_loops  # imported here because numba takes half a second to import
 
         poses = np.zeros((12, 0))
         run = np.zeros(0, np.int64)
@@ -152,16 +154,16 @@ class Surfaces:
         deformed_normals = _NO_NORMALS
         if trajectories:
             actors = objects - np.int64(self.triangles.static_objects)
-            poses, run = trajectories.runs(actors, owned(times))
-            if len(deforming := trajectories.deforming(actors)):
-                deformed = self.on_actors.deformed(
+            poses, run = trajectories.pose_runs(actors, owned(times))
+            if len(deforming := trajectories.deforming_rows(actors)):
+                deformed = self.on_actors.deformed_corners(
                     row[deforming], actors[deforming], times[deforming], trajectories
                 )
                 deformed_normals = normals_of(deformed.corners)
                 row[deforming] = ~np.arange(len(deforming))  # rows of `deformed_normals`
         cosines, back = np.empty((2, len(row)))
         incidence = surface_loops.Incidence(np.empty((3, len(row))), cosines, back)
-        surface_loops.meet(
+        surface_loops.compute_incidence(
             surface_loops.HitSurfaces(row, kinds, instance, run),
             owned(directions.T),
             surface_loops.NormalTables(
@@ -173,7 +175,7 @@ class Surfaces:
         )
         return incidence, kinds
 
-    def lit(
+    def illuminate(
         self,
         triangle: Integers,
         directions: Floats,
@@ -182,28 +184,28 @@ class Surfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
         colors: UInts32 | None = None,
-    ) -> LitHits:
-        """Return normals, cosines, kinds of surfaces and received energies of hits of rays (n,).
+    ) -> IlluminatedHits:
+        """Return the normals, cosines, kinds of surfaces and received energies of hits.
 
         Parameters
         ----------
         triangle, distance
-            (n,): triangles on which the rays end, and the rays' lengths (optical paths), meters.
+            (n,): triangles that the rays hit, and optical path lengths of the rays in meters.
         directions
-            (n, 3): unit directions of the rays, scene frame.
+            (n, 3): unit directions of the rays in the scene frame.
         sensor_light
             Light of the sensor.
         times
-            (n,): nanoseconds, for the poses of actors.
+            (n,): firing times in nanoseconds, which determine the poses of actors.
         trajectories
             Trajectories of the actors.
         colors
-            (n,): packed, needed where materials are `textured`.
+            (n,): packed colors, which are required if materials are `textured`.
         """
         from . import surface_loops
 
         table = self.at_wavelength(sensor_light.wavelength_nm)
-        incidence, kinds = self._meet(triangle, directions, table, times, trajectories)
+        incidence, kinds = self._incidence(triangle, directions, table, times, trajectories)
         normals, cosines, back = incidence
         bright = luminance(colors) if table.textured and colors is not None else None
         if table.textured or table.roughness.any():
@@ -213,11 +215,11 @@ class Surfaces:
             film = np.empty(len(cosines), np.bool_)
             water = surface_loops.WaterFilm(LEVEL, sensor_light.wet, table.passes | table.leafy)
             shares = table.shares(kinds, bright)
-            surface_loops.soak(
+            surface_loops.apply_water_film(
                 normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
             )
-        surface_loops.fade(owned(distance), sensor_light.extinction, back)
-        return LitHits(normals.T, cosines, kinds, back, film)
+        surface_loops.attenuate_energies(owned(distance), sensor_light.extinction, back)
+        return IlluminatedHits(normals.T, cosines, kinds, back, film)
 
     def colors(
         self,
@@ -226,10 +228,10 @@ class Surfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> UInts32:
-        """Return the colors of points (n, 3) on triangles (n,), packed: (n,).
+        """Return the packed colors of points (n, 3) on triangles (n,).
 
-        Points are in the scene frame, meters. Without colors in the scene, all points are gray.
-        Actors have their poses at times (n,), nanoseconds.
+        Points are in the scene frame in meters. If the scene has no colors, all points are gray.
+        Actors have their poses at `times` (n,) in nanoseconds.
         """
         if self._lookup is None:
             return np.full(len(triangle), packed(GRAY[0])[0])
@@ -244,7 +246,7 @@ class Surfaces:
     def _block_colors(
         self, triangle: Integers, points: Floats, times: Any, trajectories: ActorTrajectories
     ) -> UInts32:
-        """Return the colors of points of a block of hits, for `colors`."""
+        """Return the colors of a block of points for `colors`."""
         assert self._lookup is not None
         stored_rows, _, instance = self.triangles.locate(triangle)
         on_instances = np.flatnonzero(instance >= 0)
@@ -257,7 +259,7 @@ class Surfaces:
             from_origins = (
                 points[on_instances] - self._scene.instances.transforms[instance_numbers, :, 3]
             )
-            points[on_instances] = into_axes(from_origins, normal_matrices)
+            points[on_instances] = rotate_into_frames(from_origins, normal_matrices)
         self.on_actors.move_to_rest(points, triangle, stored_rows, times, trajectories)
         return self._lookup.colors_at(stored_rows, points)
 
@@ -277,7 +279,7 @@ class Surfaces:
         return Lookup(colors, corners)
 
     def kinds(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,): (n,), or -1 without a surface."""
+        """Return the kinds of surfaces of triangles (n,), or -1 for `NO_SURFACE`."""
         return self.triangle_kinds.of_triangles(triangle)
 
     def energy(
@@ -288,12 +290,12 @@ class Surfaces:
         sensor_light: SensorLight,
         colors: UInts32 | None = None,
     ) -> Floats:
-        """Return the received energy of rays that end on triangles (n,), at distances in meters.
+        """Return the received energy of rays that end on triangles (n,) at distances in meters.
 
-        ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
-        retro-reflector, a gain replaces the cosine; rough surfaces add gloss; distances below
-        `NEAREST_M` count as `NEAREST_M`. Where materials are `textured`, the colors (n,) are
-        needed.
+        The energy is ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction *
+        distance)``. For a retroreflector, a gain replaces the cosine. Rough surfaces add gloss.
+        Distances below `NEAREST_M` are treated as `NEAREST_M`. If materials are `textured`,
+        `colors` (n,) is required.
         """
         table = self.at_wavelength(sensor_light.wavelength_nm)
         bright = luminance(colors) if table.textured and colors is not None else None

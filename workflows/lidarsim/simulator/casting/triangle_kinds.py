@@ -1,4 +1,4 @@
-"""Kinds of surfaces of triangles: an object, or a material of an object with several materials."""
+"""Map triangles to kinds of surfaces, which are objects or materials of objects."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .stored_triangles import StoredTriangles
 
 
 class TriangleKinds:
-    """Kinds of surfaces, rows of the table of materials, of the triangles of a scene.
+    """Kinds of surfaces of the triangles in a scene, which are rows of the material table.
 
-    A kind of surface is an object, or a material of an object whose files have several materials.
+    A kind of surface is an object, or one material of an object whose files have several materials.
     """
 
     def __init__(
@@ -32,9 +32,10 @@ class TriangleKinds:
         self.material_kinds = kinds
 
     def of_triangles(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,): (n,), or -1 without a surface.
+        """Return the kinds of surfaces of triangles (n,), or -1 for `NO_SURFACE`.
 
-        Names of materials that match the same material of the survey, in an object, are one kind.
+        If several material names of an object match the same material of the survey, they are one
+        kind.
         """
         if self._kind_in_object is None:
             return self._triangles.objects(triangle)
@@ -42,9 +43,9 @@ class TriangleKinds:
         return self.of_rows(triangle_indices, objects)
 
     def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
-        """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
+        """Return the kinds of surfaces from rows of the stored triangles (n,) and objects (n,).
 
-        Objects are an argument because instances that share stored triangles may differ in object.
+        Objects are required because instances of different objects can share stored triangles.
         """
         if self._kind_in_object is None:
             return objects
@@ -53,9 +54,9 @@ class TriangleKinds:
 
     @cached_property
     def _kind_in_object(self) -> Ints32 | None:
-        """Kind of each stored triangle, numbered within its object: (f,).
+        """Kind of each stored triangle, numbered within its object. Shape (f,).
 
-        None if each object has a single kind, which has the number of the object.
+        None if each object has a single kind, whose number is then the number of the object.
         """
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
@@ -73,7 +74,7 @@ class TriangleKinds:
         return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
-        """Return materials of triangles, as numbers of `Scene.material_names`, or -1 for none."""
+        """Return the materials of triangles as indices into `Scene.material_names`, or -1."""
         triangle_indices, objects, _ = self._triangles.locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
@@ -82,17 +83,17 @@ class TriangleKinds:
 
     @cached_property
     def _number_of_kind(self) -> Ints32:
-        """Number of the name of each kind's material, or -1 for none."""
+        """Index of each kind's material name in `Scene.material_names`, or -1."""
         numbers = {name: number for number, name in enumerate(self._scene.material_names)}
         return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
 
     @cached_property
     def _material_kind(self) -> Ints32:
-        """First kind of the same object that has the same material, for each kind: (kinds,).
+        """For each kind, the first kind of the same object with the same material. Shape (kinds,).
 
-        Several names of materials in an object's files may match a single material of the survey.
-        Their faces are then a single kind, so that a body of water or leaves whose faces have
-        several names is closed.
+        Several material names in an object's files may match a single material of the survey. Their
+        faces then form a single kind, so that a body of water or leaves is closed even if its faces
+        have several names.
         """
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)
@@ -104,13 +105,13 @@ class TriangleKinds:
 
     @cached_property
     def _faces_by_object(self) -> tuple[Indices, Indices]:
-        """Rows of the scene's faces by objects, and where each object starts in this order."""
+        """Rows of the scene's faces sorted by object, and where each object starts."""
         owners = self._scene.face_object
         order = np.argsort(owners, kind="stable")
         return order, np.searchsorted(owners[order], np.arange(self._triangles.static_objects + 1))
 
     def faces_of(self, kind: int) -> Integers:
-        """Return the scene's faces of a kind of surface, (f, 3)."""
+        """Return the faces (f, 3) of the scene that have a kind of surface."""
         order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[kind])
         face_indices = order[starts[owner] : starts[owner + 1]]
@@ -120,7 +121,7 @@ class TriangleKinds:
         return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
-        """Select the faces of a kind of surface from faces of an object, (f, 3)."""
+        """Select the faces that have a kind of surface from the faces (f, 3) of an object."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds

@@ -1,4 +1,4 @@
-"""Visibility: the objects that each sensor of a survey does not see."""
+"""Determine which objects each sensor of a survey cannot see."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from ...survey.survey import Survey
 
 
 def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
-    """Return the objects that the sensors of a survey do not see, by the sensors' patterns.
+    """Return the objects that each sensor of a survey cannot see.
 
     Returns
     -------
-    For each sensor a mask (objects,), in the order of `Scene.object_names`; None if the sensor sees
-    all objects.
+    tuple
+        One boolean mask (objects,) per sensor, in the order of `Scene.object_names`, or None if the
+        sensor sees all objects.
 
     Raises
     ------
     LidarError
-        If a pattern of a sensor fits no object.
+        If a pattern in `Mounted.unseen` matches no object.
     """
     if not any(carried.unseen for carried in survey.carried):
         return (None,) * len(survey.carried)
@@ -40,9 +41,9 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
 
 
 def static_key(scene: Scene, unseen: Bools | None) -> bytes:
-    """Return bytes that are equal for masks (objects,) of the same unseen static objects.
+    """Return a key that is equal for masks (objects,) with the same unseen static objects.
 
-    Empty if all static objects are seen: of the mask None, or of unseen actors alone.
+    The key is empty if all static objects are visible.
     """
     if unseen is None or not unseen[: len(scene.names)].any():
         return b""
@@ -50,10 +51,10 @@ def static_key(scene: Scene, unseen: Bools | None) -> bytes:
 
 
 def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
-    """Return the static objects of a scene that are seen, by a mask (objects,).
+    """Return a scene with only the visible static objects, or None if no object is left.
 
-    Objects keep their numbers; colors, materials and actors are left out. None if no object is
-    left.
+    `unseen` is a mask (objects,). Objects keep their numbers; colors, materials and actors are
+    omitted.
     """
     faces = np.flatnonzero(~unseen[scene.face_object])
     instances = scene.instances

@@ -1,4 +1,4 @@
-"""Passage of light through grids of leaf area density, until the light meets a leaf."""
+"""Follow light through voxel grids of leaf area density until it hits a leaf."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ from typing import NamedTuple
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Indices
-from ...base.vectors import applied, inverse, matmul
+from ...base.vectors import inverse, matmul, matvec
 from ...scene.scene_instances import Instances
 
-BLOCK_RAYS = 1 << 13  # rays that are followed at a time, to fit a cache
-_LEVEL = 1e-30  # voxels a meter: along an axis, slower light stays in its layer of voxels
+BLOCK_RAYS = 1 << 13  # number of rays that are followed at a time, to fit a cache
+_LEVEL = 1e-30  # voxels per meter; light that is slower along an axis stays in its voxel layer
 
 
 class GridPassage(NamedTuple):
-    """Passage of n rays of light through k grids each."""
+    """Result of following n rays of light through k grids each."""
 
-    meters: Floats  # (n,): from the start to the leaf that light meets; inf without a leaf
-    # (n,): optical depth that is left until a leaf, at the path's end; -inf if light meets a leaf.
+    meters: Floats  # (n,): distance from the start to the leaf that light hits, or inf
+    # (n,): optical depth left until a leaf, at the end of the path; -inf if light hits a leaf.
     remaining_depth: Floats
-    density: Floats  # (n, k): optical depth per meter of each grid at the leaf; 0 without a leaf
+    density: Floats  # (n, k): optical depth per meter of each grid at the leaf, 0 without a leaf
 
 
 class _GridRays(NamedTuple):
-    """Rays of light in the voxels of k grids, with rays along the last axis of all arrays.
+    """Rays of light in the voxels of k grids. Rays are along the last axis of all arrays.
 
-    Rays leave the table when they meet a leaf or reach their end.
+    Rays are removed when they hit a leaf or reach the end of their path.
     """
 
-    row: Indices  # (n,): number of the ray among those that entered
-    uniform_density: Floats  # (n,): optical depth per meter of the media that are not grids
-    length: Floats  # (n,): length of the path, meters
-    depth: Floats  # (n,): remaining optical depth until a leaf
+    row: Indices  # (n,): number of the ray in its block
+    uniform_density: Floats  # (n,): optical depth per meter of media that are not grids
+    length: Floats  # (n,): path length, meters
+    depth: Floats  # (n,): optical depth left until a leaf
     meters: Floats  # (n,): distance from the start
-    cell: Floats  # (3, k, n): indices of the voxel of the light; outside of the grid too
+    cell: Floats  # (3, k, n): voxel indices of the light, which may be outside the grid
     step: Floats  # (3, k, n): -1, 0 or 1, the sign of the light's direction
-    pace: Floats  # (3, k, n): meters for each voxel; 0 for light that stays in its layer
-    shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` meters
+    pace: Floats  # (3, k, n): meters per voxel; 0 for light that stays in its voxel layer
+    shift: Floats  # (3, k, n): the next voxel border is at `cell * pace + shift` meters
     size: Floats  # (3, k, n): number of voxels of the grid
     first: Floats  # (k, n): index of the grid's first voxel among the densities of all grids
     # (k, n): optical depth per meter for a leaf area density of 1, which is the mean projection of
@@ -46,12 +46,12 @@ class _GridRays(NamedTuple):
     projection: Floats
 
     def take(self, row_indices: Indices) -> _GridRays:
-        """Return the light of selected rows."""
+        """Return the light in the selected rows."""
         return _GridRays._make(array[..., row_indices] for array in self)
 
 
 class Grids:
-    """The grids of the instances of a scene, with the densities of each part stored once."""
+    """Voxel grids of the instances in a scene. The densities of each part are stored once."""
 
     def __init__(self, shared: Instances) -> None:
         voxels = [part.voxels for part in shared.mesh_parts]
@@ -67,26 +67,26 @@ class Grids:
 
     @classmethod
     def from_instances(cls, shared: Instances | None) -> Grids | None:
-        """Return the grids of instances, or None without grids."""
+        """Return the grids of instances, or None if no instance has a grid."""
         if shared is None or all(part.voxels is None for part in shared.mesh_parts):
             return None
         return cls(shared)
 
-    def moved(self, shared: Instances) -> Grids:
-        """Return the grids with the instances placed anew."""
+    def with_moved_instances(self, shared: Instances) -> Grids:
+        """Return the grids with the current transforms of the instances."""
         grids = copy(self)
         grids._place_instances(shared)
         return grids
 
     def _place_instances(self, shared: Instances) -> None:
-        """Compute the origin of each instance's grid, scene frame, and matrices to its voxels."""
+        """Compute the origins of the instances' grids, and the matrices to their voxels."""
         self._part = shared.part
         to_scene = shared.transforms
         matrices = self._matrices[self._part]
-        self._origins = applied(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
+        self._origins = matvec(to_scene[:, :, :3], matrices[:, :, 3]) + to_scene[:, :, 3]
         self._to_grid = inverse(matmul(to_scene[:, :, :3], matrices[:, :, :3]))
 
-    def through(
+    def follow(
         self,
         instances: Indices,
         starts: Floats,
@@ -96,25 +96,25 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
-        """Follow light (n,) through grids, voxel by voxel (Amanatides and Woo 1987).
+        """Follow n rays of light through grids, voxel by voxel (Amanatides and Woo 1987).
 
         Parameters
         ----------
         instances
-            (n, k): instances whose grids overlap along the path; -1 for none.
+            (n, k): instances whose grids overlap along the path, padded with -1.
         starts, directions
-            (n, 3): origins of the light, and directions, in the scene frame.
+            (n, 3): origins and directions of the light in the scene frame.
         projection
             (n, k): optical depth per meter for a leaf area density of 1 in each grid.
         uniform_density
-            (n,): optical depth per meter of the media that are not grids.
+            (n,): optical depth per meter of media that are not grids.
         length
-            (n,): length of the path, meters.
+            (n,): path lengths in meters.
         depth
-            (n,): optical depth after which the light meets a leaf.
+            (n,): optical depth after which the light hits a leaf.
         """
         passages = [
-            self._block_through(
+            self._follow_block(
                 instances[block],
                 starts[block],
                 directions=directions[block],
@@ -131,7 +131,7 @@ class Grids:
             return passages[0]
         return GridPassage(*map(np.concatenate, zip(*passages, strict=True)))
 
-    def _block_through(
+    def _follow_block(
         self,
         instances: Indices,
         starts: Floats,
@@ -141,7 +141,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
-        """Follow a block of light, for `through`."""
+        """Follow a block of light for `follow`."""
         passage = GridPassage(
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
@@ -174,7 +174,7 @@ class Grids:
             passage.remaining_depth[rays.row[at_end]] = remaining[at_end]
             rays = rays._replace(
                 depth=remaining,
-                # A first border may be before the start, by rounding.
+                # Because of rounding, a first border may lie before the start.
                 meters=np.maximum(border_m, 0),
                 cell=np.where(border <= border_m, rays.cell + rays.step, rays.cell),
             )
@@ -193,11 +193,11 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return the light of a block in the voxels at its start, for `through`."""
+        """Return the light of a block in the voxels at its start, for `follow`."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]
-        # Product by product, for the same bits in every block.
+        # Add products one by one, so that blocks of any size give identical bits.
         position = np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in to_grid])
         direction = np.stack([(row[0] * u + row[1] * v) + row[2] * w for row in to_grid])
         level = np.abs(direction) < _LEVEL
@@ -222,9 +222,9 @@ class Grids:
         )
 
     def _density(self, rays: _GridRays) -> tuple[Floats, Bools]:
-        """Return leaf area densities, m²/m³, at light, and whether its voxels are in a grid.
+        """Return leaf area densities in m²/m³, and whether the light is inside a grid.
 
-        Both are (k, n); densities outside of grids are 0.
+        Both arrays have shape (k, n). Densities outside grids are 0.
         """
         i, j, k = rays.cell
         size = rays.size
@@ -235,10 +235,10 @@ class Grids:
 
 
 def _border(rays: _GridRays, inside: Bools) -> Floats:
-    """Return the distances from the start to the borders of voxels ahead, (3, k, n), meters.
+    """Return the distances in meters from the start to the next voxel borders. Shape (3, k, n).
 
-    Light that leaves a grid for ever, by `inside` (k, n), has no borders ahead: `rays.shift` is
-    set to inf.
+    For light that has left a grid for good, as determined from `inside` (k, n), there are no more
+    borders, and `rays.shift` is set to inf.
     """
     beyond = ~inside & np.isfinite(rays.shift).any(axis=0)
     if beyond.any():

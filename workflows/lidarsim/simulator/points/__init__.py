@@ -1,1 +1,1 @@
-"""Points: the columns of returns, made on the host or on the CUDA device."""
+"""Compute the columns of points on the host or on a CUDA device."""

@@ -1,4 +1,4 @@
-"""Columns of a batch, from the returns of its scans."""
+"""Collect the columns of a batch from the returns of its scans."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .device_columns import DevicePoints
 
 
 def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
-    """Return the stored columns of a batch, with the hits of each hit counter.
+    """Return the stored columns of a batch, and the number of hits of each hit counter.
 
-    `batches` are the returns of consecutive scans in order, as `Rig.cast` yields them: separate for
-    each sensor and station. All are of the same survey.
+    `batches` are the returns of consecutive scans in order, as `Rig.cast` yields them: one item for
+    each sensor and station. All items must belong to the same survey.
     """
     columns = {
         column.name: _joined([returns.column(column) for returns in batches])
         for column in batches[0].survey.stored_columns
     }
-    counters, hits = batches[0].tally  # counters that are not 0, and their hits
+    counters, hits = batches[0].tally  # nonzero counters, and their hits
     if len(batches) > 1:
         all_counters, all_hits = map(
             np.concatenate, zip(*(returns.tally for returns in batches), strict=True)
@@ -40,5 +40,5 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
 
 
 def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    """Concatenate arrays, or return a single contiguous array as is."""
+    """Concatenate arrays, or return a single array, made contiguous."""
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

@@ -1,4 +1,4 @@
-"""The returns of a batch: the sources of columns."""
+"""Compute the columns of a batch from its returns, with NumPy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts
 from ...base.elementary import arccos, arcsin, arctan2
 from ...base.errors import LidarError
 from ...base.random_numbers import normal
-from ...base.vectors import products, turned
+from ...base.vectors import dot, rotate
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...media.materials import at_right_angles
@@ -23,34 +23,34 @@ from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
-from ..casting.surfaces import Surfaces, sensor_light_of
-from ..pulses import Scanned
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
+from ..pulses import ScannedReturns
 from ..returns import required
 from ..steps.cast import GHOST
 from ..steps.doppler import VELOCITY, radial_velocities
 from ..steps.step_list import received_causes
 
-BLOCK_HITS = 1 << 16  # hits whose normals are computed at a time
-MIN_REMAINING = 1e-30  # share of light, so that quotients are finite in single precision
+BLOCK_HITS = 1 << 16  # number of hits whose normals are computed at a time
+MIN_REMAINING = 1e-30  # smallest share of light, which keeps quotients finite in single precision
 
 
 class BatchPoints:
-    """Reported returns of consecutive scans of a station, in (scan, ray) order.
+    """Reported returns of consecutive scans of one station, sorted by scan and ray.
 
-    The attributes are arrays (n,) with a value for each return, computed on first use: the
-    sources of columns (`lidarsim.columns.table`).
+    The properties are the sources of columns (`lidarsim.columns.table`). Each is an array with one
+    value per return (n,), and expensive ones are computed on first use.
     """
 
     def __init__(
         self,
         scene: Scene,
         survey: Survey,
-        surfaces: Surfaces,
-        specs: list[ScanSpec],  # scans of consecutive firings
-        scanned: Scanned,  # rays are numbered from 0 at the first firing
+        surfaces: SceneSurfaces,
+        specs: list[ScanSpec],  # scans with consecutive firings
+        scanned: ScannedReturns,  # rays are numbered from 0 at the first firing
         *,
         pattern: Pattern,
-        start: int,  # number of ray 0 within the pattern
+        start: int,  # row of ray 0 in the pattern
         poses: CastPoses,
     ) -> None:
         self.scene = scene
@@ -58,13 +58,13 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Counters that are not 0 (`StoredTriangles.counter`), and their hits, (k,) each: counts
-        # of all triangles would take much memory, since each station of a batch stores them.
+        # Nonzero counters (`StoredTriangles.counter`) and their hits, each of shape (k,). Counts of
+        # all triangles would take much memory, because each station of a batch stores them.
         counter_hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan, kept or not
+        self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan before thinning
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -75,11 +75,11 @@ class BatchPoints:
         return len(self.pulse_returns.ray)
 
     def column(self, column: Column) -> AnyArray:
-        """Values of a column."""
+        """Return the values of a column."""
         return column.make(self)
 
     def positions_of(self, row_indices: Ints) -> Floats:
-        """Return the positions of returns by their rows (k,), as `positions`: (k, 3)."""
+        """Return the positions (k, 3) of the returns in the given rows."""
         return self.positions[row_indices]
 
     # -- the ray -----------------------------------------------------------------------------
@@ -93,7 +93,7 @@ class BatchPoints:
 
     @cached_property
     def counts(self) -> Ints:
-        """Returns of each scan: (scans,)."""
+        """Number of returns of each scan. Shape (scans,)."""
         cuts = np.searchsorted(self.pulse_returns.ray, self._first_rays)
         return np.diff(np.append(cuts, len(self))).astype(np.int64)
 
@@ -110,12 +110,12 @@ class BatchPoints:
 
     @cached_property
     def channel(self) -> UInts32:
-        """Beam of the sensor."""
+        """Channel of the sensor."""
         return np.asarray(self.pulse_returns.ray % np.uint32(self.sensor.channels), np.uint32)
 
     @cached_property
     def firing(self) -> Ints:
-        """Number of the firing, from the beginning of the station."""
+        """Number of the firing, counted from the start of the station."""
         return self.specs[0].firings[0] + self._firing_in_run
 
     @property
@@ -125,12 +125,12 @@ class BatchPoints:
 
     @cached_property
     def _firing_times_ns(self) -> Ints:
-        """Firing times, nanoseconds since the survey's start."""
+        """Firing times in nanoseconds since the start of the survey."""
         return self._firings.times(self.pulse_returns.ray)
 
     @cached_property
     def time(self) -> Ints:
-        """Time of the ray by the sensor's clock, nanoseconds since the survey's start.
+        """Time of the ray on the sensor's clock, in nanoseconds since the start of the survey.
 
         A frozen sensor sends an old sweep again, with the times of the sweep that it replaces.
         """
@@ -144,7 +144,7 @@ class BatchPoints:
 
     @property
     def _actor_times_ns(self) -> Ints:
-        """Firing times, nanoseconds since the survey's start, or zeros without actors."""
+        """Firing times in nanoseconds since the start of the survey, or zeros without actors."""
         return (
             self._firing_times_ns
             if self._poses.actor_trajectories
@@ -160,78 +160,78 @@ class BatchPoints:
 
     @cached_property
     def _rays(self) -> tuple[Floats, Floats]:
-        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays, in the scene frame."""
+        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays in the scene frame."""
         return self._poses.rays(self._pattern, self.pulse_returns.ray, self._start)
 
     @property
     def origins(self) -> Floats:
-        """Starts of the rays, meters, the scene's local coordinates: (n, 3)."""
+        """Origins of the rays in the scene frame, in meters. Shape (n, 3)."""
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
     def directions(self) -> Floats:
-        """Unit directions in the scene frame: (n, 3)."""
+        """Unit directions in the scene frame. Shape (n, 3)."""
         return self._rays[1]
 
     @property
     def range(self) -> Floats:
-        """Distance from the start of the ray, meters, with noise."""
+        """Distance from the origin of the ray in meters, with noise."""
         return required(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
-        """Ends of the rays, meters, the scene's local coordinates: (n, 3).
+        """End points of the rays in the scene frame, in meters. Shape (n, 3).
 
-        The points that a frozen sensor sends again stay fixed in the sensor frame, and move with
-        the sensor.
+        Points that a frozen sensor sends again stay fixed in the sensor frame, and so move with the
+        sensor.
         """
         return self._moved_with_frozen_sensor(self._scene_positions)
 
     def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
         """Move points (n, 3) with a frozen sensor from the old sweep to the sweep that it replaces.
 
-        Points are in the scene frame; points of a sensor that is not frozen are returned unchanged.
+        Points are in the scene frame. If the sensor is not frozen, they are returned unchanged.
         """
         if self.specs[0].repeats is None:
             return points
         frozen_pose, current_pose = map(self.survey.pose, self.specs[0].repeats)
         if frozen_pose == current_pose:
             return points
-        in_sensor = turned(np.subtract(points, frozen_pose.position), frozen_pose.rotation_matrix.T)
-        return turned(in_sensor, current_pose.rotation_matrix) + current_pose.position
+        in_sensor = rotate(np.subtract(points, frozen_pose.position), frozen_pose.rotation_matrix.T)
+        return rotate(in_sensor, current_pose.rotation_matrix) + current_pose.position
 
     @cached_property
     def ray_origins(self) -> Floats:
-        """Starts of the rays in the coordinates of the survey's points, meters: (n, 3)."""
+        """Origins of the rays in the survey's point coordinates, in meters. Shape (n, 3)."""
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
         return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
 
     @property
     def origin_x(self) -> Floats:
-        """Return x of the starts of the rays."""
+        """The x coordinate of the ray origins."""
         return self.ray_origins[:, 0]
 
     @property
     def origin_y(self) -> Floats:
-        """Return y of the starts of the rays."""
+        """The y coordinate of the ray origins."""
         return self.ray_origins[:, 1]
 
     @property
     def origin_z(self) -> Floats:
-        """Return z of the starts of the rays."""
+        """The z coordinate of the ray origins."""
         return self.ray_origins[:, 2]
 
     @cached_property
     def _scene_positions(self) -> Floats:
-        """Ends of the rays when they were fired, meters, scene frame: (n, 3)."""
+        """End points of the rays when they were fired, in the scene frame. Shape (n, 3), meters."""
         origins, directions = self._rays
         positions = directions * self.range[:, None]
         return np.add(positions, origins, out=positions)
 
     @cached_property
     def cells(self) -> Ints32:
-        """Positions as whole multiples of the survey's precision: (3, n)."""
+        """Positions as integer multiples of the survey's precision. Shape (3, n)."""
         world = self.survey.coordinates == "world"
         scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
         cells = np.empty((3, len(self)), np.int32)
@@ -249,17 +249,17 @@ class BatchPoints:
 
     @property
     def cell_x(self) -> Ints32:
-        """Quantized x of each return, multiples of the precision from the local origin."""
+        """Quantized x of each return, in multiples of the precision from the local origin."""
         return self.cells[0]
 
     @property
     def cell_y(self) -> Ints32:
-        """Quantized y of each return, multiples of the precision from the local origin."""
+        """Quantized y of each return, in multiples of the precision from the local origin."""
         return self.cells[1]
 
     @property
     def cell_z(self) -> Ints32:
-        """Quantized z of each return, multiples of the precision from the local origin."""
+        """Quantized z of each return, in multiples of the precision from the local origin."""
         return self.cells[2]
 
     @cached_property
@@ -269,16 +269,16 @@ class BatchPoints:
 
     @cached_property
     def _sensor_directions(self) -> Floats:
-        """Unit directions in the sensor frame: (n, 3)."""
+        """Unit directions in the sensor frame. Shape (n, 3)."""
         return self._to_sensor(self._pattern.directions[self._pattern_rows])
 
     @cached_property
     def sensor_positions(self) -> Floats:
-        """Ends of the rays in the sensor frame at the firing, meters: (n, 3)."""
+        """End points of the rays in the sensor frame at the firing. Shape (n, 3), meters."""
         return self._in_sensor(self.range)
 
     def _in_sensor(self, distance: Floats) -> Floats:
-        """Return points of the rays at distances (n,), sensor frame, meters: (n, 3)."""
+        """Return points at the given distances along the rays, in the sensor frame."""
         origins = self._pattern.origins
         points = self._pattern.directions[self._pattern_rows] * distance[:, None]
         if origins is not None:
@@ -290,38 +290,38 @@ class BatchPoints:
         return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
-        """Rotate vectors (n, 3), a vector for each return, to the sensor frame.
+        """Rotate vectors (n, 3), one per return, from the pattern frame to the sensor frame.
 
-        Vectors are in the frame of the pattern: of the head, where the pattern is a single firing
-        that each pose turns (`CastPoses.by_head`), else of the carrier.
+        The pattern is in the head frame if it is a single firing that each pose rotates
+        (`CastPoses.by_head`), otherwise in the platform frame.
         """
         if self._poses.by_head:
             spins = self.sensor.spins(self._firings.numbers)
-            assert spins is not None  # or the rig would not cast by head
+            assert spins is not None  # otherwise the rig would not cast by head
             cos, sin = (values.take(self._firing_in_run) for values in spins)
             x, y, z = vectors.T
             in_head = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
-            return turned(in_head, self.sensor.axes)
+            return rotate(in_head, self.sensor.axes)
         mount = self.carried.mount.rotation
-        return turned(vectors, None if mount is None else mount.T)
+        return rotate(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
         """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
-        in_carrier = np.empty(vectors.shape[::-1])
+        in_platform = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
-            in_carrier[axis] = products(vectors.T, axes.T)
-        return self._to_sensor(in_carrier.T)
+            in_platform[axis] = dot(vectors.T, axes.T)
+        return self._to_sensor(in_platform.T)
 
     @cached_property
     def azimuth(self) -> Floats:
-        """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
+        """Azimuth of the ray about the sensor's z axis, in degrees from 0 to 360."""
         x, y, _ = self._sensor_directions.T
         return np.degrees(arctan2(y, x)) % 360
 
     @cached_property
     def elevation(self) -> Floats:
-        """Angle of the ray above the sensor's xy plane, degrees."""
+        """Elevation of the ray above the sensor's xy plane, in degrees."""
         return np.degrees(arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
 
     # -- the surface -------------------------------------------------------------------------
@@ -338,7 +338,7 @@ class BatchPoints:
 
     @cached_property
     def _kinds(self) -> Ints32:
-        """Kind of the surface of each return, a row of the table of materials: (n,), or -1."""
+        """Kind of surface of each return, a row of the material table, or -1."""
         if not self.scene.has_mixed_objects:
             return self.object
         return self._surfaces.kinds(self.pulse_returns.triangle)
@@ -353,10 +353,10 @@ class BatchPoints:
 
     @cached_property
     def _facing_normals(self) -> tuple[Floats, Floats]:
-        """Unit normals (n, 3), scene frame, on the side that was hit, and cosines of incidence.
+        """Unit normals on the side that was hit, in the scene frame, and cosines of incidence.
 
-        NaN for returns without a surface, leaves within a crown, and ghosts, whose last ray starts
-        at a mirror.
+        Values are NaN for returns without a surface, for leaves within a crown, and for ghosts,
+        whose last ray starts at a mirror.
         """
         triangle = self.pulse_returns.triangle
         surfaces = self._surfaces
@@ -373,7 +373,7 @@ class BatchPoints:
             facing = surfaces.normals(
                 triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
             )
-            signed_cosines = products(facing.T, self.directions[block].T)
+            signed_cosines = dot(facing.T, self.directions[block].T)
             facing[signed_cosines > 0] *= -1
             normals[block] = facing
             cosines[block] = np.abs(signed_cosines)
@@ -381,9 +381,9 @@ class BatchPoints:
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3).
+        """Unit normals on the side that was hit, in the frame of the survey's points. Shape (n, 3).
 
-        NaN for returns without a surface, leaves within a crown, and ghosts.
+        Values are NaN for returns without a surface, for leaves within a crown, and for ghosts.
         """
         normals, _ = self._facing_normals
         if self.survey.coordinates == "sensor":
@@ -394,33 +394,33 @@ class BatchPoints:
 
     @property
     def normal_x(self) -> Floats:
-        """Return x of the normals."""
+        """The x component of the normals."""
         return self.normals[:, 0]
 
     @property
     def normal_y(self) -> Floats:
-        """Return y of the normals."""
+        """The y component of the normals."""
         return self.normals[:, 1]
 
     @property
     def normal_z(self) -> Floats:
-        """Return z of the normals."""
+        """The z component of the normals."""
         return self.normals[:, 2]
 
     @property
     def incidence_deg(self) -> Floats:
-        """Angle between the ray and the normal of its surface, degrees, NaN as in `normals`."""
+        """Angle between the ray and the surface normal in degrees, or NaN as in `normals`."""
         return np.degrees(arccos(np.minimum(self._facing_normals[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies, in blocks to save memory."""
+        """Cosines of incidence, of either sign, and energies, computed in blocks to save memory."""
         sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
         colors = self._colors if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            lit = self._surfaces.lit(
+            lit = self._surfaces.illuminate(
                 self.pulse_returns.triangle[block],
                 self.directions[block],
                 distance=self.pulse_returns.distance[block],
@@ -435,14 +435,14 @@ class BatchPoints:
 
     @cached_property
     def intensity(self) -> Floats:
-        """Received energy, on the scale of `Surfaces.energy`."""
+        """Received energy, on the scale of `SceneSurfaces.energy`."""
         if self.pulse_returns.energy is not None:
             return self.pulse_returns.energy
         return self._lit[1]
 
     @cached_property
     def _colors(self) -> UInts32:
-        """Packed colors of the surfaces, from `Surfaces.colors`."""
+        """Packed colors of the surfaces, from `SceneSurfaces.colors`."""
         if self.pulse_returns.color is not None:
             return self.pulse_returns.color
         points = self._scene_positions
@@ -457,17 +457,17 @@ class BatchPoints:
 
     @property
     def red(self) -> Bytes:
-        """Red of the surface, sRGB."""
+        """Red component of the surface color, sRGB."""
         return unpacked(self._colors)[:, 0]
 
     @property
     def green(self) -> Bytes:
-        """Green of the surface, sRGB."""
+        """Green component of the surface color, sRGB."""
         return unpacked(self._colors)[:, 1]
 
     @property
     def blue(self) -> Bytes:
-        """Blue of the surface, sRGB."""
+        """Blue component of the surface color, sRGB."""
         return unpacked(self._colors)[:, 2]
 
     @property
@@ -477,27 +477,27 @@ class BatchPoints:
 
     @property
     def signal(self) -> NDArray[np.uint16]:
-        """Counts in proportion to the clipped energy."""
+        """Counts proportional to the clipped energy."""
         return np.minimum(np.rint(self._clipped_energy * COUNTS), 65_535).astype(np.uint16)
 
     @property
     def reflectivity(self) -> Bytes:
-        """Clipped energy, corrected for the loss by distance, on the scale of the manufacturer."""
+        """Clipped energy, corrected for the loss with distance, on the manufacturer's scale."""
         remaining = at_right_angles(self.pulse_returns.distance)
         return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
-        """Intensity, corrected for the loss by distance and air."""
+        """Intensity, corrected for the losses due to distance and air."""
         remaining = at_right_angles(
             self.pulse_returns.distance, self.survey.extinction(self.sensor)
         )
-        # In thick fog or dust, no light returns from the distance at which a false alarm appears.
+        # In dense fog or dust, no light returns from the distance of a false alarm.
         return np.asarray(self.intensity / np.maximum(remaining, MIN_REMAINING))
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """Growth of the range, m/s, with noise, or NaN for returns that the receiver adds."""
+        """Rate of change of the range in m/s with noise; NaN for returns added by the receiver."""
         returns = self.pulse_returns
         velocity = returns.velocity
         if velocity is None:
@@ -514,7 +514,7 @@ class BatchPoints:
                 velocity[np.isin(returns.cause, received_causes())] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
-            # A frozen sensor sends an older scan again, with the random numbers of the older scan.
+            # A frozen sensor sends an older scan again, including its random numbers.
             scan = self.scan.astype(np.int64) + self.specs[0].ahead
             errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
             velocity = velocity + noise.velocity_m_s * errors
@@ -522,9 +522,9 @@ class BatchPoints:
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the pulse in the waveform, or `intensity` without waveforms: (n,).
+        """Height of the pulse in the waveform, or `intensity` without waveforms.
 
-        Both are on the scale of `Surfaces.energy`.
+        Both are on the scale of `SceneSurfaces.energy`.
         """
         return (
             self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
@@ -532,7 +532,7 @@ class BatchPoints:
 
     @property
     def pulse_width(self) -> Floats:
-        """Full width at half maximum of the pulse in the waveform, nanoseconds."""
+        """Full width at half maximum of the pulse in the waveform, in nanoseconds."""
         if self.pulse_returns.width is None:
             returns = self.survey.returns_each[self.specs[0].sensor]
             return np.full(len(self), returns.length_ns(self.sensor.optics))
@@ -540,7 +540,7 @@ class BatchPoints:
 
     @property
     def waveform(self) -> Records:
-        """Recorded waveform, with location and direction: `lidarsim.columns.waveforms.record`."""
+        """Recorded waveform with its location and direction (`columns.waveforms.record`)."""
         table = required(self.pulse_returns.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
@@ -551,24 +551,24 @@ class BatchPoints:
 
     @property
     def return_number(self) -> Bytes:
-        """Number among the reported returns of its pulse."""
+        """Number among the reported returns of the pulse, starting at 1."""
         return required(self.pulse_returns.number)
 
     @property
     def returns(self) -> Bytes:
-        """Number of reported returns of its pulse."""
+        """Number of reported returns of the pulse."""
         return required(self.pulse_returns.return_counts)
 
     @property
     def cause(self) -> Bytes:
-        """Cause of the return, a number of `lidarsim.columns.table.CAUSES`."""
+        """Cause of the return, an index into `lidarsim.columns.table.CAUSES`."""
         if self.pulse_returns.cause is None:
             return np.zeros(len(self), np.uint8)
         return self.pulse_returns.cause
 
     @property
     def semantic_class(self) -> NDArray[np.uint16]:
-        """Class of the material."""
+        """Semantic class of the material."""
         classes = self._surfaces.materials.semantic_class[self._kinds]
         return (
             classes if self.pulse_returns.cause is None else np.where(self._kinds < 0, 0, classes)
@@ -576,5 +576,5 @@ class BatchPoints:
 
     @property
     def material_number(self) -> Ints32:
-        """Number of the material's name among the names of the scene, or -1 without a material."""
+        """Index of the material's name in `Scene.material_names`, or -1 without a material."""
         return self._surfaces.triangle_kinds.material_numbers(self.pulse_returns.triangle)

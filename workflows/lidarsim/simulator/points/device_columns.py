@@ -1,10 +1,10 @@
-"""Columns that are computed on the CUDA device: only their values cross the bus, in file types.
+"""Compute columns on a CUDA device, and transfer only their values, in their file types.
 
-The formulas and bits are as in `BatchPoints`. If a survey has further columns, the reported hits
-cross the bus as well, and NumPy computes these columns: energies in haze, azimuths and noise, since
-`exp` and `atan2` of a device differ from `elementary` in the last bit. NumPy also computes the
-energies of hits on actors, which depend on the actors' poses; `SceneCaster` finds the hits on
-actors, and the device merges them with its hits.
+Formulas and results are bit-identical to `BatchPoints`. If a survey has other columns, the reported
+hits are transferred as well, and NumPy computes these columns. They include energies in haze,
+azimuths and noise, because `exp` and `atan2` on a device differ from `elementary` in the last bit.
+NumPy also computes the energies of hits on actors, which depend on the actors' poses: `SceneCaster`
+finds the hits on actors, and the device merges them with its own hits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from raybeam import Pattern
-from raybeam.device import DeviceHits, OtherHits, Outbox, filled, host_array, to_device
+from raybeam.device import (
+    CopyQueue,
+    DeviceHits,
+    ExternalHits,
+    pinned_array,
+    to_device,
+    trim_to_count,
+)
 from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
@@ -29,21 +36,21 @@ from ...scene.scene import Scene
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
-from ..pulses import Scanned
+from ..casting.surfaces import SceneSurfaces
+from ..pulses import ScannedReturns
 from ..returns import SURFACE, PulseReturns
 from .batch_points import BatchPoints
 
-OPTIONS = "-std=c++17", "-fmad=false"  # options of the compiler
-_BLOCK = 128  # threads
+OPTIONS = "-std=c++17", "-fmad=false"  # compiler options
+_BLOCK = 128  # threads per block
 _ENERGIES = "intensity", "reflectance"
 _TRIANGLE = TABLE["triangle"]
-# Columns that a device computes, in the order of columns.cu.
+# Columns that a device computes, in the order used in columns.cu.
 _DEVICE_COLUMNS = (
     *AXES, CHANNEL, OBJECT,
     *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
 )  # fmt: skip
-_CONSTANT_COLUMNS = "sensor", "return_number", "returns", "cause"  # the same for all points
+_CONSTANT_COLUMNS = "sensor", "return_number", "returns", "cause"  # same value for all points
 _HITS = np.uint32, np.float64, np.int32  # types of rays, distances and triangles for NumPy
 _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
@@ -63,28 +70,28 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     computable = {column.name for column in _DEVICE_COLUMNS} - {
         *(_ENERGIES if hazy or textured_or_rough else ())
     }
-    if scene.has_mixed_objects:  # the device has no materials of faces
+    if scene.has_mixed_objects:  # the device does not know the materials of faces
         computable -= {*_ENERGIES, "class"}
     computable -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
     return computable - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
-    """Return True if NumPy computes a column, so that all reported hits leave the device."""
+    """Return whether NumPy computes a column, so that all reported hits must leave the device."""
     names = {column.name for column in survey.stored_columns}
     return not names <= _device_column_names(scene, survey) | {*_CONSTANT_COLUMNS}
 
 
 @dataclass(frozen=True, eq=False)
 class DevicePoints:
-    """Points of consecutive scans of a station: columns from the device, as of `BatchPoints`."""
+    """Points of consecutive scans of a station, with columns as in `BatchPoints`."""
 
     scene: Scene
     survey: Survey
     specs: list[ScanSpec]
     counts: Ints  # (scans,): number of points of each scan
-    hit_counts: Ints  # (scans,): number of hits of each scan, reported or not
-    tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
+    hit_counts: Ints  # (scans,): number of hits of each scan before thinning
+    tally: tuple[Indices, Ints]  # nonzero hit counters, and their hits
     columns: dict[str, AnyArray]  # {column name: values}
     returns: BatchPoints | None  # returns on the host, if NumPy computes columns
 
@@ -101,9 +108,9 @@ class DevicePoints:
         return np.full(len(self), value, column.dtype)
 
     def positions_of(self, row_indices: Ints) -> Floats:
-        """Return the positions of points by their rows (k,), meters: (k, 3).
+        """Return the positions (k, 3) of the points in the given rows, in meters.
 
-        Positions are rounded to the precision unless NumPy computes columns.
+        Positions are rounded to the precision of the survey unless NumPy computes columns.
         """
         if self.returns is not None:
             return self.returns.positions_of(row_indices)
@@ -111,27 +118,27 @@ class DevicePoints:
         return cells * self.survey.precision_m
 
 
-class SeenBodies:
-    """Bodies that a sensor sees, numbered as its caster numbers them."""
+class VisibleBodies:
+    """Bodies that a sensor can see, in the numbering of its caster."""
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
         self.caster = caster
         self.body_rows = caster.body_rows  # rows in `StoredTriangles.bodies`
-        self.table = bodies[self.body_rows]  # all actors are the last body
+        self.table = bodies[self.body_rows]  # all actors are one body, the last
         self.counters = caster.counters()
         self.device_table: Any = None
         self.device_normal_matrices: Any = None
 
 
 class DeviceColumns:
-    """Casts surveys whose rays have a single return, and computes columns on the device.
+    """Casts surveys in which each ray has at most one return, and computes columns on the device.
 
-    NumPy computes the columns that the device cannot compute, as the module says. `casters` are the
-    casters of the sensors, by the sensors' numbers.
+    NumPy computes the columns that the device cannot compute, as described in the module docstring.
+    `casters` are the casters by sensor number.
     """
 
     def __init__(
-        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: Surfaces
+        self, casters: Sequence[SceneCaster], scene: Scene, survey: Survey, surfaces: SceneSurfaces
     ) -> None:
         self._scene = scene
         self._surfaces = surfaces
@@ -145,17 +152,17 @@ class DeviceColumns:
             column for column in _DEVICE_COLUMNS if column.name in stored & computable
         ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
-        # Whether NumPy computes energies of hits on actors, which the device computes of others.
+        # Whether NumPy computes the energies of hits on actors; the device computes all others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
         bodies, _ = surfaces.triangles.bodies()
-        seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
+        seen = {caster: VisibleBodies(caster, bodies) for caster in dict.fromkeys(casters)}
         self._seen_bodies = [seen[caster] for caster in casters]  # one for each sensor
         self._surface_tables: tuple[Any, ...] | None = None
 
-    def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
-        """Return a copy for a scene with moved instances.
+    def with_moved_instances(self, scene: Scene, surfaces: SceneSurfaces) -> DeviceColumns:
+        """Return a copy for a scene in which instances have moved.
 
-        Unchanged tables stay on the device.
+        Tables that do not change stay on the device.
         """
         moved_columns = copy(self)
         moved_columns._scene = scene
@@ -174,8 +181,8 @@ class DeviceColumns:
     ) -> DevicePoints:
         """Cast consecutive scans of a station, and compute their columns.
 
-        `window` has the first ray in `pattern` and the ray after the last; `groups` (scans,) has
-        the first ray of each scan, counted from the first ray of the window.
+        `window` has the first ray in `pattern` and one past the last. `groups` (scans,) has the
+        first ray of each scan, counted from the start of the window.
         """
         survey = self.survey
         sensor = survey.carried[specs[0].sensor].sensor
@@ -196,13 +203,15 @@ class DeviceColumns:
             self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
         )
         try:
-            hit_counts, tally = seen.caster.caster.visit(
+            hit_counts, tally = seen.caster.caster.scan_on_device(
                 scan, transfer.make, seen.counters, actor_hits
             )
-        finally:  # else the device would write to memory that goes back to the pool
+        finally:  # otherwise the device could write to memory that has been returned to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hit_counts, None)
+        scanned = ScannedReturns(
+            PulseReturns.single_returns(ray, distance, triangle), hit_counts, None
+        )
         returns = BatchPoints(
             self._scene,
             survey,
@@ -230,10 +239,10 @@ class DeviceColumns:
     def write_ranges(
         self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges of rays of sensor `number` to `image` (n,), meters.
+        """Write the ranges in meters of the rays of a sensor to `image` (n,).
 
-        Ray i is row ``i % len(pattern)`` of the pattern. `image` has inf before; a ray without a
-        return keeps inf.
+        Ray i is row ``i % len(pattern)`` of the pattern. The caller fills `image` with inf, which
+        remains where a ray has no return.
         """
         sensor = self.survey.carried[number].sensor
         seen = self._seen_bodies[number]
@@ -244,19 +253,19 @@ class DeviceColumns:
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
         )
-        images: list[Any] = []  # arrays on the device, as soon as there are hits
+        images: list[Any] = []  # arrays on the device, created with the first hits
 
         def take(hits: DeviceHits) -> None:
             if not images:
                 images.append(hits.cupy.full(len(image), np.inf, np.float32))
             images[0][hits.ray] = hits.distance
 
-        seen.caster.caster.visit(scan, take, other_hits=_actor_hits(seen, scan, poses))
+        seen.caster.caster.scan_on_device(scan, take, external_hits=_actor_hits(seen, scan, poses))
         for device_image in images:
             device_image.get(out=image)
 
-    def tables(self, cupy: Any, seen: SeenBodies) -> tuple[Any, ...]:
-        """Return the tables of surfaces that columns.cu reads, on the caster's device."""
+    def tables(self, cupy: Any, seen: VisibleBodies) -> tuple[Any, ...]:
+        """Return the surface tables that columns.cu reads, on the caster's device."""
         if self._surface_tables is None:
             triangles = self._surfaces.triangles
             materials = self._surfaces.materials
@@ -277,28 +286,28 @@ class DeviceColumns:
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 
 
-def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
-    """Find the hits of a scan on actors that are seen, or return None without actors.
+def _actor_hits(seen: VisibleBodies, scan: Scan, poses: CastPoses) -> ExternalHits | None:
+    """Find the hits of a scan on visible actors, or return None without actors.
 
-    All actors are the last body: its triangles count from 0.
+    All actors are the last body, and its triangles are numbered from 0.
     """
     if not poses.actor_trajectories:
         return None
-    hits = seen.caster.on_actors(scan, poses)
+    hits = seen.caster.find_actor_hits(scan, poses)
     return replace(hits, triangle=hits.triangle - np.int32(seen.table[-1, 0]))
 
 
 class _ColumnTransfer:
-    """Computes columns of a batch on the device, and sends the values to the host.
+    """Computes the columns of a batch on the device, and sends their values to the host.
 
-    `maker` names the columns and has the tables of surfaces. The caster of the bodies `seen` passes
-    the hits of the batch to `make` in parts; `finish` returns the columns of all hits.
+    `maker` has the columns and the surface tables. The caster passes the hits of the batch to
+    `make` in parts. `finish` returns the columns of all hits.
     """
 
     def __init__(
         self,
         maker: DeviceColumns,
-        seen: SeenBodies,
+        seen: VisibleBodies,
         specs: list[ScanSpec],
         groups: Ints,
         max_points: int,
@@ -310,7 +319,7 @@ class _ColumnTransfer:
         self._max_points = max_points
         self._buffers: _TransferBuffers | None = None
         self._count = 0
-        # Rows, rays, distances and triangles of the hits on actors, of each call of `make`.
+        # Rows, rays, distances and triangles of the hits on actors, for each call of `make`.
         self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]
 
     def make(self, hits: DeviceHits) -> None:
@@ -333,7 +342,7 @@ class _ColumnTransfer:
         self._count += len(hits)
 
     def _compute(self, hits: DeviceHits, buffers: _TransferBuffers) -> dict[Column, Any]:
-        """Compute columns of hits on the device, with a single element in unneeded columns."""
+        """Compute columns of hits on the device. Arrays of unneeded columns have one element."""
         computed = {*buffers.columns, *([_TRIANGLE] if buffers.hits else [])}
         arrays = {
             column: hits.cupy.empty(len(hits) if column in computed else 1, column.dtype)
@@ -373,33 +382,35 @@ class _ColumnTransfer:
         return np.concatenate([row_indices for row_indices, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for the values, and return {column name: values}, and the hits that NumPy needs.
+        """Wait for the values, and return the columns by name, and the hits that NumPy needs.
 
-        Hits are rays, distances and triangles: of all hits, of those on actors, or of none.
+        The hits are arrays of rays, distances and triangles. They cover all hits, only the hits on
+        actors, or no hits.
         """
         if self._buffers is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.device_columns}, _NO_HITS[1:]
         self._buffers.outbox.wait()
         sizes = (self._count, self._max_points)
         columns = {
-            column.name: filled(host, *sizes) for column, host in self._buffers.columns.items()
+            column.name: trim_to_count(host, *sizes)
+            for column, host in self._buffers.columns.items()
         }
         if self._buffers.hits:
-            return columns, tuple(filled(host, *sizes) for host in self._buffers.hits)
+            return columns, tuple(trim_to_count(host, *sizes) for host in self._buffers.hits)
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
     def _start(self, cupy: Any) -> _TransferBuffers:
-        """Allocate host arrays, and send the kernel's arguments that are the same for all hits."""
+        """Allocate host arrays, and send the kernel arguments that are the same for all hits."""
         maker = self._maker
         kernel_arguments = self._kernel_arguments(cupy)
-        outbox = Outbox(cupy)
+        outbox = CopyQueue(cupy)
         columns = {
-            column: host_array(cupy, self._max_points, column.dtype)
+            column: pinned_array(cupy, self._max_points, column.dtype)
             for column in maker.device_columns
         }
         hits = (
-            [host_array(cupy, self._max_points, kind) for kind in _HITS]
+            [pinned_array(cupy, self._max_points, kind) for kind in _HITS]
             if maker.needs_all_hits
             else []
         )
@@ -407,7 +418,7 @@ class _ColumnTransfer:
         return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)
 
     def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
-        """Return the arguments of the kernel between hits and columns, arrays on the device."""
+        """Return the device arrays that are the kernel arguments between hits and columns."""
         maker = self._maker
         specs = self._specs
         sensor = maker.survey.carried[specs[0].sensor].sensor
@@ -438,12 +449,12 @@ class _ColumnTransfer:
 
 @dataclass(frozen=True, eq=False)
 class _TransferBuffers:
-    """Kernel of a batch with hits, and page-locked host arrays that receive the values."""
+    """Kernel for the hits of a batch, and page-locked host arrays that receive the values."""
 
     kernel: Any
     kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
-    outbox: Outbox
-    columns: dict[Column, AnyArray]  # columns with room for all rays
+    outbox: CopyQueue
+    columns: dict[Column, AnyArray]  # sized for all rays
     hits: list[AnyArray]  # arrays as in `_HITS`; empty unless NumPy needs all hits
 
 

@@ -1,1 +1,1 @@
-"""Steps: each is an effect on pulses, in a separate module with its loops beside it."""
+"""The simulation steps. Each module implements one effect; its compiled loops are beside it."""

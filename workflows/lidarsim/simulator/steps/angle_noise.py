@@ -1,4 +1,4 @@
-"""Errors of the directions of sent beams, while reported directions have no errors."""
+"""Errors of the emitted beam directions; the reported directions contain no errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UP = Purpose(3, "vertical noise of a beam direction")
 
 
 class AngleNoiseStep(PulseStep):
-    """Turns each beam by a random angle."""
+    """Rotates each beam by a random angle."""
 
     role = Role.AIMS
     purposes = ACROSS, UP
@@ -42,7 +42,7 @@ class AngleNoiseStep(PulseStep):
 
 
 class RippleStep(PulseStep):
-    """Turns beams by an error of azimuth that repeats with the head's revolutions."""
+    """Rotates beams by an azimuth error that repeats with each revolution of the head."""
 
     role = Role.AIMS | Role.ABOUT_AXIS
     effects = ("Systematic errors",)
@@ -54,16 +54,17 @@ class RippleStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of directions of beams, or 0 if `AngleNoiseStep` counts the memory."""
+        """Return the memory of beam directions, or 0 if `AngleNoiseStep` already counts it."""
         return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add the errors of azimuth to the beams of a batch, and return the returns unchanged."""
+        """Add the azimuth errors to the beams of a batch, and return the returns unchanged."""
         noise = self.setup.noise
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.row_range])
         sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
-        # An error of azimuth moves a beam across by the horizontal part of its unit direction.
+        # An azimuth error moves a beam sideways in proportion to the horizontal part of its
+        # direction.
         level = hypot(*sensor.ahead.T[:2])
         across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
         batch.deflect(np.column_stack([across, np.zeros(len(across))]))
@@ -71,9 +72,9 @@ class RippleStep(PulseStep):
 
 
 def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, Floats]:
-    """Return random angles of beams, across and up: (n,) and (n,), radians.
+    """Return the random horizontal and vertical angles of n beams, in radians.
 
-    `ray` (n,) are numbers of rays in their scans, `scan` (n,).
+    `scan` (n,) are scan numbers, and `ray` (n,) are the numbers of rays within their scans.
     """
     sigma = np.radians(noise.angle_deg)
     across = sigma * normal(noise.seed, ACROSS, scan, ray)
@@ -83,6 +84,6 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
 
 def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
     """Return the memory of the directions of deflected beams, in bytes."""
-    if setup.return_count_varies:  # then the beams are deflected batch by batch
+    if setup.return_count_varies:  # the beams are deflected batch by batch
         return Memory()
     return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

@@ -1,6 +1,6 @@
-"""Paths of light: casts sub-rays, and follows the light through glass and off mirrors.
+"""Cast sub-rays, and follow their light through glass and off mirrors.
 
-A surface that mirrors, transmits and scatters light divides it; the parts continue separately.
+A surface can reflect, transmit and scatter parts of the light; each part continues separately.
 """
 
 from __future__ import annotations
@@ -15,146 +15,148 @@ from raybeam import Pattern
 
 from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
 from ...base.random_numbers import Purpose, raw
-from ...base.vectors import into_axes, products
+from ...base.vectors import dot, rotate_into_frames
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
 from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, Clock, along_rings
+from ..casting.motion import CastPoses, FiringClock, order_along_rings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, sensor_light_of
-from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
+from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
-from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
+from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, random_depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
-MAX_PASSES = 16  # surfaces that light passes before it is dropped
-MAX_LEAFY_PASSES = 64  # limit with crowns: light passes the surface of a crown twice
-MAX_REFLECTIONS = 2  # reflections of light, which a mirror may divide each time
+MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
+MAX_LEAFY_PASSES = 64  # limit with crowns, because light passes the surface of a crown twice
+MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
 
 
 @dataclass
 class LightPaths:
-    """Straight pieces of the paths of sub-rays: arrays (n,), vectors (n, 3) in the scene frame.
+    """Straight segments of the light paths of sub-rays.
 
-    The first piece starts at the sensor, each later piece just behind a surface that transmits or
-    mirrors the light.
+    All arrays have shape (n,), and vectors have shape (n, 3) in the scene frame. The first segment
+    of a path starts at the sensor. Each later segment starts just behind a surface that transmits
+    or reflects the light.
     """
 
-    ray: Ints  # number of the sub-ray, from 0 at the start of the batch
-    times: Floats  # firing times, nanoseconds since the survey's start; 0 without actors
-    origins: Floats  # starts of the pieces, meters
+    ray: Ints  # number of the sub-ray, counted from the start of the batch
+    times: Floats  # firing times, nanoseconds since the start of the survey; 0 without actors
+    origins: Floats  # start points of the segments, meters
     directions: Floats  # unit vectors
-    # Share of the energy that the earlier surfaces pass, on the way out and back: 1 at the sensor.
+    # Share of the energy left by the earlier surfaces, on the way out and back; 1 at the sensor.
     share: Floats
-    optical_start: Floats  # optical path from the sensor to the origins, meters
-    # (n, 3, 3): product of the reflections so far, which turns directions as they were fired into
-    # directions of the pieces. None if no light is reflected, and for beams of a single sub-ray.
+    optical_start: Floats  # optical path length from the sensor to the origins, meters
+    # (n, 3, 3): product of the reflections so far, which maps fired directions to the directions of
+    # the segments. None if no light is reflected, and for beams with a single sub-ray.
     mirror_matrices: Floats | None = None
     mirrored: Bytes | None = None  # number of reflections so far, if there are mirrors
     in_media: LightInMedia | None = None  # None without media
-    # Growth of the optical path by the motions of the sensor and of the earlier surfaces, m/s, as
-    # if the next surface stood still; None if no column stores velocities.
+    # Rate of change of the optical path length caused by the motion of the sensor and of the
+    # earlier surfaces, in m/s, as if the next surface were static; None if no column stores
+    # velocities.
     range_rate: Floats | None = None
 
     def take(self, row_indices: Integers) -> LightPaths:
-        """Return the light of selected rows."""
-        return LightPaths(*selected(vars(self).values(), row_indices))
+        """Return the light in the selected rows."""
+        return LightPaths(*select_rows(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
-        """Return the optical paths from the sensor to distances (n,) from the origins, meters."""
+        """Return the optical path lengths from the sensor to points `step_m` from the origins."""
         return self.optical_start + (
-            step_m if self.in_media is None else self.in_media.optical(step_m)
+            step_m if self.in_media is None else self.in_media.optical_length(step_m)
         )
 
     @property
     def index(self) -> Floats | float:
-        """Refractive index around the light (n,), or 1.0 without media."""
+        """Refractive index of the medium around the light, or 1.0 without media."""
         return 1.0 if self.in_media is None else self.in_media.index
 
 
 class CastLight(NamedTuple):
-    """Light that hits a surface, and the surfaces that it hits: arrays (n,)."""
+    """Light that hits surfaces, and the triangles that it hits, as arrays of shape (n,)."""
 
     light: LightPaths
-    # Leaves are met from here on, meters from the origin: from the sensor's smallest range, or
-    # from the surface that the light left, which is at or below 0.
+    # Distance in meters from which on the light can hit leaves: the sensor's minimum range or, for
+    # later segments, the position of the last surface, which is at or slightly below 0.
     start_m: Floats
     step_m: Floats  # distance of the hit from the origin, meters
     triangle: Ints32  # number of the triangle (`SceneCaster`)
 
 
 class SurfaceHits(NamedTuple):
-    """Hits of light, one for each row of the light: arrays (n,), vectors (n, 3)."""
+    """Surface hits, one for each row of light. Arrays (n,), vectors (n, 3)."""
 
-    step_m: Floats  # meters from the origin of the last piece of the path
-    triangle: Ints32  # triangle of a leaf: where the light entered the crown
-    distance: Floats  # optical path from the sensor, meters
-    color: UInts32 | None  # packed (`Surfaces.colors`); None if not needed
-    normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
+    step_m: Floats  # distance from the origin of the last segment, meters
+    triangle: Ints32  # for a hit on a leaf, the triangle where the light entered the crown
+    distance: Floats  # optical path length from the sensor, meters
+    color: UInts32 | None  # packed (`SceneSurfaces.colors`); None if not needed
+    normals: Floats  # unit vectors in the scene frame; for a leaf, the direction of the light
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
-    kinds: Ints32  # kinds of surfaces: rows of the table of materials
-    energy: Floats  # energy at the sensor, in the unit of `Surfaces.energy`
+    kinds: Ints32  # kinds of surfaces, rows of the material table
+    energy: Floats  # received energy, in the unit of `SceneSurfaces.energy`
     film: Bools | None  # whether there may be a film of water; None if no surface is wet
-    leaves: Indices  # (l,): rows where light meets a leaf within a crown
-    velocities: Floats  # velocities of the surfaces; (0, 3) if they are not needed
+    leaves: Indices  # (l,): rows where light hits a leaf within a crown
+    velocities: Floats  # velocities of the surfaces; shape (0, 3) if they are not needed
 
 
 class VisibleHits(NamedTuple):
-    """The k hits that the sensor may see, and where the light of all n hits continues."""
+    """The k hits that the sensor can see, and where the light of all n hits continues."""
 
-    hits: PulseReturns  # k rows; all hits, unless there are media
-    normals: Floats  # (k, 3): of the hits, mirrored back into the directions as fired
+    hits: PulseReturns  # k rows; these are all hits if there are no media
+    normals: Floats  # (k, 3): normals of the hits, reflected back to match the fired directions
     transmits: Bools  # (n,): whether light continues through the surface
-    mirrors: Bools  # (n,): whether the surface mirrors a part of the light
+    mirrors: Bools  # (n,): whether the surface reflects a part of the light specularly
 
 
-class Crossings(NamedTuple):
-    """Surfaces that transmit or mirror light: arrays (n,), vectors (n, 3).
+class SurfaceCrossings(NamedTuple):
+    """Surfaces that transmit or reflect light. Arrays (n,), vectors (n, 3).
 
-    A surface that does both is in two rows.
+    A surface that does both has two rows.
     """
 
-    step_m: Floats  # meters from the origin
-    distance: Floats  # optical path from the sensor, meters
+    step_m: Floats  # distance from the origin, meters
+    distance: Floats  # optical path length from the sensor, meters
     triangle: Ints32
     normals: Floats
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
-    reflected: Bools  # whether the light of the row is mirrored, else transmitted
-    # Velocities of the surfaces, m/s: a moving surface that bends light changes the range rate.
+    reflected: Bools  # True if the light of the row is reflected, False if it is transmitted
+    # Velocities of the surfaces in m/s. Refraction at a moving surface changes the range rate.
     velocities: Floats | None
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues: arrays (k,), with a row twice where the light divides."""
+    """Rows of light that continues, as arrays (k,). Divided light has two rows."""
 
     row_indices: Indices
-    reflected: Bools  # whether the light of the row is mirrored, else transmitted
-    share: Floats  # share behind the surface, like `LightPaths.share`
+    reflected: Bools  # True if the light of the row is reflected, False if it is transmitted
+    share: Floats  # share behind the surface, as in `LightPaths.share`
 
 
 class Deflection(NamedTuple):
-    """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
+    """Light behind surfaces that refract or reflect it. Arrays (n,), vectors (n, 3)."""
 
     directions: Floats
-    share: Floats  # share behind the surface, like `LightPaths.share`
-    mirrored: Bools  # whether light is mirrored, by total reflection or otherwise
-    twice_normals: Floats  # normals times 2 where light is mirrored, else 0
+    share: Floats  # share behind the surface, as in `LightPaths.share`
+    mirrored: Bools  # whether light is reflected, including total internal reflection
+    twice_normals: Floats  # twice the normal where light is reflected, otherwise 0
 
 
 class OnwardLight(NamedTuple):
-    """Light behind the surfaces of its last hits, before its next cast: arrays (n,)."""
+    """Light behind the surfaces of its last hits, before the next cast, as arrays (n,)."""
 
     light: LightPaths
-    start_m: Floats  # positions of those surfaces along the light, meters, at or below 0
-    pattern: Pattern  # the rays to cast: origins and directions of `light`
+    start_m: Floats  # positions of these surfaces along the light, meters, at or below 0
+    pattern: Pattern  # rays to cast, which are the origins and directions of `light`
 
 
 class CastStep(PulseStep):
-    """Casts the sub-rays, and makes hits where their light meets surfaces and leaves.
+    """Casts sub-rays, and records hits where their light meets surfaces and leaves.
 
-    Light that a surface transmits or mirrors is cast again from the surface, and makes more hits.
+    Light that a surface transmits or reflects is cast again and can produce further hits.
     """
 
     role = Role.FRAME
@@ -170,7 +172,7 @@ class CastStep(PulseStep):
     causes = (GHOST,)
     purposes = LEAF, CROWN
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
@@ -180,14 +182,14 @@ class CastStep(PulseStep):
         filled = table.leafy.any() or table.refracts.any()
         air = self._sensor_light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
-        # Light that can return no more energy than this is not cast again, if there are mirrors.
+        # If there are mirrors, light that can return no more energy than this is not cast again.
         self._faintest = FAINTEST * setup.noise.threshold
         white = np.ones(len(table.reflectance))
-        # Largest energy that a kind of surface sends back from 10 m.
+        # Largest energy that any kind of surface returns from a distance of 10 m.
         self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLORS for column in survey.stored_columns)
         self._colored = shown or surfaces.materials.textured
-        # Whether the origins of rays are needed, and not only their directions.
+        # Whether the origins of rays are needed in addition to their directions.
         self._needs_origins = (
             self._colored
             or setup.has_velocities
@@ -195,54 +197,55 @@ class CastStep(PulseStep):
             or self._media is not None
         )
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return the step for a scene with moved instances, and media with new bounds."""
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
+        """Return the step for a scene with moved instances and updated bounds of media."""
         if self._media is not None:
-            return super().moved(setup, surfaces)
-        return self.repointed(setup, surfaces)
+            return super().with_moved_instances(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if a ray may have several returns, or no return."""
+        """Return True if a ray may have several returns or none."""
         return setup.return_count_varies
 
     @staticmethod
-    def added(setup: Setup) -> float:
-        """Return the number of ghosts that a pulse can have, an upper bound of the mean number."""
+    def added_returns(setup: Setup) -> float:
+        """Return the largest number of ghosts of a pulse, as an upper bound of the mean number."""
         return MAX_REFLECTIONS * setup.has_mirrors
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the bytes of sub-rays and hits, more if light continues or is bent.
+        """Return the memory of sub-rays and hits in bytes, which is larger if light continues.
 
-        The bytes are those while rays are cast and while returns are counted (`Memory`).
+        It consists of the memory used while rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
         casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.return_count
         return Memory(casting=casting, counting=75 * sizes.return_count + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of the sub-rays of a batch, without using `returns`.
+        """Return the hits of a batch's sub-rays; the argument `returns` is not used.
 
-        A pass is a cast and what its hits do with the light:
+        A pass casts light and determines what happens to it at the hits:
 
         1. `_cast_first` casts all sub-rays from the sensor. `CastLight` has a row for each sub-ray
-           that hits a surface: the path of its light (`LightPaths`), and the triangle.
-        2. `_surface_hits` computes what each row meets: a surface, or a leaf before the surface.
+           that hits a surface, with the path of its light (`LightPaths`) and the triangle.
+        2. `_surface_hits` determines whether each row hits the surface or a leaf in front of it.
            `SurfaceHits` has the color, the normal and the energy of each row.
-        3. `_visible_hits` chooses the rows that the sensor sees, as `PulseReturns`, and marks rows
-           whose light continues: `VisibleHits`.
-        4. `_continue` takes these rows (`OnwardRows`), twice where light is both transmitted and
-           mirrored, and bends or mirrors the light (`Deflection`): `OnwardLight`. Without such rows
-           the passes end.
-        5. `_cast_again` casts this light, and returns the `CastLight` of the next pass, which goes
-           on with 2.
-        6. `_join` puts the hits of all passes in the order of sub-rays.
+        3. `_visible_hits` selects the rows that the sensor can see, as `PulseReturns`, and marks
+           rows whose light continues (`VisibleHits`).
+        4. `_continue` takes the marked rows (`OnwardRows`), twice if light is both transmitted and
+           reflected, and refracts or reflects the light (`Deflection`). The result is
+           `OnwardLight`. If no rows are marked, this was the last pass.
+        5. `_cast_again` casts this light and returns the `CastLight` of the next pass, which
+           continues
+           with 2.
+        6. `_join` sorts the hits of all passes by sub-ray.
 
-        Two sub-rays meet a pane of glass at 4 m with a wall behind it at 9 m. Pass 1 has two rows,
-        hits on the pane, and both continue. Pass 2 has two rows, hits on the wall, and no row
-        continues. The joined hits have the sub-rays 0, 0, 1, 1, and the distances 4, 9, 4, 9. Hits
-        on clear glass have no energy, and no return is made of them.
+        For example, two sub-rays hit a pane of glass at 4 m with a wall behind it at 9 m. Pass 1
+        has two rows, the hits on the pane, and the light of both continues. Pass 2 has two rows,
+        the hits on the wall, where no light continues. The joined hits have the sub-rays 0, 0, 1, 1
+        and the distances 4, 9, 4, 9. Hits on clear glass have no energy and do not become returns.
         """
         cast, rays = self._cast_first(batch)
         first_light = cast.light
@@ -260,19 +263,19 @@ class CastStep(PulseStep):
 
     @property
     def _leafy(self) -> bool:
-        """Whether there are crowns."""
+        """Whether the scene has crowns."""
         return self._media is not None and self._media.leafy
 
     @property
     def _reach_m(self) -> float:
-        """Greatest length of a cast ray, meters, or inf if there are crowns.
+        """Largest length of a cast ray in meters, or inf if there are crowns.
 
-        The path through a crown ends at the surface on its far side, at any distance.
+        A path through a crown ends at the surface on the far side, which can be at any distance.
         """
         return np.inf if self._leafy else self.setup.sensor.max_range_m
 
     def _draw(self, batch: PulseBatch) -> Draw:
-        """Return the function `draw(purpose, ray)` of random bits of sub-rays `ray` (n,): (n,)."""
+        """Return a function `draw(purpose, ray)` that returns random bits for sub-rays (n,)."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
             scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
@@ -285,8 +288,9 @@ class CastStep(PulseStep):
     def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
         """Cast the sub-rays of a batch, and return the light that hits a surface, and all rays.
 
-        The rays are origins, if they are needed, and unit directions of all sub-rays of the batch,
-        in the scene frame: (6, s) or (3, s). The light has a row for each of the sub-rays that hit.
+        The rays are an array of shape (6, s) with origins and unit directions of all s sub-rays in
+        the scene frame, or of shape (3, s) if the origins are not needed. The light has one row for
+        each sub-ray that hits a surface.
         """
         poses = batch.subray_poses
         first, stop = batch.window
@@ -299,16 +303,16 @@ class CastStep(PulseStep):
             window=batch.window,
             t_min=nearest_m,
             t_max=self._reach_m,
-            room=rays,
+            out=rays,
         )
         light = self._light_of_rays(hits.ray.astype(np.int64), rays, batch)
         start_m = np.full(len(light.ray), nearest_m)
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light at the sensor of sub-rays `ray` (n,) of a batch that hit a surface.
+        """Return the light, at the sensor, of sub-rays `ray` (n,) that hit a surface.
 
-        `rays` are all sub-rays of the batch (`_cast_first`).
+        `rays` has all sub-rays of the batch (`_cast_first`).
         """
         setup = self.setup
         poses = batch.subray_poses
@@ -328,7 +332,7 @@ class CastStep(PulseStep):
         if batch.subrays_per_beam > 1 and deflected:
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
-            leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
+            leaf_depths = random_depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
             media_rays = MediaRays(origins, directions, times, poses.actor_trajectories)
             light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
         return light
@@ -336,9 +340,9 @@ class CastStep(PulseStep):
     # -- hits --------------------------------------------------------------------------------
 
     def _surface_hits(self, cast: CastLight, batch: PulseBatch) -> SurfaceHits:
-        """Return the hits of light on surfaces, or on leaves before the surfaces.
+        """Return the hits of light on surfaces, or on leaves in front of the surfaces.
 
-        Advances `cast.light.in_media`, the state of the light in media, to the hits.
+        This advances `cast.light.in_media`, the state of the light in media, to the hits.
         """
         surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories
@@ -351,7 +355,7 @@ class CastStep(PulseStep):
         if self._colored:
             points = light.origins + step_m[:, None] * light.directions
             color = surfaces.colors(triangle, points, light.times, actor_trajectories)
-        normals, cosines, kinds, energy, film = surfaces.lit(
+        normals, cosines, kinds, energy, film = surfaces.illuminate(
             triangle,
             light.directions,
             distance=distance,
@@ -361,7 +365,7 @@ class CastStep(PulseStep):
             colors=color,
         )
         if leaves is not None and len(leaves.row_indices):
-            # Leaves face the light: two leaves behind each other are then never one surface.
+            # Leaves face the light, so that two leaves in a row are never taken for one surface.
             normals[leaves.row_indices] = light.directions[leaves.row_indices]
             energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, color)
         energy *= light.share
@@ -383,7 +387,7 @@ class CastStep(PulseStep):
         )
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
-        """Return light that ends at the leaves that it meets, and the leaves.
+        """Return the light, shortened where it hits leaves, and the leaves.
 
         The leaves are None without media.
         """
@@ -407,9 +411,10 @@ class CastStep(PulseStep):
     def _leaf_energy(
         self, leaves: Leaves, triangle: Ints32, distance: Floats, color: UInts32 | None
     ) -> Floats:
-        """Return the energies received from leaves (k,).
+        """Return the received energies of leaves (k,).
 
-        `triangle`, `distance` (meters) and `color` are of all hits (n,), with those on leaves.
+        `triangle`, `distance` (meters) and `color` belong to all hits (n,), including hits on
+        leaves.
         """
         row_indices = leaves.row_indices
         leaf_color = None if color is None else color[row_indices]
@@ -428,7 +433,7 @@ class CastStep(PulseStep):
         triangle: Ints32,
         actor_trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities of surfaces at hits, m/s: (n, 3), or (0, 3) if not needed."""
+        """Return the velocities in m/s of surfaces at hits, with shape (0, 3) if not needed."""
         if light.range_rate is None:
             return np.zeros((0, 3))
         return velocities_of_ends(
@@ -441,14 +446,14 @@ class CastStep(PulseStep):
         )
 
     def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
-        """Return the hits that the sensor may see, and where light continues.
+        """Return the hits that the sensor can see, and where light continues.
 
-        With media, hits on the surfaces of crowns and hits beyond the sensor's range are left out.
+        With media, hits on the surfaces of crowns and hits beyond the sensor's range are omitted.
         """
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
-            along_ray = products(surface_hits.velocities.T, light.directions.T)
+            along_ray = dot(surface_hits.velocities.T, light.directions.T)
             velocity = light.range_rate + light.index * along_ray
         cause = None
         mirrored = light.mirrored
@@ -465,7 +470,7 @@ class CastStep(PulseStep):
         )
         normals = surface_hits.normals
         if light.mirror_matrices is not None:
-            normals = into_axes(normals, light.mirror_matrices)
+            normals = rotate_into_frames(normals, light.mirror_matrices)
         transmits = materials.passes[surface_hits.kinds]
         mirrors = np.zeros(len(surface_hits.kinds), np.bool_)
         if mirrored is not None:
@@ -474,9 +479,9 @@ class CastStep(PulseStep):
             mirrors = smooth & (mirrored < MAX_REFLECTIONS)
         if light.in_media is None:
             return VisibleHits(hits, normals, transmits, mirrors)
-        crowns = materials.leafy[surface_hits.kinds]  # whose surfaces reflect no light
+        crowns = materials.leafy[surface_hits.kinds]  # surfaces of crowns reflect no light
         crowns[surface_hits.leaves] = False
-        # Optical paths are longer than the rays that were cast.
+        # Optical path lengths exceed the lengths of the cast rays.
         in_range = surface_hits.distance <= self.setup.sensor.max_range_m
         row_indices = np.flatnonzero(in_range & ~crowns)
         return VisibleHits(
@@ -495,9 +500,9 @@ class CastStep(PulseStep):
         visible: VisibleHits,
         subrays_per_beam: int,
     ) -> OnwardLight | None:
-        """Return the light that surfaces transmit or mirror, ready to cast, or None without any.
+        """Return the light that surfaces transmit or reflect, ready to cast, or None if none does.
 
-        Rows that are transmitted and mirrored are taken twice, and ordered along rings.
+        Light that is both transmitted and reflected has two rows. Rows are ordered by ring.
         """
         if not self.setup.has_onward_light:
             return None
@@ -506,17 +511,19 @@ class CastStep(PulseStep):
         if not len(row_indices):
             return None
         reflected = np.arange(len(row_indices)) >= len(transmitted)
-        order = along_rings(light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels)
+        order = order_along_rings(
+            light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels
+        )
         row_indices, reflected, share = self._divide(
             light, surface_hits, row_indices[order], reflected[order]
         )
         onward = light.take(row_indices)
         onward.share = share
-        crossings = Crossings(
+        crossings = SurfaceCrossings(
             step_m=surface_hits.step_m[row_indices],
             distance=surface_hits.distance[row_indices],
             triangle=surface_hits.triangle[row_indices],
-            normals=surface_hits.normals.T.take(row_indices, axis=-1).T,  # twice as fast as by rows
+            normals=surface_hits.normals.T.take(row_indices, axis=-1).T,  # twice as fast as rows
             cosines=surface_hits.cosines[row_indices],
             reflected=reflected,
             velocities=None if light.range_rate is None else surface_hits.velocities[row_indices],
@@ -526,16 +533,16 @@ class CastStep(PulseStep):
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, row_indices: Indices, reflected: Bools
     ) -> OnwardRows:
-        """Compute the share of light that surfaces transmit or mirror, and drop faint light.
+        """Compute the shares of light that surfaces transmit or reflect, and drop faint light.
 
-        `surface_hits` has a row for each row of `light` (n,). `row_indices` (k,) are the rows whose
-        light goes on. `reflected` (k,) is True for light that is mirrored, and False for light that
-        is transmitted. Both arrays are overwritten.
+        `surface_hits` has a row for each row of `light`. `row_indices` (k,) are the rows whose
+        light continues. `reflected` (k,) is True for reflected light, and False for transmitted
+        light. Both arrays are overwritten.
 
-        Light is dropped only if there are mirrors, and if no medium refracts: where light is
-        refracted, its energy may exceed the limit that is computed here.
+        Light is dropped only if there are mirrors and no medium refracts. Refraction can increase
+        the energy beyond the limit that is computed here.
         """
-        from ..casting import surface_loops  # not before: numba takes half a second to import
+        from ..casting import surface_loops  # imported here: numba takes half a second to import
 
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
@@ -574,12 +581,13 @@ class CastStep(PulseStep):
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces, and return the light that hits a surface in range.
 
-        With crowns, hits beyond the range are returned too: there may be leaves before them.
+        With crowns, hits beyond the range are returned too, because there may be leaves before
+        them.
         """
         light, start_m, pattern = onward
         max_range_m = self.setup.sensor.max_range_m
-        # Light takes no time: it travels 300 m in a microsecond.
-        clock = Clock(light.times, np.zeros(1), actor_trajectories)
+        # The travel time of light is neglected: it travels 300 m in a microsecond.
+        clock = FiringClock(light.times, np.zeros(1), actor_trajectories)
         poses = CastPoses(np.zeros(3), clock=clock)
         hits = self.caster.scan(pattern, poses, t_max=self._reach_m)
         row_indices = hits.ray
@@ -605,13 +613,13 @@ class CastStep(PulseStep):
         rays: Floats,
         first_light: LightPaths,
     ) -> PulseReturns:
-        """Return the hits of all passes in the order of sub-rays, and set them in the batch.
+        """Combine the hits of all passes, sorted by sub-ray, and store them in the batch.
 
-        `hits_by_pass` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams
-        have several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light
-        of the sub-rays that hit a surface.
+        `hits_by_pass` has the hits of each pass. This sets `batch.hits`, and `batch.planes` if
+        beams have several sub-rays. `rays` has all sub-rays (`_cast_first`), and `first_light` is
+        the light of the sub-rays that hit a surface.
         """
-        hits = joined([visible.hits for visible in hits_by_pass])
+        hits = concatenate_returns([visible.hits for visible in hits_by_pass])
         normals = hits_by_pass[0].normals
         if hits_by_pass[1:]:
             order = np.argsort(hits.ray, kind="stable")
@@ -621,16 +629,17 @@ class CastStep(PulseStep):
         batch.hits = hits
         if batch.subrays_per_beam > 1:
             directions = first_light.directions
-            # The rows differ from `first_light` after several passes, or if hits were left out.
+            # The rows differ from `first_light` after several passes or if hits were omitted.
             if hits_by_pass[1:] or len(hits.ray) != len(first_light.ray):
                 directions = rays[-3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits
 
-    def _cross(self, light: LightPaths, crossings: Crossings) -> OnwardLight:
-        """Return the light behind surfaces that transmit or mirror the light.
+    def _cross(self, light: LightPaths, crossings: SurfaceCrossings) -> OnwardLight:
+        """Return the light behind surfaces that transmit or reflect it.
 
-        The new origins are a small distance behind the surfaces, so as not to hit them again.
+        The new origins are a small distance behind the surfaces, so that the light does not hit
+        them again.
         """
         incoming_index = light.index
         deflection = self._deflect(light, crossings)
@@ -638,18 +647,18 @@ class CastStep(PulseStep):
         normals = crossings.normals
         mirror_matrices = light.mirror_matrices
         if mirror_matrices is not None:
-            normals_as_seen = into_axes(normals, mirror_matrices)
+            normals_as_seen = rotate_into_frames(normals, mirror_matrices)
             reflections = deflection.twice_normals[:, :, None] * normals_as_seen[:, None]
             mirror_matrices = mirror_matrices - reflections
         cosines = np.abs(crossings.cosines)
         in_media = light.in_media
         if in_media is not None:
             in_media.deflect(light.directions, outgoing, normals, deflection.mirrored)
-            cosines = np.abs(products(normals.T, outgoing.T))
+            cosines = np.abs(dot(normals.T, outgoing.T))
         range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
         clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
         pattern, origins = _pattern_behind(light, crossings.step_m, clear_m, outgoing)
-        optical_m = clear_m if in_media is None else in_media.optical(clear_m)
+        optical_m = clear_m if in_media is None else in_media.optical_length(clear_m)
         if in_media is not None:
             in_media.advance(clear_m)
         behind = LightPaths(
@@ -666,10 +675,10 @@ class CastStep(PulseStep):
         )
         return OnwardLight(behind, -clear_m, pattern)
 
-    def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
-        """Return the directions and shares of light behind surfaces that refract or mirror.
+    def _deflect(self, light: LightPaths, crossings: SurfaceCrossings) -> Deflection:
+        """Return directions and shares of light behind surfaces that refract or reflect it.
 
-        Moves the light into the media behind the surfaces.
+        This moves the light into the media behind the surfaces.
         """
         outgoing = light.directions
         share = light.share
@@ -684,7 +693,7 @@ class CastStep(PulseStep):
                 crossings.reflected,
             )
             outgoing = refraction.directions
-            share = share * refraction.shares**2  # light passes on the way out and back
+            share = share * refraction.shares**2  # light passes on the way out and on the way back
             mirrored = mirrored | refraction.totally_reflected
         twice_normals = 2 * mirrored[:, None] * crossings.normals
         outgoing = outgoing - crossings.cosines[:, None] * twice_normals
@@ -697,26 +706,26 @@ def _range_rate_behind(
     velocities: Floats | None,
     outgoing: Floats,
 ) -> Floats | None:
-    """Return `LightPaths.range_rate` behind moving surfaces that bend or mirror light, m/s: (n,).
+    """Return `LightPaths.range_rate` behind moving surfaces that refract or reflect light.
 
-    `light` has the directions before the surfaces, `outgoing` (n, 3) are those behind the surfaces.
-    `velocities` (n, 3) are the velocities of the surfaces, m/s. `incoming_index` is the refractive
-    index before the surfaces, `light.index` behind them.
+    `light` has the directions in front of the surfaces, and `outgoing` (n, 3) are the directions
+    behind them. `velocities` (n, 3) are the velocities of the surfaces in m/s. `incoming_index` is
+    the refractive index in front of the surfaces, and `light.index` the index behind them.
     """
     if light.range_rate is None or velocities is None:
         return light.range_rate
-    incoming_speed = products(velocities.T, light.directions.T)
-    outgoing_speed = products(velocities.T, outgoing.T)
+    incoming_speed = dot(velocities.T, light.directions.T)
+    outgoing_speed = dot(velocities.T, outgoing.T)
     return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
 
 
 def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
-    """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).
+    """Return rays that start `clear_m` (n,) beyond the ends of light, and their origins (n, 3).
 
-    Light ends at distances `step_m` (n,) from its origins, meters. `outgoing` (n, 3) are the
-    directions of the rays, of any length close to 1.
+    The light ends at distances `step_m` (n,) in meters from its origins. `outgoing` (n, 3) are the
+    directions of the rays, whose lengths must be close to 1.
     """
     from ..casting import surface_loops
 

@@ -1,4 +1,4 @@
-"""Crosstalk: a receiver cannot tell foreign pulses, of other sensors, from its own pulses."""
+"""Crosstalk: a receiver cannot distinguish pulses of other sensors from its own pulses."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ from ...base.arrays import Floats, Indices, Ints, Ints32, owned
 from ...base.elementary import arccos, exp
 from ...base.elementary_scalars import sin_cos_of
 from ...base.random_numbers import Purpose
-from ...base.vectors import into_axes, length, products, turned
+from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import at_right_angles
 from ...sensor import Sensor
 from ...sensor.optics import LIGHT_M_NS
 from ...survey.survey import ScanSpec, Survey, firing_start_ns
-from ..casting.motion import CastPoses, Clock
+from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, numbers, returns_without_surface
-from .detection import passes
+from ..casting.surfaces import SceneSurfaces
+from ..returns import (
+    RETURN_COLUMNS,
+    PulseReturns,
+    merge_returns,
+    number_within_ray,
+    returns_without_surface,
+)
+from .detection import exceeds_threshold
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:
@@ -32,33 +38,33 @@ if TYPE_CHECKING:
 
 FOREIGN_PULSE = Purpose(23, "energy noise of a pulse from another sensor")
 CROSSTALK = CAUSES.index("crosstalk")
-CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
-FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
-SLACK_NS = 10.0  # error of the estimated time at which a pulse reaches the receiver, at most
+CELL_RAYS = 1 << 6  # number of rays that are compared with a spot at a time
+FILTER_NM = 20.0  # largest difference of wavelengths that passes a receiver's filter
+SLACK_NS = 10.0  # largest error of the estimated time at which a pulse reaches the receiver
 
 
 class ReceivedPulses(NamedTuple):
-    """Foreign pulses that rays receive: arrays (k,)."""
+    """Pulses of other sensors that rays receive, as arrays of shape (k,)."""
 
-    row: Indices  # row of the receiving rays
-    distance: Floats  # at which the pulse appears to the receiver, meters
+    row: Indices  # rows of the receiving rays
+    distance: Floats  # apparent distance of the pulse, meters
     energy: Floats  # 1 for a white surface at `REFERENCE_M`
 
 
 class _WaitingRays(NamedTuple):
-    """Rays whose receiver waits for light: arrays (n,), vectors (n, 3) in the scene frame."""
+    """Rays whose receiver waits for light. Arrays (n,), vectors (n, 3) in the scene frame."""
 
     fired: Floats  # firing times, nanoseconds since the start of the station
-    order: Indices  # rows of the rays in order of their firing times
+    order: Indices  # rows of the rays, sorted by firing time
     origins: Floats
     directions: Floats
-    gate: Floats  # (2,): nanoseconds after firing between which the receiver waits
+    gate: Floats  # (2,): start and end of the wait after firing, nanoseconds
 
 
 class _Spots(NamedTuple):
-    """Points on surfaces that the pulses of a sensor light: arrays (n,)."""
+    """Points on surfaces that the pulses of a sensor illuminate, as arrays of shape (n,)."""
 
-    time: Floats  # at which the pulse lights the spot, nanoseconds since the start of the station
+    time: Floats  # when the pulse illuminates the spot, nanoseconds since the start of the station
     position: Floats  # (n, 3), meters, scene frame
     normal: Floats  # (n, 3), unit vectors
     triangle: Ints32
@@ -66,7 +72,7 @@ class _Spots(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Spots, and consecutive rays that may see each spot: arrays (k,)."""
+    """Spots, and consecutive rays that may see each spot, as arrays of shape (k,)."""
 
     spot: Indices
     start: Indices  # index of the first ray in `_WaitingRays.order`
@@ -74,11 +80,11 @@ class _Candidates(NamedTuple):
 
 
 class CrosstalkStep(PulseStep):
-    """Adds the foreign pulses that a sensor receives.
+    """Adds pulses of other sensors that a sensor receives.
 
-    A pulse of another sensor lights a spot. A ray receives the light of the spot if the spot is
+    A pulse of another sensor illuminates a spot. A ray receives light from the spot if the spot is
     visible and in the field of view of the ray's receiver, which is as wide as the beam, and if
-    the light arrives while the receiver waits for the pulse of the ray.
+    the light arrives while the receiver waits for the ray's own pulse.
     """
 
     role = Role.RECEIVES
@@ -88,12 +94,12 @@ class CrosstalkStep(PulseStep):
     causes = (CROSSTALK,)
     purposes = (FOREIGN_PULSE,)
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._survey = setup.survey
         self._sensor = setup.sensor
         divergence = setup.reporting.divergence(self._sensor.optics)
-        self._cosine = sin_cos_of(divergence / 2)[1]  # cosine of half the field of view of a ray
+        self._cosine = sin_cos_of(divergence / 2)[1]  # cosine of half a ray's field of view
         nm = self._sensor.optics.wavelength_nm
         self._other_sensors = [
             number
@@ -101,9 +107,9 @@ class CrosstalkStep(PulseStep):
             if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
-        return self.repointed(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -112,16 +118,16 @@ class CrosstalkStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of causes of returns, of rays, and of foreign pulses, in bytes."""
+        """Return the memory of return causes, rays and foreign pulses, in bytes."""
         foreign_pulses = _foreign_pulses(setup.survey, setup.sensor)
         return Memory(
             retained=10 * sizes.return_count, casting=(120 + 180 * foreign_pulses) * sizes.beams
         )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch and the received foreign pulses."""
+        """Return the returns of a batch together with received foreign pulses."""
         rays = np.arange(batch.start, batch.stop)
-        row, distance, energy = self.received(
+        row, distance, energy = self.receive(
             batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
         )
         order = np.lexsort((distance, row))
@@ -129,19 +135,21 @@ class CrosstalkStep(PulseStep):
         distance = distance[order]
         energy = energy[order]
         scan, number = batch.keys.scan_and_number(ray)
-        detected = passes(self.setup.noise, FOREIGN_PULSE, energy, scan, number, numbers(ray))
+        detected = exceeds_threshold(
+            self.setup.noise, FOREIGN_PULSE, energy, scan, number, number_within_ray(ray)
+        )
         foreign_returns = returns_without_surface(
             returns, ray[detected], distance[detected], energy[detected], CROSSTALK
         )
-        return merged(returns, foreign_returns)
+        return merge_returns(returns, foreign_returns)
 
-    def received(
+    def receive(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
     ) -> ReceivedPulses:
         """Return the foreign pulses that consecutive rays (n,) receive.
 
-        `rays` are numbers counted from the first ray of scan `scan`. Origins, meters, and unit
-        directions are (n, 3), in the scene frame.
+        `rays` are numbers counted from the first ray of scan `scan`. `origins` (n, 3) in meters and
+        unit `directions` (n, 3) are in the scene frame.
         """
         spec = self._survey.scan(scan)
         sensor = self._sensor
@@ -177,8 +185,8 @@ class CrosstalkStep(PulseStep):
         return ReceivedPulses(row[visible], distance[visible], energy)
 
     def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
-        """Return the pairs of a ray and a spot in the ray's field of view while the ray waits."""
-        from . import stray_loops  # not before: numba takes half a second to import
+        """Return pairs of a ray and a spot in its field of view that arrive while the ray waits."""
+        from . import stray_loops  # imported here because numba takes half a second to import
 
         candidates = self._candidates(waiting, spots)
         max_count = int(np.maximum(candidates.stop - candidates.start, 0).sum())
@@ -205,22 +213,22 @@ class CrosstalkStep(PulseStep):
         return sightings.first(count)
 
     def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
-        """Return spots, and for each spot the rays that may receive the light of the spot.
+        """Return spots, and for each spot the rays that may receive its light.
 
-        The rays wait while the light of the spot arrives, and their cell looks towards the spot.
+        These rays wait when the light of the spot arrives, and their cell faces the spot.
         """
         times = waiting.fired[waiting.order]
         nearest_firing = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
         towards = spots.position - waiting.origins[waiting.order[nearest_firing]]
-        distance = np.sqrt(products(towards.T, towards.T))
+        distance = np.sqrt(dot(towards.T, towards.T))
         arrival = spots.time + distance / LIGHT_M_NS
         first = np.searchsorted(times, arrival - waiting.gate[1] - SLACK_NS)
         stop = np.searchsorted(times, arrival - waiting.gate[0] + SLACK_NS, side="right")
         axes, opening = self._cells(waiting.directions[waiting.order])
         with np.errstate(invalid="ignore", divide="ignore"):
-            slack = SLACK_NS * LIGHT_M_NS / distance  # rays of a cell start at different positions
+            slack = SLACK_NS * LIGHT_M_NS / distance  # rays of a cell have different origins
         spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
-        angles = arccos(np.clip(products(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
+        angles = arccos(np.clip(dot(axes[cell].T, towards[spot].T) / distance[spot], -1, 1))
         in_view = ~(angles > opening[cell] + slack[spot])
         spot = spot[in_view]
         cell = cell[in_view]
@@ -228,38 +236,40 @@ class CrosstalkStep(PulseStep):
         return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
 
     def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Return the axes (c, 3) and opening angles (c,), radians, of cones of consecutive rays.
+        """Return the axes (c, 3) and opening angles (c,) in radians of cones of consecutive rays.
 
-        Consecutive rays look into a narrow cone, and few spots are in the cone.
+        Consecutive rays lie in a narrow cone, which few spots are in.
         """
         cell_starts = np.arange(0, len(directions), CELL_RAYS)
         sums = np.add.reduceat(directions, cell_starts, axis=0)
-        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
+        axes = sums / np.maximum(norm(sums), 1e-9)[:, None]
         min_cosine = np.minimum.reduceat(
-            products(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
+            dot(axes[np.arange(len(directions)) // CELL_RAYS].T, directions.T), cell_starts
         )
         return axes, arccos(np.clip(min_cosine, -1, 1)) + arccos(self._cosine)
 
     def _spots(
         self, number: int, spec: ScanSpec, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
-        """Cast the pulses that another sensor fires within a span of time. Return their spots."""
+        """Cast the pulses that another sensor fires in a time interval, and return their spots."""
         sensor: Sensor = self._survey.carried[number].sensor
         firings = np.arange(*_firings_in(sensor, self._survey.steps_each[number], span))
         firing_starts = sensor.begins_ns(firings)
         fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
         origins, directions = self._fired_rays(number, spec.station, firings, firing_starts)
         trajectories = poses.actor_trajectories
-        hits = self.caster.of_sensors[number].scan(
+        hits = self.caster.by_sensor[number].scan(
             Pattern(directions, origins),
-            CastPoses(np.zeros(3), clock=Clock(fired + spec.start_ns, np.zeros(1), trajectories)),
+            CastPoses(
+                np.zeros(3), clock=FiringClock(fired + spec.start_ns, np.zeros(1), trajectories)
+            ),
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
         )
         ray = hits.ray.astype(np.int64)
         distance = hits.distance
         triangle = hits.triangle
-        if self.caster.unseen is not None:  # spots on objects that this sensor does not see
+        if self.caster.unseen is not None:  # remove spots on objects that this sensor cannot see
             seen = np.flatnonzero(~self.caster.unseen[self.surfaces.triangles.objects(triangle)])
             ray = ray[seen]
             distance = distance[seen]
@@ -276,49 +286,50 @@ class CrosstalkStep(PulseStep):
     def _fired_rays(
         self, number: int, station: int, firings: Ints, firing_starts: Floats
     ) -> tuple[Floats, Floats]:
-        """Return origins and directions of the rays of firings, in the scene frame: (n, 3)."""
+        """Return origins and directions of the rays of firings, in the scene frame."""
         carried = self._survey.carried[number]
         path = self._survey.path
         sensor = carried.sensor
         directions = sensor.directions(firings)
         origins = sensor.origins(firings)
         origins = np.zeros_like(directions) if origins is None else origins
-        directions = turned(directions.reshape(-1, 3), carried.mount.rotation)
-        origins = turned(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
+        directions = rotate(directions.reshape(-1, 3), carried.mount.rotation)
+        origins = rotate(origins.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
         times = np.minimum(firing_starts + sensor.lead_ns, path.duration_ns)
         positions, rotations = path.poses(station, times)
         if rotations is not None:
             inverse = np.repeat(rotations.transpose(0, 2, 1), sensor.channels, axis=0)
-            directions = into_axes(directions, inverse)
-            origins = into_axes(origins, inverse)
+            directions = rotate_into_frames(directions, inverse)
+            origins = rotate_into_frames(origins, inverse)
         return origins + np.repeat(positions, sensor.channels, axis=0), directions
 
     def _energy(self, spots: _Spots, spot: Indices, towards: Floats, path_m: Floats) -> Floats:
-        """Return the energies received from spots `spot` (n,), as of the receiving sensor's pulses.
+        """Return the energies received from spots, relative to a white surface at `REFERENCE_M`.
 
-        `towards` (n, 3) are vectors from the receivers to the spots, of lengths `path_m` (n,).
+        `spot` (n,) are rows of `spots`. `towards` (n, 3) are vectors from the receivers to the
+        spots, whose lengths are `path_m` (n,).
         """
         surfaces = self.surfaces
         triangle = spots.triangle[spot]
-        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / path_m
-        # The depth of air from the other sensor to the spot, and on to the receiver.
+        cosine = np.abs(dot(spots.normal[spot].T, towards.T)) / path_m
+        # Optical depth of the air from the other sensor to the spot and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
         table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
-        # A retro-reflector sends light back only to the sensor that sent the light.
+        # A retroreflector returns light only to the sensor that emitted it.
         share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
-    """Return rows (k,) and integers (k,) of all half-open ranges, `first` to `stop` (n,)."""
+    """Enumerate the integers in half-open ranges, and the range that each belongs to."""
     counts = np.maximum(stop - first, 0)
     row = np.repeat(np.arange(len(counts)), counts)
     return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
-    """Return start and stop of firings with beams in a span, ns since the station's start."""
+    """Return start and stop of the firings with beams in an interval, in ns from station start."""
     firings = range(sensor.firings(steps - 1)[1])
     start_of = partial(firing_start_ns, sensor)
     slowest_ns = float(sensor.beams.time_ns.max())
@@ -327,7 +338,7 @@ def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[
 
 
 def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
-    """Return the number of foreign pulses for each pulse of a sensor."""
+    """Return the number of foreign pulses per pulse of a sensor."""
 
     def rate(lidar: Sensor) -> float:
         first, stop = lidar.firings(0)

@@ -1,4 +1,4 @@
-"""Detection: which signals pass the threshold of a receiver, and which returns drop out."""
+"""Detection: which signals exceed the threshold of a receiver, and which returns drop out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ...base.arrays import Bools, Floats, Integers
 from ...base.random_numbers import Purpose, normal, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
-from ..returns import PulseReturns, numbers
+from ..returns import PulseReturns, number_within_ray
 from .step import PulseBatch, PulseStep, Role, Setup
 
 DETECTION = Purpose(4, "energy noise of a return")
@@ -16,9 +16,9 @@ LOSS = Purpose(5, "whether a return is lost")
 
 
 class DetectionStep(PulseStep):
-    """Drops weak returns of waveforms, and a random share of all returns, `Noise.dropout`.
+    """Drops weak returns found in waveforms, and a random share of all returns (`Noise.dropout`).
 
-    Without waveforms, `SeparationStep` drops the returns by the same function, `detected`.
+    Without waveforms, `SeparationStep` drops returns with the same function, `detected`.
     """
 
     role = Role.CHANGES
@@ -27,35 +27,38 @@ class DetectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the noise can lose returns and returns are found in waveforms."""
+        """Return True if returns are found in waveforms and can be lost because of noise."""
         return setup.noise.loses and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the detected returns."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        detected_mask = detected(self.setup.noise, returns.height, scan, ray, numbers(returns.ray))
+        detected_mask = detected(
+            self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)
+        )
         return returns.take(detected_mask)
 
 
 def detected(
     noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
 ) -> Bools:
-    """Return whether returns (n,) of some energy are detected: (n,).
+    """Return whether returns (n,) with the given energies are detected.
 
-    `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (number in the
-    scan) and `number` (number in the ray, from 0) are the keys of the random numbers.
+    `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (the ray's
+    number in its scan) and `number` (the return's number in its ray, from 0) are the keys of the
+    random numbers.
 
-    The signal with its normally distributed noise has to pass a threshold: at an energy equal to
-    the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a fifth of
-    the threshold 3 in 100,000.
+    The signal with normally distributed noise must exceed a threshold. If the energy equals the
+    threshold, half of the returns are detected; at 1.4 times this energy, 97.7 %; and at a fifth of
+    it, 3 in 100,000.
     """
     detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
     if noise.detection_range_m is not None:
-        detected_mask &= passes(noise, DETECTION, energy, scan, ray, number)
+        detected_mask &= exceeds_threshold(noise, DETECTION, energy, scan, ray, number)
     return detected_mask
 
 
-def passes(
+def exceeds_threshold(
     noise: Noise,
     purpose: Purpose,
     energy: Floats,
@@ -63,9 +66,9 @@ def passes(
     ray: Integers,
     number: ArrayLike = 0,
 ) -> Bools:
-    """Return whether signals (n,) with their noise pass the threshold: (n,).
+    """Return whether signals (n,) with noise exceed the threshold.
 
-    The arguments are as in `detected`; the random numbers of the noise are of a purpose.
+    The arguments are the same as in `detected`, with a purpose for the random numbers.
     """
     signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
     return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

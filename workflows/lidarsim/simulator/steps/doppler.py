@@ -1,8 +1,8 @@
-"""Radial velocities: growth of the range of each return, as a coherent lidar measures it.
+"""Radial velocities: the rate of change of each return's range, as a coherent lidar measures it.
 
-The velocity of the hit point minus the velocity of the ray's origin, along the ray, which the
-Doppler shift 2 v / wavelength of FMCW lidars shows (Hexsel, Vhavle and Chen 2022). Both are
-derivatives of the trajectories' curves (`lidarsim.motion.trajectory.velocities`).
+This is the velocity of the hit point minus the velocity of the ray's origin, projected on the ray.
+FMCW lidars measure it from the Doppler shift 2 v / wavelength (Hexsel, Vhavle and Chen 2022). Both
+velocities are derivatives of trajectories (`lidarsim.motion.trajectory.velocities`).
 """
 
 from __future__ import annotations
@@ -11,36 +11,36 @@ import numpy as np
 
 from ...base.arrays import Floats, Integers, Ints, Ints32
 from ...base.random_numbers import Purpose
-from ...base.vectors import products
+from ...base.vectors import dot
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 
 VELOCITY = Purpose(40, "radial velocity noise of a return")
-BLOCK_HITS = 1 << 13  # hits that are computed at a time, to fit a cache
+BLOCK_HITS = 1 << 13  # number of hits that are computed at a time, to fit a cache
 
 
 def range_rates_of_origins(
     poses: CastPoses, ray: Integers, origins: Floats, directions: Floats
 ) -> Floats:
-    """Return the growth of the ranges of static points by the motion of the carrier, m/s: (n,).
+    """Return the range rates of static points due to the motion of the platform, in m/s.
 
     `ray` (n,) are numbers of rays in the order of `poses`. Origins and unit directions of the rays
-    are (n, 3), in the scene frame.
+    have shape (n, 3) and are in the scene frame.
     """
     rates = np.zeros(len(ray))
-    if poses.carrier is None:
+    if poses.platform is None:
         return rates
     origins = np.broadcast_to(origins, directions.shape)
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
-        drift = poses.drift(ray[block], origins[block])
-        rates[block] = -products(drift.T, directions[block].T)
+        drift = poses.platform_velocities(ray[block], origins[block])
+        rates[block] = -dot(drift.T, directions[block].T)
     return rates
 
 
 def radial_velocities(
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     poses: CastPoses,
     ray: Integers,
     rays: tuple[Floats, Floats],
@@ -48,20 +48,20 @@ def radial_velocities(
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the radial velocities, growth of length, of rays (n,) to triangles, m/s: (n,).
+    """Return the radial velocities of the end points of rays, in m/s, positive if receding.
 
     Parameters
     ----------
     ray
         (n,): numbers of the rays in the order of `poses`.
     rays
-        Origins and unit directions of the rays, (n, 3) each, in the scene frame.
+        Origins and unit directions of the rays, each (n, 3), in the scene frame.
     distance
-        (n,): lengths of the rays, meters; without noise.
+        (n,): lengths of the rays in meters, without noise.
     triangle
-        (n,): triangles at the ends; ends in the air, -1, are at rest.
+        (n,): triangles at the end points. A point in the air, with triangle -1, is static.
     times
-        (n,): firing times, nanoseconds since the survey's start; for actors.
+        (n,): firing times in nanoseconds since the start of the survey, for actors.
     """
     origins, directions = rays
     rates = range_rates_of_origins(poses, ray, origins, directions)
@@ -69,22 +69,22 @@ def radial_velocities(
         velocity = velocities_of_ends(
             surfaces, poses.actor_trajectories, rays, distance, triangle, times
         )
-        rates += products(velocity.T, directions.T)
+        rates += dot(velocity.T, directions.T)
     return rates
 
 
 def velocities_of_ends(
-    surfaces: Surfaces,
+    surfaces: SceneSurfaces,
     actor_trajectories: ActorTrajectories,
     rays: tuple[Floats, Floats],
     distance: Floats,
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the velocities of actors' surfaces at the ends of rays, scene frame, m/s: (n, 3).
+    """Return the velocities of actors' surfaces at the ends of rays, in m/s, in the scene frame.
 
-    `rays` are origins and unit directions (n, 3) in the scene frame; `distance` (n,) is in meters,
-    `times` (n,) are firing times in nanoseconds since the survey's start.
+    `rays` are origins and unit directions (n, 3) in the scene frame. `distance` (n,) is in meters,
+    and `times` (n,) are firing times in nanoseconds since the start of the survey.
     """
     directions = rays[1]
     end_velocities = np.empty(rays[1].shape)

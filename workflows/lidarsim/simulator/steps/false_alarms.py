@@ -1,4 +1,4 @@
-"""False alarms: noise of a receiver that passes its threshold."""
+"""False alarms: receiver noise that exceeds the detection threshold."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...base.random_numbers import Purpose, uniform
 from ...columns.table import CAUSES
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import LIGHT_M_NS
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
+from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 FALSE_ALARM = CAUSES.index("false alarm")
@@ -21,11 +21,11 @@ PEAK = Purpose(21, "energy of a false alarm")
 
 
 class FalseAlarms(NamedTuple):
-    """False alarms of rays: arrays (k,)."""
+    """False alarms of rays, as arrays of shape (k,)."""
 
-    row: Indices  # row of the rays of the alarms
-    time_s: Floats  # since the receiver opened, seconds
-    energy: Floats  # energy on the scale of `Noise.threshold`
+    row: Indices  # rows of the rays that have the alarms
+    time_s: Floats  # time since the receiver opened, seconds
+    energy: Floats  # on the scale of `Noise.threshold`
 
 
 class FalseAlarmStep(PulseStep):
@@ -44,17 +44,17 @@ class FalseAlarmStep(PulseStep):
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of false alarms while the receiver waits for a pulse."""
         return setup.noise.false_alarm_hz * setup.sensor.gate_s
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of a cause for each return, and of the rays, in bytes."""
+        """Return the memory of the rays and of a cause for each return, in bytes."""
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch and the false alarms of its rays."""
+        """Return the returns of a batch together with the false alarms of its rays."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(rays)
@@ -63,15 +63,15 @@ class FalseAlarmStep(PulseStep):
         alarm_returns = returns_without_surface(
             returns, rays[alarms.row], distance, alarms.energy, FALSE_ALARM
         )
-        return merged(returns, alarm_returns)
+        return merge_returns(returns, alarm_returns)
 
 
 def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> FalseAlarms:
-    """Sample false alarms of rays (n,), whose receivers are open for `gate_s` seconds.
+    """Sample false alarms of rays (n,) whose receivers are open for `gate_s` seconds.
 
-    False alarms come at the same rate at all times. Each is a maximum of the receiver's noise above
-    the threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
-    distribution (Rice 1944).
+    False alarms occur at a constant rate. Each is a maximum of the receiver noise above the
+    threshold; maxima of normally distributed narrowband noise follow a Rayleigh distribution
+    (Rice 1944).
     """
     ray_indices = np.arange(len(ray))
     since_s = np.zeros(len(ray))

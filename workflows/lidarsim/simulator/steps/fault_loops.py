@@ -1,4 +1,4 @@
-"""Loop over returns that faults of a sensor take: see losses.py."""
+"""Compiled loop that drops returns lost to sensor faults, see losses.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,18 +9,18 @@ from raybeam.compiled import compiled
 
 @compiled()
 def remaining(ray, times, spans, firing, channel, row_indices):
-    """Write the rows of returns that no fault takes, and return the number of rows.
+    """Write the rows of returns that no fault removes, and return the number of rows.
 
-    Rays `ray` (n,), in order, have firing times `times` (n,), nanoseconds. Each of f faults acts in
-    a half-open span of times, `spans` (f, 2), and takes returns by masks of firings (f, firings)
-    and channels (f, channels).
+    `ray` (n,) are sorted ray numbers, and `times` (n,) are firing times in nanoseconds. Each of f
+    faults acts in a half-open time interval, `spans` (f, 2), on the firings and channels in the
+    masks `firing` (f, firings) and `channel` (f, channels).
     """
     channels = channel.shape[1]
     count = 0
     number = 0
     begin = 0
     for k in range(len(ray)):
-        while ray[k] >= begin + channels:  # rays follow each other
+        while ray[k] >= begin + channels:  # rays are sorted
             number += 1
             begin += channels
         lost = False

@@ -1,8 +1,8 @@
-"""Media within closed surfaces: refraction and attenuation, and leaves that light meets by chance.
+"""Media within closed surfaces: refraction, attenuation, and leaves that light hits at random.
 
-Directions follow Snell's law, energies Fresnel's equations, Beer and Lambert's law, and the beam's
-widening: ray differentials (Igehy 1999) say how large an area a cone of light is at its end. Leaves
-are met after an exponentially distributed optical depth (Ross 1981).
+Directions follow Snell's law. Energies follow Fresnel's equations, the Beer-Lambert law, and the
+divergence of the beam, for which ray differentials (Igehy 1999) track the cross-section of a cone
+of light. Light hits a leaf after an exponentially distributed optical depth (Ross 1981).
 """
 
 from __future__ import annotations
@@ -16,52 +16,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
-from raybeam.sub_rays import any_axes
+from raybeam.sub_rays import perpendicular_axes
 
 from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ...base.elementary import exp, log
 from ...base.elementary_scalars import log_of
 from ...base.errors import LidarError
 from ...base.random_numbers import Purpose
-from ...base.vectors import applied, products
+from ...base.vectors import dot, matvec
 from ...media.leaves import brightness, projection
 from ...media.materials import MaterialTable, fresnel
 from ...scene.scene import Scene
 from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, Clock
+from ..casting.motion import CastPoses, FiringClock
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
-from ..returns import selected
+from ..casting.surfaces import SceneSurfaces
+from ..returns import select_rows
 
 LEAF = Purpose(30, "depth to which light penetrates leaves")
 CROWN = Purpose(31, "crown that a leaf belongs to, where crowns overlap")
-MAX_MEDIA = 8  # media around a point that are stored
-MAX_PROBES = 256  # surfaces that a search for the media around a point passes
-UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # direction of search, unlike edges of usual models
+MAX_MEDIA = 8  # number of media around a point that are stored
+MAX_PROBES = 256  # number of surfaces that a search for the media around a point can pass
+UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # search direction, not parallel to common edges
 
-# Random bits of rays for a purpose: (n,).
+# Function that returns random bits of rays (n,) for a purpose.
 Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
 class MediaRays(NamedTuple):
-    """Light of sub-rays at its origin, and the trajectories of actors."""
+    """Light of sub-rays at its origins, and the trajectories of actors."""
 
     origins: Floats  # (n, 3): meters, scene frame
     directions: Floats  # (n, 3): unit vectors, scene frame
-    times: Floats  # (n,): nanoseconds, for the poses of actors
+    times: Floats  # (n,): nanoseconds, which determine the poses of actors
     actor_trajectories: ActorTrajectories
 
 
 @dataclass
 class MediaStack:
-    """Media around the light of sub-rays, the innermost first: (n, MAX_MEDIA), -1 for no medium."""
+    """Media around the light of sub-rays, innermost first. Shape (n, MAX_MEDIA); -1 for none."""
 
-    kinds: Ints32  # kinds of the surfaces of the media
-    triangles: Ints32  # through which the light entered
+    kinds: Ints32  # kinds of the media's surfaces
+    triangles: Ints32  # triangles through which the light entered
 
     @classmethod
-    def none(cls, count: int) -> MediaStack:
-        """Return the stacks of light in the air."""
+    def empty(cls, count: int) -> MediaStack:
+        """Return the stacks of light in air."""
         return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
     def __getitem__(self, row_indices: Integers) -> MediaStack:
@@ -69,7 +69,7 @@ class MediaStack:
         return MediaStack(self.kinds[row_indices], self.triangles[row_indices])
 
     def enter(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium within the media around light: a medium for each selected row.
+        """Add a medium inside the current media of each selected row.
 
         A full stack loses its outermost medium.
         """
@@ -78,14 +78,14 @@ class MediaStack:
             table[row_indices, 0] = values
 
     def surround(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium around the media of selected rows, while full stacks stay as they are."""
+        """Add a medium around the current media of each selected row, unless its stack is full."""
         depth = (self.kinds[row_indices] >= 0).sum(axis=1)
         free = depth < MAX_MEDIA
         self.kinds[row_indices[free], depth[free]] = kinds[free]
         self.triangles[row_indices[free], depth[free]] = triangles[free]
 
     def leave(self, row_indices: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stacks of rows, and return False for rows without it."""
+        """Remove a medium from the stacks of rows, and return False for rows without the medium."""
         matches = self.kinds[row_indices] == kinds[:, None]
         in_stack = matches.any(axis=1)
         row_indices = row_indices[in_stack]
@@ -100,38 +100,37 @@ class MediaStack:
 
 @dataclass
 class RayDifferentials:
-    """Refraction, attenuation and widening of the light of sub-rays: arrays (n, …)."""
+    """Refraction, attenuation and divergence of the light of sub-rays."""
 
     index: Floats  # (n,): refractive index at the light's position
     initial_index: Floats  # (n,): refractive index at the light's origin
-    attenuation_depth: Floats  # (n,): optical depth by attenuation, one way
-    position_derivatives: Floats  # (n, 2, 3): of the position, by the initial direction
-    direction_derivatives: Floats  # (n, 2, 3): of the direction, by the initial direction
+    attenuation_depth: Floats  # (n,): optical depth of the attenuation, one way
+    position_derivatives: Floats  # (n, 2, 3): derivatives with respect to the initial direction
+    direction_derivatives: Floats  # (n, 2, 3): derivatives with respect to the initial direction
 
     @classmethod
     def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
-        """Return the differentials of light at its origin, from directions (n, 3)."""
-        derivatives = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
+        """Return the differentials of light at its origin, from its directions (n, 3)."""
+        derivatives = np.stack([axis.T for axis in perpendicular_axes(directions.T)], axis=1)
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 
     def __getitem__(self, row_indices: Integers) -> RayDifferentials:
         """Return the differentials of selected sub-rays."""
-        return RayDifferentials(*selected(vars(self).values(), row_indices))
+        return RayDifferentials(*select_rows(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
-        """Move the light straight on by steps (n,), meters, through an attenuation (n,), 1/m."""
+        """Advance the light by steps (n,) in meters through an attenuation (n,) in 1/m."""
         shift = step[:, None, None] * self.direction_derivatives
         self.position_derivatives = self.position_derivatives + shift
         self.attenuation_depth = self.attenuation_depth + attenuation * step
 
     def energy_factor(self, directions: Floats, distance: Floats, extinction: float) -> Floats:
-        """Return the energy relative to light on a straight path of `distance` in the air: (n,).
+        """Return the energy relative to light on a straight path of the same length in air.
 
-        Light that is scattered at the end of a path reaches the receiver in proportion to the
-        receiver's area over the area of the cone of scattered light there. By reciprocity, the
-        latter is the area of the cone of the outgoing light, times the square of the refractive
-        index.
+        Light scattered at the end of a path reaches the receiver in proportion to the receiver's
+        area divided by the area of the cone of scattered light there. By reciprocity, the latter is
+        the area of the cone of outgoing light times the square of the refractive index.
         """
         first_axis, second_axis = self.position_derivatives.transpose(1, 2, 0)
         a, b, c = directions.T
@@ -140,26 +139,27 @@ class RayDifferentials:
         area = np.abs((y * w - z * v) * a + (z * u - x * w) * b + (x * v - y * u) * c)
         area *= (self.index / self.initial_index) ** 2
         spreading = distance**2 / np.maximum(area, 1e-12)
-        # Beyond the limit, the factor of the air itself is 0.
+        # Beyond the limit, the factor of the air alone is already 0.
         exponent = np.minimum(2 * (extinction * distance - self.attenuation_depth), 700.0)
         return np.asarray(spreading * exp(exponent))
 
     def deflect(
         self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools, index: Floats
     ) -> None:
-        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3).
+        """Update the differentials at flat surfaces that change directions.
 
-        `index` (n,) is the refractive index behind the surfaces, for light that is not mirrored.
+        Directions change from `incoming` to `outgoing` (n, 3). `index` (n,) is the refractive index
+        behind the surfaces, for light that is not reflected.
         """
-        incoming_cosine = _away_from_zero(products(incoming.T, normals.T))
-        outgoing_cosine = _away_from_zero(products(outgoing.T, normals.T))
-        # Neighboring rays meet the plane of the surface before or behind the central ray.
-        shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
+        incoming_cosine = _away_from_zero(dot(incoming.T, normals.T))
+        outgoing_cosine = _away_from_zero(dot(outgoing.T, normals.T))
+        # Neighboring rays cross the plane of the surface before or after the central ray.
+        shift = matvec(self.position_derivatives, normals) / incoming_cosine[:, None]
         self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
-        # A mirror turns the component along the normal round: it changes by twice its size.
+        # A mirror reverses the component along the normal, which changes it by twice its size.
         bend = np.where(mirrored, 2.0, ratio - ratio**2 * incoming_cosine / outgoing_cosine)
-        slope = bend[:, None] * applied(self.direction_derivatives, normals)
+        slope = bend[:, None] * matvec(self.direction_derivatives, normals)
         derivatives = ratio[:, None, None] * self.direction_derivatives
         self.direction_derivatives = derivatives - slope[..., None] * normals[:, None]
         self.index = np.where(mirrored, self.index, index)
@@ -168,26 +168,30 @@ class RayDifferentials:
 class Media:
     """The media of a scene.
 
-    `table` are the materials at the wavelength of the light, and `air_extinction` is the extinction
-    of the scene's air, 1/m.
+    `table` has the materials at the wavelength of the light, and `air_extinction` is the extinction
+    of the scene's air in 1/m.
     """
 
     def __init__(
-        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air_extinction: float = 0.0
+        self,
+        scene: Scene,
+        surfaces: SceneSurfaces,
+        table: MaterialTable,
+        air_extinction: float = 0.0,
     ) -> None:
         self._surfaces = surfaces
         self.air_extinction = air_extinction
-        self.filled = table.leafy | table.refracts  # surfaces that enclose a medium
+        self.filled = table.leafy | table.refracts  # kinds of surfaces that enclose a medium
         self.leafy = bool(table.leafy.any())
         self.refracts = bool(table.refracts.any())
-        self.mirrors = table.refracts & (table.specular > 0)  # surfaces that refract and mirror
+        self.mirrors = table.refracts & (table.specular > 0)  # refracting and reflecting surfaces
         self.grids = surfaces.grids
         self.instances = surfaces.triangles.instances
         owners = surfaces.triangle_kinds.material_kinds.object
-        # (kinds + 1,): whether the leaves are in grids of voxels; the last entry is of kind -1.
+        # (kinds + 1,): whether the leaves are in voxel grids; the last entry is for kind -1.
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
-        # The value of the kind -1, no surface, is 0: the last entry.
+        # The last entry, for kind -1 (no surface), is 0.
         self._area, self._index, self._attenuation = (
             np.append(values, 0.0)
             for values in (table.leaf_area, table.refractive_index, table.attenuation)
@@ -201,8 +205,8 @@ class Media:
                     "leaf_area_density, but its surface has gaps. Use a closed surface, such as a "
                     "box or a sphere."
                 )
-        # Boxes that may put sensors within media. A surface of water that is an open sheet has
-        # water below at any depth; an actor that holds a medium may be anywhere.
+        # Boxes in which sensors may be inside media. The surface of water may be an open sheet with
+        # water at any depth below it, and an actor that contains a medium may be anywhere.
         is_static = owners < len(scene.object_bounds)
         static_kinds = np.flatnonzero(self.filled & is_static)
         bounds = scene.object_bounds[owners[static_kinds]]
@@ -212,15 +216,15 @@ class Media:
         self._bounds = bounds
         if self.leafy:
             for angle in self._angles:
-                projection(angle, np.ones(1))  # computes and caches the table of the angle
+                projection(angle, np.ones(1))  # computes and caches the table for this angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
-        """Return whether light enters bodies: (n,), by `cosines` between normals and light."""
+        """Return whether light enters bodies, given the cosines between normals and light (n,)."""
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
     def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
         """Return the media around the origins of light."""
-        stack = MediaStack.none(len(rays.origins))
+        stack = MediaStack.empty(len(rays.origins))
         in_bounds = np.zeros(len(rays.origins), np.bool_)
         if not len(in_bounds):
             return stack
@@ -232,7 +236,7 @@ class Media:
         ray_indices = np.flatnonzero(in_bounds)
         if not len(ray_indices):
             return stack
-        # Most rays start at the same position and time as the ray before.
+        # Most rays start at the same position and time as the previous ray.
         origins = rays.origins[ray_indices]
         times = rays.times[ray_indices]
         first_of_run = np.ones(len(ray_indices), np.bool_)
@@ -254,10 +258,10 @@ class Media:
     ) -> MediaStack:
         """Find the media around origins (n, 3) by casting rays upwards.
 
-        A medium that a ray leaves without having entered it is around the origin of the ray.
+        If a ray leaves a medium that it has not entered, its origin is inside this medium.
         """
-        surrounding = MediaStack.none(len(origins))
-        entered = MediaStack.none(len(origins))
+        surrounding = MediaStack.empty(len(origins))
+        entered = MediaStack.empty(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
         probe_indices = np.arange(len(origins))
         skip_m = caster.clear_m / up[2]
@@ -265,13 +269,15 @@ class Media:
             if not len(probe_indices):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
+            poses = CastPoses(
+                np.zeros(3), clock=FiringClock(times, np.zeros(1), actor_trajectories)
+            )
             hits = caster.scan(light, poses)
             probe_indices = probe_indices[hits.ray]
             times = times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + skip_m) * up
             normals = self._surfaces.normals(hits.triangle, times, actor_trajectories)
-            cosines = products(normals.T, up[:, None])
+            cosines = dot(normals.T, up[:, None])
             self._cross_probes(entered, surrounding, probe_indices, hits.triangle, cosines)
         return surrounding
 
@@ -283,7 +289,7 @@ class Media:
         triangles: Ints32,
         cosines: Floats,
     ) -> None:
-        """Update the stacks of a search for the probes that cross triangles, by their indices."""
+        """Update the search stacks for probes that cross triangles."""
         kinds = self._surfaces.kinds(triangles)
         at_medium = self.filled[kinds]
         entering = self.enters(kinds, cosines) & at_medium
@@ -296,9 +302,9 @@ class Media:
     def initial_state(
         self, caster: SceneCaster, rays: MediaRays, depths: Floats | None
     ) -> LightInMedia:
-        """Return the state of the light of `rays` (n,) at its origin.
+        """Return the state of the light of n rays at its origins.
 
-        `depths` (n,) are the optical depths at which light meets a leaf; None without leaves.
+        `depths` (n,) are the optical depths at which light hits a leaf, or None without leaves.
         """
         stack = self.stack_at(caster, rays)
         differentials = (
@@ -309,19 +315,19 @@ class Media:
         return LightInMedia(self, stack, differentials, depths)
 
     def index(self, stack: MediaStack) -> Floats:
-        """Return the refractive index of the innermost medium with an index: (n,)."""
+        """Return the refractive index of the innermost refracting medium."""
         indices = self._index[stack.kinds]
         return _first_masked(indices, indices > 0, 1.0)
 
     def attenuation(self, stack: MediaStack) -> Floats:
-        """Return the extinction, 1/m: (n,): of the innermost refracting medium, or of the air."""
+        """Return the extinction in 1/m of the innermost refracting medium, or of the air."""
         refracts = self._index[stack.kinds] > 0
         return _first_masked(self._attenuation[stack.kinds], refracts, self.air_extinction)
 
-    def behind(
+    def stack_behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
-        """Return the media behind surfaces (n,), by `cosines` between normals and light."""
+        """Return the media behind surfaces (n,), given the cosines between normals and light."""
         behind = stack[np.arange(len(kinds))]
         enters = self.enters(kinds, cosines)
         filled = self.filled[kinds]
@@ -332,10 +338,10 @@ class Media:
         return behind
 
     def density(self, stack: MediaStack, upright: Floats) -> Floats:
-        """Return the optical depth of leaves per meter, in each medium around light.
+        """Return the optical depth of leaves per meter in each medium around the light.
 
-        `upright` (n,) are cosines between the light and the vertical, 0 to 1. Returns
-        (n, MAX_MEDIA); for grids of voxels, values are for a leaf area density of 1 m²/m³.
+        `upright` (n,) are cosines between the light and the vertical, from 0 to 1. The result has
+        shape (n, MAX_MEDIA). For voxel grids, the values are for a leaf area density of 1 m²/m³.
         """
         density = self._area[stack.kinds]
         if density.any():
@@ -345,10 +351,10 @@ class Media:
         return density
 
     def leaf_cosines(self, kinds: Ints32, upright: Floats) -> Floats:
-        """Return the mean cosine between light and the normals of the leaves that it hits: (n,).
+        """Return the mean cosine between light and the normals of the leaves that it hits.
 
-        `kinds` (n,) are kinds of crowns (closed surfaces with leaves), and `upright` (n,) cosines
-        between the light and the vertical, 0 to 1.
+        `kinds` (n,) are kinds of crowns (closed surfaces with leaves). `upright` (n,) are cosines
+        between the light and the vertical, from 0 to 1.
         """
         cosines = np.ones(len(kinds))
         for number, angle in enumerate(self._angles):
@@ -357,36 +363,37 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light among all light that passes grids of voxels: arrays (k,)."""
+    """Light that passes voxel grids, as arrays of shape (k,)."""
 
     row_indices: Indices  # rows of the light
-    meters: Floats  # meters to the leaf that the light meets; inf without a leaf
-    remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
-    # (k, MAX_MEDIA): optical depth per meter; of a grid in the voxel where light meets a leaf, or 0
+    meters: Floats  # distance to the leaf that the light hits, or inf
+    remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if light hits a leaf
+    # (k, MAX_MEDIA): optical depth per meter; for a grid, in the voxel where light hits a leaf, or
+    # 0
     density: Floats
 
 
 class Refraction(NamedTuple):
-    """Light behind surfaces: arrays (n,), vectors (n, 3)."""
+    """Light behind surfaces. Arrays (n,), vectors (n, 3)."""
 
     directions: Floats
-    # Share of the light, on one way: transmitted, or mirrored where light is reflected.
+    # Share of the light, one way: transmitted light, or reflected light where light is reflected.
     shares: Floats | float
-    totally_reflected: Bools  # their directions are as if there were no surface
+    totally_reflected: Bools  # whether light is totally reflected; its direction is then unchanged
 
 
 class Leaves(NamedTuple):
-    """Leaves that light meets: arrays (k,)."""
+    """Leaves that light hits, as arrays of shape (k,)."""
 
     row_indices: Indices  # rows of the light
-    meters: Floats  # meters from the start of the span to the leaf
-    triangles: Ints32  # through which the light entered the crown
-    cosines: Floats  # mean cosine between light and leaves
+    meters: Floats  # distance from the start of the span to the leaf
+    triangles: Ints32  # triangles through which the light entered the crown
+    cosines: Floats  # mean cosine between light and leaf normals
 
 
 @dataclass
 class LightInMedia:
-    """State of light in media: stack of media, refraction, and optical depth to a leaf."""
+    """State of light in media: media stack, refraction, and remaining optical depth to a leaf."""
 
     media: Media
     stack: MediaStack
@@ -397,7 +404,7 @@ class LightInMedia:
         """Return the state of selected sub-rays."""
         return LightInMedia(
             self.media,
-            *selected((self.stack, self.differentials, self.remaining_depth), row_indices),
+            *select_rows((self.stack, self.differentials, self.remaining_depth), row_indices),
         )
 
     @property
@@ -405,8 +412,8 @@ class LightInMedia:
         """Refractive index at the position of the light."""
         return 1.0 if self.differentials is None else self.differentials.index
 
-    def optical(self, step: Floats) -> Floats:
-        """Return the optical paths of steps (n,), meters."""
+    def optical_length(self, step: Floats) -> Floats:
+        """Return the optical path lengths of steps (n,) in meters."""
         return step if self.differentials is None else step * self.differentials.index
 
     def meet_leaves(
@@ -418,10 +425,11 @@ class LightInMedia:
         ray: Ints,
         draw: Draw,
     ) -> Leaves:
-        """Return the leaves that light meets between distances from its origins.
+        """Return the leaves that light hits between two distances from its origins.
 
-        Distances `starts_m` and `ends_m` are meters (n,), `ray` are numbers of sub-rays (n,), and
-        `draw` draws random bits that choose among crowns that overlap. Reduces `remaining_depth`.
+        The distances `starts_m` and `ends_m` (n,) are in meters, and `ray` (n,) are sub-ray
+        numbers. `draw` draws the random bits that choose between overlapping crowns. This reduces
+        `remaining_depth`.
         """
         if self.remaining_depth is None:
             no_rows = np.zeros(0, np.intp)
@@ -445,9 +453,9 @@ class LightInMedia:
     def _advance_to_leaves(
         self, density: Floats, length: Floats, passage: LightInGrids | None
     ) -> tuple[Indices, Floats]:
-        """Reduce the remaining depth over lengths (n,), meters, of a density (n,), 1/m.
+        """Reduce the remaining depth along paths of length (n,) in meters and density (n,) in 1/m.
 
-        Returns the rows of light that meets a leaf, and the meters to the leaf.
+        Returns the rows of light that hits a leaf, and the distances to the leaves in meters.
         """
         assert self.remaining_depth is not None
         depth = density * length
@@ -468,10 +476,11 @@ class LightInMedia:
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
     ) -> LightInGrids:
-        """Follow light through grids of voxels, and return the passage with new densities.
+        """Follow light through voxel grids, and return the passage with updated densities.
 
-        Light starts at `starts` (n, 3) and goes on for `length` (n,), meters. `density`
-        (n, MAX_MEDIA) is the optical depth per meter; of a grid for a leaf area density of 1 m²/m³.
+        The light starts at `starts` (n, 3) and travels `length` (n,) meters. `density` (n,
+        MAX_MEDIA) is the optical depth per meter; for a grid, it is given for a leaf area density
+        of 1 m²/m³.
         """
         grids = self.media.grids
         stack = self.stack
@@ -479,13 +488,14 @@ class LightInMedia:
         gridded = self.media.gridded[stack.kinds]
         row_indices = np.flatnonzero(gridded.any(axis=1))
         gridded = gridded[row_indices]
-        # Columns of the stack: grids first, as many columns as the most grids around any light.
+        # Order the columns of the stack with grids first, up to the largest number of grids of any
+        # ray.
         grid_layers = np.argsort(~gridded, axis=1, kind="stable")
         grid_layers = grid_layers[:, : gridded.sum(axis=1).max(initial=1)]
         is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
         triangles = np.take_along_axis(stack.triangles[row_indices], grid_layers, axis=1)
         media_density = np.where(gridded, 0, density[row_indices])
-        meters, remaining_depth, grid_density = grids.through(
+        meters, remaining_depth, grid_density = grids.follow(
             np.where(is_grid, self.media.instances(triangles), -1),
             starts[row_indices],
             directions=directions[row_indices],
@@ -501,12 +511,12 @@ class LightInMedia:
         return LightInGrids(row_indices, meters, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
-        """Move the light straight on by steps (n,), meters."""
+        """Advance the light by steps (n,) in meters."""
         if self.differentials is not None:
             self.differentials.advance(step, self.media.attenuation(self.stack))
 
     def energy_factor(self, directions: Floats, distance: Floats) -> Floats | float:
-        """Return the energy relative to light on a straight path of `distance` in the air: (n,)."""
+        """Return the energy relative to light on a straight path of the same length in air."""
         if self.differentials is None:
             return 1.0
         return self.differentials.energy_factor(directions, distance, self.media.air_extinction)
@@ -520,19 +530,19 @@ class LightInMedia:
         cosines: Floats,
         reflected: Bools,
     ) -> Refraction:
-        """Transmit light through surfaces (n,), or reflect the light of the mask `reflected`.
+        """Transmit light through surfaces (n,), or reflect it where `reflected` is True.
 
-        `cosines` are between normals and directions. Updates the stacks of media: transmitted light
-        enters or leaves a medium; reflected and totally reflected light stays in its media.
-        Reflected light keeps its direction here. At surfaces of `Media.mirrors`, mirrored light has
-        separate rows in `reflected`, so totally reflected light in other rows has the share 0.
+        `cosines` are cosines between normals and directions. This updates the media stacks:
+        transmitted light enters or leaves a medium, while reflected light stays in its media. The
+        direction of reflected light is not changed here. At surfaces in `Media.mirrors`, reflected
+        light has its own rows, so totally reflected light in the other rows gets the share 0.
         """
         stack_before = self.stack
-        self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
+        self.stack = self.media.stack_behind(self.stack, kinds, triangles, cosines)
         if self.differentials is None:
             return Refraction(directions, 1.0, np.zeros(len(kinds), np.bool_))
         ratio = self.media.index(self.stack) / self.differentials.index
-        refraction = refracted(directions, normals, cosines, ratio)
+        refraction = refract(directions, normals, cosines, ratio)
         keeps_media = refraction.totally_reflected | reflected
         self.stack.kinds[keeps_media] = stack_before.kinds[keeps_media]
         self.stack.triangles[keeps_media] = stack_before.triangles[keeps_media]
@@ -543,17 +553,18 @@ class LightInMedia:
         return Refraction(outgoing, shares, refraction.totally_reflected)
 
     def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
-        """Change directions at flat surfaces, from `incoming` to `outgoing` (n, 3)."""
+        """Update the differentials at flat surfaces that change directions (n, 3)."""
         if self.differentials is not None:
             self.differentials.deflect(
                 incoming, outgoing, normals, mirrored, self.media.index(self.stack)
             )
 
 
-def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
-    """Refract light at surfaces by Snell's law, with index behind over index before, `ratio` (n,).
+def refract(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
+    """Refract light at surfaces according to Snell's law.
 
-    Totally reflected light has the direction and share that it would have without a surface.
+    `ratio` (n,) is the refractive index behind the surface divided by the index in front of it.
+    Totally reflected light keeps the direction and share that it would have without the surface.
     """
     cosine = np.maximum(np.abs(cosines), 1e-9)
     squared_cosine = 1 - (1 - cosine**2) / ratio**2
@@ -569,19 +580,19 @@ def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Float
 
 
 def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
-    """Choose the crown of each leaf in proportion to the crowns' densities, by random bits (k,).
+    """Choose the crown of each leaf at random, in proportion to the crowns' densities.
 
-    `cumulative` (k, MAX_MEDIA) are cumulative sums of the densities of the media in the stacks.
-    Returns columns of `MediaStack`, (k,).
+    `bits` (k,) are random bits, and `cumulative` (k, MAX_MEDIA) are cumulative sums of the
+    densities of the media in the stacks. The result has columns of `MediaStack`.
     """
     share = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
     return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
 
 
-def depths(bits: NDArray[np.uint64]) -> Floats:
-    """Return exponentially distributed numbers of mean 1, from random bits: (n,).
+def random_depths(bits: NDArray[np.uint64]) -> Floats:
+    """Convert random bits (n,) to exponentially distributed numbers with mean 1.
 
-    The logarithm is computed from the binary exponent and a table of 32,768 logarithms: fast.
+    For speed, the logarithm is computed from the binary exponent and a table of 32,768 logarithms.
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     mantissa, exponent = np.frexp(share)
@@ -591,7 +602,7 @@ def depths(bits: NDArray[np.uint64]) -> Floats:
 
 @cache
 def _logs() -> Floats:
-    """Return negative logarithms of equal steps from 1/2 to 1, in single precision."""
+    """Return the negative logarithms of equal steps from 1/2 to 1, rounded to single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
 
@@ -602,7 +613,7 @@ def _away_from_zero(cosine: Floats) -> Floats:
 
 
 def _first_masked(values: Floats, mask: AnyArray, default: float) -> Floats:
-    """Return the first value of each row that is in the mask, or a default: (n,)."""
+    """Return the first value in each row where the mask is True, or a default."""
     column = mask.argmax(axis=1)
     row_indices = np.arange(len(values))
     return np.where(mask[row_indices, column], values[row_indices, column], default)

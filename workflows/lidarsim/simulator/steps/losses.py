@@ -1,4 +1,4 @@
-"""Faults of sensors: dirt on the window, and channels, packets and scans without returns."""
+"""Sensor faults: dirt on the window, and channels, packets and scans without returns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .step import PulseBatch, PulseStep, Role, Setup
 
 
 class DirtStep(PulseStep):
-    """Weakens light that passes a dirty part of the window."""
+    """Attenuates light that passes through a dirty part of the window."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -26,7 +26,7 @@ class DirtStep(PulseStep):
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return hits with energies behind the dirty window. They replace the hits of the batch."""
+        """Return the hits with energies reduced by dirt, which replace the hits of the batch."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))
@@ -46,19 +46,19 @@ class DirtStep(PulseStep):
 
 
 def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
-    """Return whether unit directions x, y, z (n,), sensor frame, pass a fault's dirt: (n,)."""
+    """Return whether unit directions (n,) in the sensor frame pass through the dirt of a fault."""
     begin, end = fault.azimuth_deg or (0, 360)
     half = ((end - begin) % 360 or 360) / 2
     lowest, highest = fault.elevation_deg or (-90, 90)
     sin, cos = sin_cos(np.radians((begin + half, half, lowest, highest)))
-    # Computing the angles of beams would take long; sines of a full circle are not exact.
+    # Computing beam angles would be slow. The tolerance allows for inexact sines of a full circle.
     in_spot = x * cos[0] + y * sin[0] >= cos[1] * hypot(x, y) - 1e-12
     in_spot &= (z >= sin[2] - 1e-12) & (z <= sin[3] + 1e-12)
     return in_spot
 
 
 class LossStep(PulseStep):
-    """Drops returns of dead channels, lost packets, and scans that a frozen sensor has not made."""
+    """Drops returns of dead channels, lost packets, and scans missing from a frozen sweep."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -72,14 +72,15 @@ class LossStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns that are not lost."""
-        from . import fault_loops  # not before: numba takes half a second to import
+        from . import fault_loops  # imported here because numba takes half a second to import
 
         firings = batch.firings
         spec = batch.firings.spec
         seed = self.setup.noise.seed
-        # First scans of the sweep that a frozen sensor sends again, and of the sweep it replaces.
+        # First scans of the sweep that a frozen sensor sends again, and of the sweep that it
+        # replaces.
         first_sent_again, first_replaced = spec.repeats or (spec.ahead, 0)
-        if spec.ahead != first_sent_again - first_replaced:  # the sweep sent again has no such scan
+        if spec.ahead != first_sent_again - first_replaced:  # the repeated sweep has no such scan
             return returns.take(np.zeros(0, np.intp))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)

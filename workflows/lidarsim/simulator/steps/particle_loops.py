@@ -1,4 +1,4 @@
-"""Loops over pulses that sample the particles and the fog that beams meet: see air.py."""
+"""Compiled loops that sample the particles and the fog that beams meet, see particles.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -16,30 +16,30 @@ from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
 
 class ParticleTables(NamedTuple):
-    """Tables of a kind of particles that may be detected, as `air.DetectableParticles`."""
+    """Tables of a kind of detectable particles, as in `particles.DetectableParticles`."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
-    by_range: Floats  # (5, shares): rows as in `air.DetectableParticles.by_range`
-    step_mm: float  # diameter that exp(-1) of the particles exceed
+    by_range: Floats  # (5, shares): rows as in `particles.DetectableParticles.by_range`
+    step_mm: float  # diameter that a share exp(-1) of the particles exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 
 class FogTables(NamedTuple):
-    """Cells of fog that may be detected, as `air.FogCells`."""
+    """Cells of detectable fog, as in `particles.FogCells`."""
 
     begin_m: float  # range of the first cell
     end_m: float  # range where fog ends
     cell_m: float  # length of a cell
-    energies: Floats  # (cells,): received of the fog in a cell
-    peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities (`air.FogCells.peaks`)
+    energies: Floats  # (cells,): energy received from the fog in each cell
+    peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities (`particles.FogCells.peaks`)
 
 
 @inlined
 def write_particle(ray, column, quantile, subrays, tables, hits, row):
-    """Write the hit of a particle, on a sub-ray, to a row of `hits`, `SampledHits`.
+    """Write the hit of a particle on a sub-ray to a row of `hits`, a `SampledHits`.
 
-    `column` is the particle's in `tables.by_range`. The `quantile`, in [0, 1), is the quantile of
-    the particle's diameter among particles that may be detected there.
+    `column` is the particle's column in `tables.by_range`. `quantile`, in [0, 1), is the quantile
+    of its diameter among the particles that can be detected at this range.
     """
     by_range = tables.by_range
     exponential = tables.exponential
@@ -54,11 +54,11 @@ def write_particle(ray, column, quantile, subrays, tables, hits, row):
 
 @compiled()
 def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
-    """Sample the particles of a kind that beams `beam` to `stop` meet, while `hits` has room.
+    """Sample the particles of a kind that beams `beam` to `stop` meet, until `hits` is full.
 
-    `tables` are `ParticleTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
-    that the light of each sub-ray reaches, meters. Writes `SampledHits`; returns the first beam
-    that is not sampled yet, and the number of hits.
+    `tables` is a `ParticleTables`, `keys` a `RandomKeys`, and `reach` (beams * subrays,) is the
+    range that the light of each sub-ray reaches, in meters. The function writes `SampledHits`, and
+    returns the first beam that has not been sampled and the number of hits.
     """
     starts = keys.starts
     count = 0
@@ -87,11 +87,11 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
 
 @compiled()
 def sample_fog(subrays, tables, keys, reach, hits):
-    """Sample the fog return of each beam into `hits`, and return their number.
+    """Sample the fog return of each beam into `hits`, and return the number of returns.
 
-    `tables` are `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
-    from the cell with the highest peak before its surface, the surface of its first sub-ray, in the
-    middle. A beam whose surface is nearer than the end of the first cell returns nothing.
+    `tables` is a `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
+    from the cell with the highest peak in front of its surface, which is the surface hit by its
+    first, central sub-ray. A beam whose surface is within the first cell returns nothing.
     """
     cells = len(tables.energies)
     count = 0
@@ -104,9 +104,9 @@ def sample_fog(subrays, tables, keys, reach, hits):
         scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
         scan = keys.scan + scan_index
         number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
-        # Row n of the table is n plus probabilities (`air.FogCells.peaks`).
+        # Row n of the table is n plus the probabilities (`particles.FogCells.peaks`).
         probability = fog_cells + uniform(keys.starts[0], scan, number_in_scan, 0)
-        cell = 0  # becomes the cell with the highest peak, by binary search
+        cell = 0  # the cell with the highest peak, found by binary search
         upper = cells
         while cell < upper:
             middle = (cell + upper) // 2

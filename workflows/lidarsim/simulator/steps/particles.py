@@ -1,7 +1,8 @@
 """Hits in the air: drops, flakes, fog and dust in front of surfaces.
 
-Which particles a beam meets follows from random numbers for each pulse alone. Only particles that
-the sensor may detect are drawn: the number is Poisson's, ranges and diameters are quantiles.
+The particles that a beam meets depend only on the random numbers of its pulse. Only particles that
+the sensor may detect are sampled: their number from a Poisson distribution, and their ranges and
+diameters as quantiles.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ...media.weather import reach as reach_of
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     SURFACE,
     Keys,
     Planes,
     PulseReturns,
-    joined,
-    numbers,
+    concatenate_returns,
+    number_within_ray,
     returns_without_surface,
 )
 from .doppler import range_rates_of_origins
@@ -48,32 +49,32 @@ PARTICLE_RANGE = Purpose(13, "range of a particle")
 PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that hits a particle")
 AIR = CAUSES.index("air")
-QUANTILES = 1 << 16  # equal shares of a distribution, in tables
-CACHED_TABLES = 32  # kept because a scanner builds its casters again whenever an object is moved
-MAX_FOG_CELLS = 255  # cells of half a pulse's length
-# Probabilities are summed up to so many standard deviations below and above the highest signal.
+QUANTILES = 1 << 16  # number of equal shares of a distribution in tables
+CACHED_TABLES = 32  # cached because a scanner rebuilds its casters whenever an object is moved
+MAX_FOG_CELLS = 255  # cells of half a pulse length
+# Probabilities are summed up to this many standard deviations below and above the highest signal.
 TAIL_SIGMAS = 6.0
 
 
 class DetectableParticles(NamedTuple):
-    """Distribution of the particles of a kind that may be detected."""
+    """Distribution of the detectable particles of a kind."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # (5, QUANTILES), a column for each equal share of the particles by range: ascending distances,
-    # meters; smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest));
-    # energies of a particle of 1 mm; and energies of a particle that fills the beam.
+    # (5, QUANTILES), with a column for each equal share of the particles by range: ascending
+    # distances in meters, smallest detectable diameters in mm, 1 - exp(-slope * (largest -
+    # smallest)), energies of a particle of 1 mm, and energies of a particle that fills the beam.
     by_range: Floats
-    step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
+    step_mm: float  # 1 / slope, the diameter that a share exp(-1) of the particles exceeds
 
 
 class FogCells(NamedTuple):
-    """Cells of half a pulse's length of fog that may be detected, from the sensor on."""
+    """Consecutive cells of detectable fog from the sensor on, each half a pulse long."""
 
     begin_m: float  # range of the first cell
     cell_m: float  # length of a cell
-    energy: Floats  # (cells,): received of the fog in a cell
-    # ((cells + 1) * cells,): cumulative probabilities that a cell has the highest peak of the first
-    # n cells: row n is n plus the probabilities.
+    energy: Floats  # (cells,): energy received from the fog in each cell
+    # ((cells + 1) * cells,): row n is n plus the cumulative probabilities that each cell has the
+    # highest peak among the first n cells.
     peaks: Floats
 
 
@@ -83,7 +84,7 @@ class WeatherStep(PulseStep):
     Raises
     ------
     LidarError
-        If a beam would return from too many particles.
+        If a beam would have returns from too many particles.
     """
 
     role = Role.CHANGES
@@ -100,7 +101,7 @@ class WeatherStep(PulseStep):
         PARTICLE_DIAMETER,
     )
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         sensor = setup.sensor
         noise = setup.noise
@@ -110,7 +111,7 @@ class WeatherStep(PulseStep):
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
         min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
-        # For each kind of particles; None where no particle can be detected.
+        # One entry per kind of particles; None if no particle of a kind can be detected.
         self.detectable_kinds = [
             _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
         ]
@@ -121,28 +122,30 @@ class WeatherStep(PulseStep):
             air, backscatter, noise.threshold, min_range_m, max_range_m, setup.half_pulse_m
         )
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
         """Return a copy for a scene with moved instances."""
-        return self.repointed(setup, surfaces)
+        return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the weather of the survey returns light that the sensor may detect."""
+        """Return True if the weather returns light that the sensor may detect."""
         return setup.survey.returns_light and setup.noise.detection_range_m is not None
 
     @staticmethod
-    def added(setup: Setup) -> float:
-        """Return the mean number of returns of particles and fog in a pulse."""
+    def added_returns(setup: Setup) -> float:
+        """Return the mean number of particle and fog returns per pulse."""
         backscatter = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
         return setup.survey.mean_particles(setup.number) + bool(backscatter)
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of sub-rays and of hits in the air, in bytes."""
-        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
+        return Memory(
+            casting=110 * sizes.subrays + 170 * WeatherStep.added_returns(setup) * sizes.beams
+        )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch after hits in the air are sampled."""
+        """Add hits in the air to the hits of a batch."""
         air_hits = self.sample_air_hits(
             returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
         )
@@ -153,11 +156,11 @@ class WeatherStep(PulseStep):
     def sample_air_hits(
         self, hits: PulseReturns, beams: tuple[int, int], keys: Keys, subrays: int
     ) -> PulseReturns | None:
-        """Sample the hits in the air before surfaces, of particles and of fog.
+        """Sample hits on particles and fog in the air in front of surfaces.
 
-        `beams` are the numbers of the first beam, and one past the last, as in `keys`. `hits` are
-        the hits of these beams on surfaces; each beam has `subrays` sub-rays. Hits in the air are
-        in the order of rays: sub-rays, numbered from the first of the first beam. Returns None if
+        `beams` are the number of the first beam and one past the last, as in `keys`. `hits` are the
+        surface hits of these beams; each beam has `subrays` sub-rays. The result is sorted by ray,
+        where rays are sub-rays numbered from the first sub-ray of the first beam. It is None if
         neither particles nor fog can be detected.
         """
         first, stop = beams
@@ -184,9 +187,9 @@ class WeatherStep(PulseStep):
         return air_hits
 
     def _refracting(self, hits: PulseReturns) -> Indices:
-        """Return rows of hits on surfaces of water and glass with a refractive index.
+        """Return rows of hits on surfaces of refracting water and glass.
 
-        Of each ray, the first, third, … such hits enter a body, the others leave it.
+        In each ray, the first, third, … of these hits enter a body, and the others leave it.
         """
         refracts = self.surfaces.at_wavelength(self._wavelength_nm).refracts
         if not refracts.any():
@@ -197,7 +200,7 @@ class WeatherStep(PulseStep):
         )
 
     def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether points at distances on rays (n,) are in water or glass: (n,)."""
+        """Return whether points at distances (n,) along rays are inside water or glass."""
         row_indices = self._refracting(hits)
         surface_ray = hits.ray[row_indices]
         surface_distance = hits.distance[row_indices]
@@ -210,10 +213,10 @@ class WeatherStep(PulseStep):
         return np.asarray(count % 2 == 1)
 
     def _fog_ends(self, hits: PulseReturns, reach: Floats) -> Floats:
-        """Return the ranges at which the fog before each sub-ray ends, (rays,), meters.
+        """Return the ranges in meters at which the fog in front of each sub-ray ends.
 
-        Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half of
-        the pulse's length: panes of glass do not end fog.
+        Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half
+        the pulse length. Panes of glass do not end fog.
         """
         row_indices = self._refracting(hits)
         if not len(row_indices):
@@ -223,7 +226,7 @@ class WeatherStep(PulseStep):
         exit_distance = np.full(len(row_indices), np.inf)
         same_ray = ray[1:] == ray[:-1]
         exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
-        enters = (numbers(ray) % 2 == 0) & (
+        enters = (number_within_ray(ray) % 2 == 0) & (
             exit_distance - surface_distance > self.setup.half_pulse_m
         )
         reach = reach.copy()
@@ -232,12 +235,12 @@ class WeatherStep(PulseStep):
 
 
 def light_reach(
-    materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
+    materials: MaterialTable, surfaces: SceneSurfaces, hits: PulseReturns, count: int
 ) -> Floats:
-    """Return ranges that the light of `count` sub-rays reaches, (count,), meters.
+    """Return the ranges in meters that the light of `count` sub-rays reaches.
 
-    The range is the distance of the last hit of a sub-ray on a surface. It is inf without a hit, or
-    if the last surface lets light pass. `hits.ray` are sub-rays, from 0.
+    This is the distance of a sub-ray's last surface hit. It is inf if there is no hit, or if the
+    last surface transmits light. `hits.ray` are sub-rays, numbered from 0.
     """
     ray = hits.ray
     end_distance = hits.distance
@@ -249,19 +252,19 @@ def light_reach(
         ray = ray[row_indices]
         end_distance = end_distance[row_indices]
     reach = np.full(count, np.inf)
-    reach[ray] = end_distance  # the last hit of a ray counts
+    reach[ray] = end_distance  # the last hit of each ray takes effect
     return reach
 
 
 def add_air_hits(
     setup: Setup, returns: PulseReturns, batch: PulseBatch, air_hits: PulseReturns
 ) -> PulseReturns:
-    """Return the hits of a batch after hits in the air are added.
+    """Return the hits of a batch after adding hits in the air.
 
-    With waveforms, the hits in the air are inserted before the hits on surfaces; else `batch.air`
-    receives the hits in the air, for `SeparationStep`.
+    With waveforms, hits in the air are inserted before the hits on surfaces. Otherwise they are
+    stored in `batch.air` for `SeparationStep`.
     """
-    if returns.velocity is not None:  # the air is at rest
+    if returns.velocity is not None:  # the air is static
         first_subray = batch.window[0]  # the batch's first row in `batch.beams`
         rays = batch.subray_poses.rays(batch.beams, air_hits.ray, first_subray)
         air_hits = air_hits._replace(
@@ -271,21 +274,21 @@ def add_air_hits(
         batch.hits, batch.planes = insert_air_hits(returns, batch.planes, air_hits)
         return batch.hits
     if batch.air is not None:
-        air_hits = joined([batch.air, air_hits])
+        air_hits = concatenate_returns([batch.air, air_hits])
         air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
     batch.air = air_hits
     return returns
 
 
 def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
-    """Return the keys of the random numbers of beams from number `first` on, for loops."""
+    """Return the random number keys of beams from number `first` on, for compiled loops."""
     from .random_loops import RandomKeys
 
     return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
 
 
 def room_for_hits(size: int) -> SampledHits:
-    """Return arrays that loops write up to `size` hits to."""
+    """Return arrays to which compiled loops write up to `size` hits."""
     from .pulse_loops import SampledHits
 
     return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
@@ -294,48 +297,48 @@ def room_for_hits(size: int) -> SampledHits:
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), meters."""
-    from . import particle_loops as air_loops  # not before: numba takes half a second to import
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,) in meters."""
+    from . import particle_loops  # imported here: numba takes half a second
 
     beams = len(reach) // subrays
-    tables = air_loops.ParticleTables(
-        detectable.counts, detectable.by_range, detectable.step_mm, exponential()
+    tables = particle_loops.ParticleTables(
+        detectable.counts, detectable.by_range, detectable.step_mm, exponential_quantiles()
     )
     beam = 0
     while beam < beams:
         hits = room_for_hits(2 * beams + len(detectable.counts))
-        beam, count = air_loops.sample_particles(
+        beam, count = particle_loops.sample_particles(
             beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
         )
         yield hits.first(count)
 
 
 def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
-    """Return a hit of fog for each beam that has fog, on its first sub-ray.
+    """Return a fog hit on the first sub-ray of each beam that has fog.
 
-    `reach` (rays,) is where fog ends on each sub-ray, meters.
+    `reach` (rays,) is the range in meters at which fog ends on each sub-ray.
     """
-    from . import particle_loops as air_loops
+    from . import particle_loops
 
     hits = room_for_hits(len(reach) // subrays)
-    tables = air_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
-    count = air_loops.sample_fog(subrays, tables, random, reach, hits)
+    tables = particle_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
+    count = particle_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)
 
 
 def insert_air_hits(
     hits: PulseReturns, planes: Planes | None, air_hits: PulseReturns
 ) -> tuple[PulseReturns, Planes | None]:
-    """Return hits and planes with the hits in the air inserted before the surfaces of their rays.
+    """Insert hits in the air before the surface hits of their rays, in both hits and planes.
 
-    The planes of hits in the air are 0; planes stay None.
+    Planes of hits in the air are 0. If `planes` is None, it stays None.
     """
     order = np.argsort(np.concatenate([air_hits.ray, hits.ray]), kind="stable")
     if planes is not None:
         no_vectors = np.zeros((len(air_hits.ray), 3))
         normals, directions = (np.concatenate([no_vectors, vectors])[order] for vectors in planes)
         planes = normals, directions
-    return joined([air_hits, hits]).take(order), planes
+    return concatenate_returns([air_hits, hits]).take(order), planes
 
 
 @lru_cache(CACHED_TABLES)
@@ -354,9 +357,10 @@ def _detectable(
 def seen_by_range(
     air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
 ) -> tuple[float, Floats] | None:
-    """Return the mean number of particles in a beam that return at least `min_energy`, and a table.
+    """Return the mean number of detectable particles in a beam, and their table by range.
 
-    The table is `DetectableParticles.by_range`. Returns None without such particles.
+    A particle is detectable if it returns at least `min_energy`. The table is
+    `DetectableParticles.by_range`. Returns None if no particle is detectable.
     """
     distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
     detectable = np.flatnonzero(air.rate(kind, min_energy, distance) > 0)
@@ -368,17 +372,17 @@ def seen_by_range(
     integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(integrals)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    distance = single(interp(shares, sums / sums[-1], distance))
+    distance = round_to_single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
     energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
     quantities = [smallest, larger, energy_of_1_mm, full_beam_energy]
-    return float(sums[-1]), np.stack([distance, *(single(row) for row in quantities)])
+    return float(sums[-1]), np.stack([distance, *(round_to_single(row) for row in quantities)])
 
 
 def _poisson(mean: float) -> Floats:
-    """Return the cumulative probabilities of 0, 1, … events of a mean number, ending with 1."""
+    """Return the cumulative Poisson probabilities of 0, 1, … events, ending with 1."""
     sums = []
     term = exp_of(-mean)
     count = 0
@@ -388,7 +392,7 @@ def _poisson(mean: float) -> Floats:
         count += 1
         term *= mean / count
         total += term
-    return single(np.array([*sums, 1.0]))
+    return round_to_single(np.array([*sums, 1.0]))
 
 
 @lru_cache(CACHED_TABLES)
@@ -400,9 +404,9 @@ def _fog_cells(
     max_range_m: float,
     cell_m: float,
 ) -> FogCells | None:
-    """Return the cells of fog that may be detected, or None without such cells.
+    """Return the cells of detectable fog, or None if there are none.
 
-    `backscatter` of fog and dust is in 1/(m sr); `cell_m` is half of the pulse's length.
+    `backscatter` of fog and dust is in 1/(m sr), and `cell_m` is half the pulse length.
     """
     count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
     edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
@@ -411,19 +415,19 @@ def _fog_cells(
     if not len(energy):
         return None
     peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    peak_rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return FogCells(min_range_m, cell_m, single(energy), peak_rows.reshape(-1))
+    peak_rows = np.arange(len(energy) + 1)[:, None] + round_to_single(peaks)
+    return FogCells(min_range_m, cell_m, round_to_single(energy), peak_rows.reshape(-1))
 
 
 def highest_probabilities(signals: Floats) -> Floats:
-    """Return cumulative probabilities that a signal is the highest of the first n: (k + 1, k).
+    """Return cumulative probabilities that each signal is the highest of the first n.
 
-    The signals (k,) fall, and have noise of standard deviation 1. Row n is for the first n signals;
-    row 0 is 1.
+    `signals` (k,) are descending, with noise of standard deviation 1. Row n of the result (k + 1,
+    k) is for the first n signals; row 0 is 1.
     """
     count = len(signals)
     probabilities = np.ones((count + 1, count))
-    # The highest signal is about as high as the first, or somewhat higher.
+    # The highest signal is about as high as the first signal, or somewhat higher.
     levels = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
     normal = NormalDist()
     below = np.array([[normal.cdf(x - signal) for x in levels] for signal in signals])
@@ -437,16 +441,16 @@ def highest_probabilities(signals: Floats) -> Floats:
     return probabilities
 
 
-def single(table: Floats) -> Floats:
+def round_to_single(table: Floats) -> Floats:
     """Round a table to single precision.
 
-    In single precision, the error functions of different C libraries have the same results.
+    At this precision, the error functions of different C libraries give identical results.
     """
     return table.astype(np.float32).astype(np.float64)
 
 
 @cache
-def exponential() -> Floats:
-    """Return quantiles of the exponential distribution at the middles of equal shares."""
+def exponential_quantiles() -> Floats:
+    """Return the quantiles of the exponential distribution at the centers of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return single(-log1p(-shares))
+    return round_to_single(-log1p(-shares))

@@ -1,4 +1,4 @@
-"""Parts that loops over pulses share, where each loop is compiled on its first call."""
+"""Functions shared by the compiled loops over pulses. Each loop is compiled on first use."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -6,64 +6,64 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 
-SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between neighboring hits
+SLOPE = 0.5  # largest gap between planes of one surface, relative to the distance of the hits
 
 
 class SampledHits(NamedTuple):
-    """Arrays for loops to write sampled hits of sub-rays to: (k,) each."""
+    """Arrays of shape (k,) to which loops write sampled hits of sub-rays."""
 
     ray: Ints  # sub-ray
     distance: Floats  # meters
     energy: Floats
 
     def first(self, count: int) -> SampledHits:
-        """Return the first hits, which a loop has written."""
+        """Return the first `count` hits, which a loop has written."""
         return SampledHits(self.ray[:count], self.distance[:count], self.energy[:count])
 
 
-class Neighbors(NamedTuple):
+class SubrayNeighbors(NamedTuple):
     """Neighboring sub-rays of a beam, and planes of hits.
 
-    Without pairs no surface continues.
+    If there are no pairs, no surface continues from one sub-ray to the next.
     """
 
-    subrays: int  # number in a beam
+    subrays: int  # number of sub-rays per beam
     pairs: Ints  # (k, 2): neighboring sub-rays of a beam
-    normals: Floats  # (3, n): of the surfaces of hits
-    directions: Floats  # (3, n): of the rays of hits
+    normals: Floats  # (3, n): surface normals of the hits
+    directions: Floats  # (3, n): directions of the rays that hit
 
 
 class SurfaceMarks(NamedTuple):
-    """Marks of hits in the order of `PulseHits`: (n,) each."""
+    """Marks of hits in the order of `PulseHits`, each of shape (n,)."""
 
     solid: Bools  # whether the hit is on a surface that may continue
     starts_return: Bools  # whether a return starts at the hit
-    starts_surface: Bools  # False if the last hit's surface continues; may be `starts_return`
+    starts_surface: Bools  # False if the previous hit's surface continues; may be `starts_return`
 
 
 class PulseHits(NamedTuple):
-    """Hits of beams in the order of beams and distances, (n,) each, and scratch memory."""
+    """Hits sorted by beam and distance, each array of shape (n,), and scratch memory."""
 
     subray: Ints  # number among the sub-rays of all beams
     distance: Floats  # meters
-    row: Ints  # (n, 2): row among the hits of `Neighbors`, and scratch memory
-    subray_hits: Ints  # scratch memory (n * sub-rays of a beam,)
+    row: Ints  # (n, 2): row among the hits of `SubrayNeighbors`, and scratch memory
+    subray_hits: Ints  # scratch memory (n * sub-rays per beam,)
     changes: Ints  # scratch memory (n + 1,)
 
 
 @inlined
 def beam_of(ray, subrays):
-    """Return the beam of a sub-ray."""
-    return ray if subrays == 1 else ray // subrays  # a division takes as long as all else
+    """Return the beam that a sub-ray belongs to."""
+    return ray if subrays == 1 else ray // subrays  # the division would take most of the time
 
 
 @inlined
 def scan_row(scan_starts, beam, row):
-    """Return the row of the scan of a beam, searched from the row of an earlier beam."""
+    """Return the row of the scan that contains a beam, searching from an earlier beam's row."""
     while row + 1 < len(scan_starts) and scan_starts[row + 1] <= beam:
         row += 1
     return row
@@ -71,11 +71,12 @@ def scan_row(scan_starts, beam, row):
 
 @compiled()
 def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, return_counts):
-    """Count the returns of each scan, and write every `keep_every`-th return of a scan.
+    """Count the returns of each scan, and select every `keep_every`-th return of a scan.
 
-    Scans begin at rays `scan_starts`; their `hit_counts` are added to. Of kept returns, writes the
-    `row_indices`, the `number` in the pulse, from 1, and the number of returns of the pulse,
-    `return_counts`, both at most 255. Returns the number of kept returns.
+    Scans begin at the rays `scan_starts`, and their counts are added to `hit_counts`. For each kept
+    return, the function writes the row to `row_indices`, the number in the pulse (from 1) to
+    `number`, and the number of returns of the pulse to `return_counts`; the last two are at most
+    255. Returns the number of kept returns.
     """
     count = 0
     scan = 0
@@ -98,9 +99,9 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 @inlined
 def _half_way(hit, neighbor, inverse_distance, neighbors):
-    """Return the range of the plane of a hit half-way to a neighboring hit, meters.
+    """Return the range in meters of the plane of a hit, half-way to a neighboring hit.
 
-    `hit` and `neighbor` are rows in `Neighbors`; `inverse_distance` is of the hit, 1/m.
+    `hit` and `neighbor` are rows in `SubrayNeighbors`; `inverse_distance` belongs to `hit`, in 1/m.
     """
     normals = neighbors.normals
     directions = neighbors.directions
@@ -112,26 +113,27 @@ def _half_way(hit, neighbor, inverse_distance, neighbors):
     )
     hit_cosine = x * directions[0, hit] + y * directions[1, hit] + z * directions[2, hit]
     ratio = 1 + neighbor_cosine / hit_cosine
-    if ratio < 1e-9:  # and not if it is unknown
+    if ratio < 1e-9:  # False if the ratio is NaN
         ratio = 1e-9
     return 2 / (inverse_distance * ratio)
 
 
-@stage
+@noinline
 def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901, PLR0914 - a compiled loop
-    """Clear `marks.starts_surface` at hits of a beam where the last hit's surface continues.
+    """Clear `marks.starts_surface` where a hit of a beam continues the previous hit's surface.
 
-    The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,
-    `SurfaceMarks`; only `solid` hits are considered. Two neighboring sub-rays hit one surface if
-    the planes through the two hits meet half-way between the hits, within `gap_m` or half of the
-    distance between the hits. The inverse range of a plane is linear in the ray's direction, so two
-    hits on one plane always meet, whatever the angle; half of the distance allows for rough ground.
+    The hits of the beam are rows `begin` to `stop` of `hits`, a `PulseHits`, and of `marks`, a
+    `SurfaceMarks`; only `solid` hits are considered. Two neighboring sub-rays hit the same surface
+    if the planes through their hits meet half-way between the hits, within `gap_m` or within half
+    of the distance between the hits. The inverse range of a plane is linear in the ray's direction,
+    so two hits on one plane always meet, whatever the angle. The tolerance of half the distance
+    allows for rough ground.
 
-    A sub-ray may have several hits, each behind the panes of glass that it hit before: the hits of
-    neighboring sub-rays behind the same number of panes are compared.
+    A sub-ray may have several hits, each behind the panes of glass that it hit before. Hits of
+    neighboring sub-rays are compared if they are behind the same number of panes.
 
-    A beam of four sub-rays, with the pairs (0, 1), (1, 2) and (2, 3), has five hits. Sub-rays 0, 1
-    and 2 graze the ground, sub-ray 3 meets a post, and sub-ray 0 meets a raindrop on its way:
+    For example, a beam of four sub-rays with the pairs (0, 1), (1, 2) and (2, 3) has five hits.
+    Sub-rays 0, 1 and 2 graze the ground, sub-ray 3 hits a post, and sub-ray 0 also hits a raindrop:
 
     ==============================================  ======  ======  ======  ======  ======
     hit k                                           0 drop  1       2 post  3       4
@@ -146,9 +148,9 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
     `starts_surface`                                yes     yes     no      no      no
     ==============================================  ======  ======  ======  ======  ======
 
-    Pair (0, 1) clears the mark of the post as well: the post is between two hits of one surface.
-    The element of `changes` behind the last hit is -1 in the end. Pair (2, 3), ground and post, is
-    not on one surface. There are two returns, of the drop, and of the ground with the post.
+    Pair (0, 1) also clears the mark of the post, because the post is between two hits of one
+    surface. The element of `changes` after the last hit is finally -1. Pair (2, 3), ground and
+    post, is not on one surface. The result is two returns: the drop, and the ground with the post.
     """
     subrays = neighbors.subrays
     solid = marks.solid
@@ -162,8 +164,8 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
     panes = 0
     for k in range(count * subrays):
         subray_hits[k] = -1
-    # subray_hits: row of the hit of each sub-ray behind 0, 1, … panes of glass, or -1; a block of
-    # `subrays` for each number of panes.
+    # subray_hits: row of the hit of each sub-ray behind 0, 1, … panes of glass, or -1, in blocks of
+    # `subrays` elements for each number of panes.
     for k in range(begin, stop):
         changes[k - begin] = 0
         if solid[k]:
@@ -172,9 +174,9 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
                 pane += 1
             subray_hits[pane * subrays + hits.subray[k] % subrays] = k
             panes = max(panes, pane + 1)
-    changes[count] = 0  # changes[k]: change of the number of surfaces that continue at hit k
+    changes[count] = 0  # changes[k]: change in the number of surfaces that continue at hit k
     first_hit = begin
-    for k in range(begin, stop):  # row[k, 1]: the first hit of the return of hit k
+    for k in range(begin, stop):  # row[k, 1]: first hit of the return that hit k belongs to
         if starts_return[k]:
             first_hit = k
         row[k, 1] = first_hit

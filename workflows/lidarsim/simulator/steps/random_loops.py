@@ -1,4 +1,4 @@
-"""Random numbers for compiled loops: as `lidarsim.base.random_numbers`, number by number."""
+"""Random numbers for compiled loops, identical to those of `lidarsim.base.random_numbers`."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -12,7 +12,7 @@ from raybeam.compiled import inlined
 
 from ...base.arrays import AnyArray, Ints
 
-SHIFT_TO_INDEX = np.uint64(48)  # leaves the upper 16 of 64 bits, an index below 65,536
+SHIFT_TO_INDEX = np.uint64(48)  # keeps the upper 16 of 64 bits as an index below 65,536
 
 _30 = np.uint64(30)
 _27 = np.uint64(27)
@@ -21,14 +21,14 @@ _11 = np.uint64(11)
 _FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_NUMBERS = np.uint64(256)  # random numbers that a ray may have for a purpose
+_NUMBERS = np.uint64(256)  # largest number of random numbers of a ray for one purpose
 _NEXT = np.uint64(1)
 
 
 class RandomKeys(NamedTuple):
     """Keys of the random numbers of consecutive beams."""
 
-    starts: AnyArray  # uint64 (purposes,), as `random_numbers.starts`; empty without numbers
+    starts: AnyArray  # uint64 (purposes,), from `random_numbers.starts`; empty if none are needed
     scan: int  # number of the first scan
     scan_starts: Ints  # (scans,): number of the first beam of each scan
     first: int  # number of the first beam
@@ -36,7 +36,7 @@ class RandomKeys(NamedTuple):
 
 @inlined
 def _mixed(x):
-    """Return a 64-bit number after the last step of SplitMix64, as `random_numbers._mixed`."""
+    """Apply the last step of SplitMix64 to a 64-bit number, as `random_numbers._mixed` does."""
     x = (x ^ (x >> _30)) * _FIRST_FACTOR
     x = (x ^ (x >> _27)) * _SECOND_FACTOR
     return x ^ (x >> _31)
@@ -44,12 +44,12 @@ def _mixed(x):
 
 @inlined
 def bits(start, scan, ray, number):
-    """Return the 64 random bits of a purpose, by the start of its hashes, a ray and a number."""
+    """Return 64 random bits, determined by the hash start of a purpose, a ray and a number."""
     scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
     return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
 
 
 @inlined
 def uniform(start, scan, ray, number):
-    """Return a number uniform in [0, 1), a multiple of 2**-53."""
+    """Return a uniform random number in [0, 1), a multiple of 2**-53."""
     return np.float64(bits(start, scan, ray, number) >> _11) * 2.0**-53

@@ -1,4 +1,4 @@
-"""Errors of ranges: noise, of weak returns too, range walk, and lasting errors."""
+"""Range errors: noise, which is larger for weak returns, range walk, and lasting errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RangeNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns with their reported ranges."""
-        # The leading edge of a clipped pulse is the leading edge of the whole pulse.
+        # The leading edge of a clipped pulse is the same as that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)
         noise = self.setup.noise
@@ -51,11 +51,11 @@ def noisy_ranges(
     ray: Integers,
     number: Integers,
 ) -> Floats:
-    """Return the reported ranges of returns (n,), meters, at least 0.
+    """Return the reported ranges of returns (n,) in meters, which are at least 0.
 
-    `distance` (n,) is in meters; `energy` (n,) is the energy, or the height of the return in a
-    waveform, and may be None if neither noise nor walk depends on it. `scan`, `ray` and `number`
-    (n,) count scans, rays in the scan, and returns of the ray.
+    `distance` (n,) is in meters. `energy` (n,) is the energy, or the height of the return in a
+    waveform. It may be None if neither noise nor range walk depends on it. `scan`, `ray` and
+    `number` (n,) are the numbers of scans, of rays in their scan, and of returns in their ray.
     """
     sigma = noise.range_m + noise.range_per_m * distance
     if noise.range_at_threshold_m and energy is not None:
@@ -63,15 +63,15 @@ def noisy_ranges(
         sigma = np.sqrt(sigma * sigma + weak * weak)
     if noise.walk_m and energy is not None:
         distance = distance - range_walk(noise, energy)
-    if sigma.any():  # random numbers take time
+    if sigma.any():  # avoids the cost of drawing random numbers
         distance = distance + sigma * normal(noise.seed, RANGE, scan, ray, number)
     return np.maximum(distance, 0)
 
 
 def range_walk(noise: Noise, energy: Floats) -> Floats:
-    """Return by how much returns (n,) appear nearer than a return at the threshold, meters.
+    """Return by how many meters returns (n,) appear closer than a return at the threshold.
 
-    A Gaussian pulse that is `energy / threshold` times as high as a fixed threshold crosses the
+    A Gaussian pulse whose height is ``energy / threshold`` times a fixed threshold crosses the
     threshold √(2 ln(energy / threshold)) standard deviations before its maximum.
     """
     ratio = np.maximum(energy / noise.threshold, 1)
@@ -79,7 +79,7 @@ def range_walk(noise: Noise, energy: Floats) -> Floats:
 
 
 def lasting_errors(noise: Noise, channel: Integers, times_ns: Ints) -> Floats:
-    """Return lasting errors of range by channels (n,) and times since the survey's start, m."""
+    """Return the lasting range errors in meters for channels and times since the survey start."""
     biases = np.asarray(noise.channel_bias_m, np.float64)
     if not biases.ndim:
         channels = np.arange(channel.max(initial=0) + 1)

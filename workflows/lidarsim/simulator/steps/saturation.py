@@ -1,4 +1,4 @@
-"""Saturation: pulses that fill the receiver are clipped and wide, and hide close returns."""
+"""Saturation: pulses that saturate the receiver are clipped and widened, and hide near returns."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ...sensor.optics import FWHM, LIGHT_M_NS
 from ..returns import PulseReturns, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
-_HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width, in meters of range per ns of width
+_HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width in meters of range, per ns of width
 
 
 class SaturationStep(PulseStep):
-    """Clips and widens the pulses that fill the receiver, and joins pulses with hidden returns."""
+    """Clips and widens pulses that saturate the receiver, and merges them with hidden returns."""
 
     role = Role.RECEIVES
     effects = ("Saturation",)
@@ -24,12 +24,12 @@ class SaturationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the noise of the sensor has saturation."""
+        """Return True if the noise of the sensor includes saturation."""
         return setup.noise.saturation is not None
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of widths, amplitudes and joined returns, in bytes."""
+        """Return the memory of widths, amplitudes and merged returns, in bytes."""
         return Memory(retained=16 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
@@ -39,26 +39,26 @@ class SaturationStep(PulseStep):
         pulse_ns = setup.reporting.length_ns(optics)
         if setup.in_waveforms:
             pulse_ns = FWHM * setup.reporting.system_ns(optics)
-        return saturated(returns, setup.noise.full, pulse_ns)
+        return apply_saturation(returns, setup.noise.full, pulse_ns)
 
 
-def saturated(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
-    """Clip returns (n,) at the height `full`, and join returns that overlap clipped returns.
+def apply_saturation(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
+    """Clip returns (n,) at the height `full`, and merge returns that overlap clipped returns.
 
-    A Gaussian pulse of height A, clipped at S, is above S / 2 for √(1 + log2(A / S)) of its full
-    width at half maximum, `pulse_ns` unless a return has a width. With widths, as in waveforms, the
-    range of a clipped return is early by half of what clipping adds to its width: the receiver
-    measures its leading edge.
+    A Gaussian pulse of height A, clipped at S, exceeds S / 2 for √(1 + log2(A / S)) of its full
+    width at half maximum. This width is `pulse_ns` unless a return has its own width, as in
+    waveforms. In that case, the range of a clipped return is too short by half of the width that
+    clipping adds, because the receiver measures the leading edge.
     """
-    from . import saturation_loops  # not before: numba takes half a second to import
+    from . import saturation_loops  # imported here because numba takes half a second to import
 
     height = returns.height
     in_waveforms = returns.width is not None
     width = required(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
-    unclipped = np.where(width > 0, width, pulse_ns)  # returns without a waveform have the width 0
+    unclipped = np.where(width > 0, width, pulse_ns)  # without a waveform, the width is 0
     widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
     early_m = _HALF_WIDTH_M_NS * (widened - unclipped) if in_waveforms else 0.0
-    pulses = saturation_loops.Pulses(
+    pulses = saturation_loops.PulseExtents(
         ray=owned(returns.ray, np.int64),
         clipped=height > full,
         height=owned(height),

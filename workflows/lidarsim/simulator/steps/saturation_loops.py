@@ -1,4 +1,4 @@
-"""Loop that joins pulses which fill the receiver with hidden pulses: see saturation.py."""
+"""Compiled loop that merges saturating pulses with the pulses they hide, see saturation.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -11,11 +11,11 @@ from raybeam.compiled import compiled
 from ...base.arrays import Bools, Floats, Ints
 
 
-class Pulses(NamedTuple):
-    """Returns of pulses in the order of rays and distances: (n,) each."""
+class PulseExtents(NamedTuple):
+    """Returns of pulses sorted by ray and distance, each array of shape (n,)."""
 
     ray: Ints
-    clipped: Bools  # whether the return fills the receiver
+    clipped: Bools  # whether the return saturates the receiver
     height: Floats  # before clipping
     front: Floats  # leading edge of the return, meters
     back: Floats  # trailing edge of the return, meters
@@ -25,11 +25,11 @@ class Pulses(NamedTuple):
 
 @compiled()
 def join_clipped(pulses, remains):
-    """Join overlapping returns of a pulse where a return is clipped, and mark what remains.
+    """Merge overlapping returns of a pulse if one of them is clipped, and mark what remains.
 
-    Of joined returns the highest remains, with the energy of all joined returns, and with the
-    outermost edges and the smallest distance of the clipped returns. These are written to `pulses`,
-    `Pulses`, and marks to `remains` (n,).
+    The highest of the merged returns remains, with the total energy of all merged returns, and with
+    the outermost edges and the smallest distance of the clipped returns. These values are written
+    to `pulses`, a `PulseExtents`, and the marks to `remains` (n,).
     """
     height = pulses.height
     front = pulses.front

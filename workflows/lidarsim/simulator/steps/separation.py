@@ -1,4 +1,4 @@
-"""Returns of pulses: joins hits that a receiver cannot tell apart, and selects reported returns."""
+"""Combine hits that a receiver cannot separate into returns, and select reported returns."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from ..returns import (
     PulseReturns,
     required,
     returns_without_surface,
-    selected,
+    select_rows,
 )
 from .detection import DETECTION, LOSS
 from .step import PulseBatch, PulseStep, Role, Setup
 
 if TYPE_CHECKING:
-    from .pulse_loops import Neighbors
+    from .pulse_loops import SubrayNeighbors
     from .random_loops import RandomKeys
     from .separation_loops import Receiver, ReturnArrays, SubrayHits
 
-# In the order of the numbers in `separation_loops`.
+# In the order of the mode numbers in `separation_loops`.
 MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual", "two_strongest"
 _NO_VALUES = np.zeros(0)
 
@@ -40,12 +40,12 @@ class Reporting(NamedTuple):
     """Detection and selection of returns."""
 
     mode: Mode = "all"
-    noise: Noise | None = None  # noise that returns are lost by; None if all are detected
+    noise: Noise | None = None  # noise that makes returns undetected; None if all are detected
     keys: Keys | None = None
-    first: int = 0  # number, counted as in `keys`, of the beam of sub-ray 0 of the hits
+    first: int = 0  # number in `keys` of the beam to which sub-ray 0 of the hits belongs
 
 
-def separated(
+def separate_hits(
     hits: PulseReturns,
     gap_m: float,
     subrays: int = 1,
@@ -53,35 +53,35 @@ def separated(
     air: PulseReturns | None = None,
     reporting: Reporting | None = None,
 ) -> PulseReturns:
-    """Join the hits of each beam that a receiver cannot tell apart, and return the returns.
+    """Combine the hits of each beam that a receiver cannot separate into returns.
 
-    A beam's hits within `gap_m` of the next hit are a single return.
-
-    So are hits of neighboring sub-rays on one surface, however far apart the hits are: a beam that
-    grazes a road illuminates all of the road between the hits. The energy of a return is the sum
-    over the hits, the distance and velocity are means weighted by energy, the triangle and color
-    come from the strongest hit. Hits without energy are dropped.
+    Hits of a beam form a single return if each is within `gap_m` of the next. Hits of neighboring
+    sub-rays on one surface also form a single return, however far apart they are: a beam that
+    grazes a road illuminates the entire road between the hits. The energy of a return is the sum
+    over its hits, distance and velocity are energy-weighted means, and triangle and color come from
+    the strongest hit. Hits without energy are dropped.
 
     Parameters
     ----------
     hits
-        Hits of sub-rays on surfaces, in the order of sub-rays.
+        Hits of sub-rays on surfaces, sorted by sub-ray.
     gap_m
-        Half of the pulse's length, meters.
+        Half of the pulse length in meters.
     subrays
-        Sub-rays of a beam.
+        Number of sub-rays per beam.
     planes
-        Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+        Planes of the hits. If None, no surface continues from sub-ray to sub-ray.
     air
-        Hits in the air, in the order of sub-rays.
+        Hits in the air, sorted by sub-ray.
     reporting
-        Detection and selection; None if all returns are detected and reported.
+        Detection and selection. If None, all returns are detected and reported.
 
     Returns
     -------
-    The returns in the order of beams and distances; their `ray` is the beam.
+    PulseReturns
+        Returns sorted by beam and distance, whose `ray` is the beam.
     """
-    from . import separation_loops  # not before: numba takes half a second to import
+    from . import separation_loops  # imported here because numba takes half a second to import
 
     air_hits = PulseReturns.empty()._replace(energy=_NO_VALUES) if air is None else air
     reporting = reporting or Reporting()
@@ -111,7 +111,7 @@ def separated(
 
 
 def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity: bool) -> Receiver:
-    """Return the settings of a receiver for loops."""
+    """Return the settings of a receiver for compiled loops."""
     from .separation_loops import Receiver
 
     noise = reporting.noise
@@ -129,7 +129,7 @@ def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity
 
 
 def _detection_keys(reporting: Reporting) -> RandomKeys:
-    """Return the keys of detection for loops, without starts if no returns are lost."""
+    """Return the random number keys of detection, without starts if no returns are lost."""
     from .random_loops import RandomKeys
 
     noise = reporting.noise
@@ -146,11 +146,11 @@ def _detection_keys(reporting: Reporting) -> RandomKeys:
 
 
 def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -> PulseReturns:
-    """Return the columns of returns by their strongest hits, on surfaces or in the air."""
+    """Return the columns of returns from their strongest hits, on surfaces or in the air."""
     row = output.row
     if len(hits.ray):
         columns = hits.triangle, hits.color, hits.cause
-        triangle, color, cause = selected(columns, np.maximum(row, 0))
+        triangle, color, cause = select_rows(columns, np.maximum(row, 0))
         returns = PulseReturns(output.beam, output.distance, triangle, output.energy, color, cause)
     else:
         returns = returns_without_surface(
@@ -168,9 +168,9 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
 
 
 def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> SubrayHits:
-    """Return hits for loops, with velocities on request.
+    """Return hits for compiled loops, with velocities on request.
 
-    `solid` (n,) says whether hits are on surfaces; empty for hits in the air.
+    `solid` (n,) states whether each hit is on a surface. It is empty for hits in the air.
     """
     from .separation_loops import SubrayHits
 
@@ -184,23 +184,23 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
     )
 
 
-def neighbors_of(subrays: int, planes: Planes | None) -> Neighbors:
-    """Return neighboring sub-rays and planes for loops.
+def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
+    """Return neighboring sub-rays and planes for compiled loops.
 
-    Without planes no surface continues.
+    Without planes, no surface continues from sub-ray to sub-ray.
     """
-    from .pulse_loops import Neighbors
+    from .pulse_loops import SubrayNeighbors
 
     if planes is None or subrays == 1:
         no_planes = np.zeros((3, 0))
-        return Neighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
+        return SubrayNeighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
     normals, directions = planes
     pairs = owned(neighbors(subrays), np.int64)
-    return Neighbors(subrays, pairs, owned(normals.T), owned(directions.T))
+    return SubrayNeighbors(subrays, pairs, owned(normals.T), owned(directions.T))
 
 
 class SeparationStep(PulseStep):
-    """Makes returns of hits by their distances, and keeps the detected and reported returns."""
+    """Combines hits into returns by distance, and keeps the detected and reported returns."""
 
     role = Role.FRAME
     reads = "ray", "distance", "triangle", "energy", "velocity"
@@ -209,16 +209,16 @@ class SeparationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether rays may have no return or several, in a setup without waveforms."""
+        """Return True if rays may have several returns or none, and waveforms are not used."""
         return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of the hits of a batch."""
         setup = self.setup
-        # If the receiver adds or joins returns, `SelectionStep` selects.
+        # If the receiver adds or merges returns, `SelectionStep` selects the reported returns.
         mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
         reporting = Reporting(mode, setup.noise, batch.keys, batch.start)
-        return separated(
+        return separate_hits(
             returns,
             setup.half_pulse_m,
             batch.subrays_per_beam,
@@ -229,23 +229,23 @@ class SeparationStep(PulseStep):
 
 
 class SelectionStep(PulseStep):
-    """Selects the reported returns of a pulse, after waveforms and receivers made returns."""
+    """Selects the reported returns of a pulse after the receiver has added or merged returns."""
 
     role = Role.FRAME
     reads = "ray", "energy", "amplitude"
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the receiver adds or joins returns before the selection."""
+        """Return True if the receiver adds or merges returns before the selection."""
         return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the reported returns of a batch."""
-        return returns.take(chosen(returns, self.setup.reporting.mode))
+        return returns.take(reported_mask(returns, self.setup.reporting.mode))
 
 
-def chosen(returns: PulseReturns, mode: Mode) -> Bools:
-    """Return whether a mode reports each return: (n,)."""
+def reported_mask(returns: PulseReturns, mode: Mode) -> Bools:
+    """Return whether a mode reports each return."""
     from . import separation_loops
 
     shown = np.empty(len(returns.ray), np.bool_)

@@ -1,4 +1,4 @@
-"""Loops over pulses that make, detect and select the returns of hits: see separation.py."""
+"""Compiled loops that make, detect and select the returns of hits, see separation.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.cast_memory import float64s, int64s, uint8s
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.cast_record import float64s, int64s, uint8s
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
@@ -20,52 +20,52 @@ ALL, FIRST, LAST, STRONGEST, DUAL, TWO_STRONGEST = range(6)
 
 
 class SubrayHits(NamedTuple):
-    """Hits in the order of sub-rays: (n,) each."""
+    """Hits sorted by sub-ray, each array of shape (n,)."""
 
     ray: Ints  # sub-ray
     distance: Floats  # meters
-    energy: Floats  # energy as if all of the beam were in the hit's sub-ray
-    velocity: Floats  # radial, m/s; empty if returns have none
-    solid: Bools  # False for hits of no surface; empty for the table of hits in the air
+    energy: Floats  # energy as if the hit's sub-ray carried the whole beam
+    velocity: Floats  # radial, m/s; empty if returns have no velocity
+    solid: Bools  # False for hits on no surface; empty for the table of hits in the air
 
 
 class Receiver(NamedTuple):
     """Resolution, detection and reporting of a receiver."""
 
-    subrays: int  # number in a beam
-    gap_m: float  # half of the pulse's length: closer hits are one return
+    subrays: int  # number of sub-rays per beam
+    gap_m: float  # half of the pulse length; closer hits form one return
     mode: int  # which returns are reported
     with_velocity: bool  # whether returns have velocities
     dropout: float  # share of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
-    threshold_sigmas: float  # the threshold in standard deviations of the noise
+    threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # quantiles of the normal distribution; empty without detection
 
 
 class _Detection(NamedTuple):
-    """Detection by a `Receiver`, and the starts of its random numbers."""
+    """Detection settings of a `Receiver`, and the hash starts of its random numbers."""
 
     dropout: float  # share of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
-    threshold_sigmas: float  # the threshold in standard deviations of the noise
+    threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # pointer to the quantiles of the normal distribution
-    lowest: float  # first and last of the quantiles
-    highest: float
-    loss_start: np.uint64  # starts of hashes (`random_numbers.starts`)
+    lowest: float  # first quantile
+    highest: float  # last quantile
+    loss_start: np.uint64  # hash starts (`random_numbers.starts`)
     detection_start: np.uint64
 
 
 class ReturnArrays(NamedTuple):
-    """Arrays that returns are written to: (k,) each."""
+    """Arrays of shape (k,) to which returns are written."""
 
-    beam: Ints  # number of the ray of the scans, from 0 at sub-ray 0
-    row: Ints  # row of the strongest hit; of hits in the air -1, -2, …
+    beam: Ints  # number of the ray in the scans, counted from sub-ray 0
+    row: Ints  # row of the strongest hit; -1, -2, … for hits in the air
     distance: Floats  # meters
     energy: Floats  # energy of the whole beam
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:
-        """Return copies of the first returns, which a loop has written."""
+        """Return copies of the first `count` returns, which a loop has written."""
         return ReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
@@ -76,7 +76,7 @@ class ReturnArrays(NamedTuple):
 
 
 class _BeamRows(NamedTuple):
-    """Rows of the hits of a beam, on surfaces and in the air."""
+    """Rows of the hits of a beam on surfaces and in the air."""
 
     start: int
     stop: int
@@ -94,11 +94,11 @@ class _BeamScratch(NamedTuple):
     shown: Bools  # whether the mode reports a return
 
 
-# Loops over all beams read and write by pointers: numba counts references of arrays in tuples, and
-# that takes as long as the rest of the loop.
+# Loops over all beams read and write through pointers, because numba counts references to arrays in
+# tuples, which takes as long as the rest of the loop.
 @inlined
 def _pointers_to_hits(hits):
-    """Return `SubrayHits` of pointers to the arrays of `SubrayHits`, which must stay alive."""
+    """Return a `SubrayHits` of pointers to the arrays of `hits`, which must stay alive."""
     return SubrayHits(
         int64s(hits.ray.ctypes.data),
         float64s(hits.distance.ctypes.data),
@@ -110,7 +110,7 @@ def _pointers_to_hits(hits):
 
 @inlined
 def _pointers_to_returns(output):
-    """Return `ReturnArrays` of pointers to `ReturnArrays`, which must stay alive."""
+    """Return a `ReturnArrays` of pointers to the arrays of `output`, which must stay alive."""
     return ReturnArrays(
         int64s(output.beam.ctypes.data),
         int64s(output.row.ctypes.data),
@@ -120,7 +120,7 @@ def _pointers_to_returns(output):
     )
 
 
-@stage
+@noinline
 def _max_hits(ray, subrays):
     """Return the largest number of hits of a beam."""
     max_count = 0
@@ -134,7 +134,7 @@ def _max_hits(ray, subrays):
     return max_count
 
 
-@stage
+@noinline
 def _room_for_hits(size, subrays):
     """Return scratch memory for up to `size` hits of a beam."""
     pulse_hits = PulseHits(
@@ -156,7 +156,7 @@ def _room_for_hits(size, subrays):
 
 @inlined
 def _end_of_beam(ray, size, row, end_ray):
-    """Return the first row from `row` on, of `size`, whose sub-ray is not below `end_ray`."""
+    """Return the first row, from `row` on, whose sub-ray is at least `end_ray`."""
     while row < size and ray[row] < end_ray:
         row += 1
     return row
@@ -164,9 +164,9 @@ def _end_of_beam(ray, size, row, end_ray):
 
 @inlined
 def _single_return(hits, beam_rows, beam, receiver, count, output):
-    """Write the return of a beam if its hits on surfaces are within the receiver's gap.
+    """Write the return of a beam if all of its surface hits are within the receiver's gap.
 
-    Returns whether the hits are within the gap, and the number of returns that are written.
+    Returns whether the hits are within the gap, and the number of returns written so far.
     """
     nearest_m = np.inf
     farthest_m = -np.inf
@@ -201,10 +201,10 @@ def _single_return(hits, beam_rows, beam, receiver, count, output):
 
 @inlined
 def _collect_hits(hits, air, beam_rows, scratch):
-    """Write the hits of a beam that have energy to `scratch`, in the order of sub-rays.
+    """Write the hits of a beam that have energy to `scratch`, sorted by sub-ray.
 
-    Hits in the air come first in a sub-ray. Returns the number of hits, and the distance between
-    the nearest and the farthest hit, meters.
+    Within a sub-ray, hits in the air come first. Returns the number of hits, and the distance in
+    meters between the nearest and the farthest hit.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
@@ -235,7 +235,7 @@ def _collect_hits(hits, air, beam_rows, scratch):
 
 @inlined
 def _sort_by_distance(pulse_hits, count):
-    """Sort the first hits of `pulse_hits` by distance, where equally far hits keep their order."""
+    """Sort the first `count` hits by distance, keeping the order of equal distances."""
     row = pulse_hits.row
     distance = pulse_hits.distance
     for k in range(1, count):
@@ -252,21 +252,21 @@ def _sort_by_distance(pulse_hits, count):
 
 @inlined
 def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
-    """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
+    """Mark the hits in `scratch` at which returns start, and fill in the columns of the hits.
 
-    `count` is the number of hits. `exceeds_gap` is False if no hit of the beam is farther from
-    another hit than the receiver's gap. A surface that continues from sub-ray to sub-ray is in a
+    `count` is the number of hits. `exceeds_gap` is False if all hits of the beam are within the
+    receiver's gap of each other. A surface that continues from sub-ray to sub-ray belongs to a
     single return.
 
-    In the example of `continue_surfaces`, with a gap of 0.3 m, `_collect_hits` has written the
-    drop, then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
-    ground of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2: the drop is row 0 of the table of
-    the air. Each hit is farther than the gap from the hit before, so `starts_return` is True for
-    all five. Hits on surfaces are in several returns, so `continue_surfaces` looks for surfaces
-    that continue, and clears `starts_return` of hits 2, 3 and 4. `_write_returns` then writes two
-    returns: the drop at 8.0 m, and hits 1 to 4 at their mean distance, weighted by energy. If the
-    post returns twice the energy of a ground hit, the mean is 10.88 m, and the return has the row
-    of the post, 3.
+    In the example of `continue_surfaces` with a gap of 0.3 m, `_collect_hits` has written the drop
+    and then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
+    ground hits of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2, because the drop is row 0 of
+    the table of hits in the air. Each hit is farther than the gap from the previous one, so
+    `starts_return` is True for all five. Because surface hits are in several returns,
+    `continue_surfaces` looks for surfaces that continue, and clears `starts_return` of hits 2, 3
+    and 4. `_write_returns` then writes two returns: the drop at 8.0 m, and hits 1 to 4 at their
+    mean distance, weighted by energy. If the post returns twice the energy of a ground hit, the
+    mean is 10.88 m, and the return has row 3, the row of the post.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
@@ -287,7 +287,7 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
             exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
         )
         number += int(starts_return[k])
-        if solid[k]:  # surfaces can only continue if they are in several returns
+        if solid[k]:  # a surface can continue only if its hits are in several returns
             several |= surface_number >= 0 and surface_number != number
             surface_number = number
     if several and len(neighbors.pairs):
@@ -296,7 +296,7 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
 
 @inlined
 def _write_returns(hit_count, beam, receiver, scratch, count, output):
-    """Write the returns of the first hits in `scratch`, and return how many are written."""
+    """Write the returns of the first `hit_count` hits in `scratch`, and return their number."""
     row = scratch.hits.row
     distance = scratch.hits.distance
     starts_return = scratch.marks.starts_return
@@ -330,7 +330,7 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
 
 @inlined
 def _keep(output, k, count):
-    """Move return `k` to the end of the `count` kept returns, and return their new number."""
+    """Move return `k` to the end of the `count` kept returns, and return the new count."""
     output.beam[count] = output.beam[k]
     output.row[count] = output.row[k]
     output.distance[count] = output.distance[k]
@@ -341,7 +341,7 @@ def _keep(output, k, count):
 
 @inlined
 def _detection_of(receiver, starts):
-    """Return the `_Detection` of a receiver. `starts` are of `RandomKeys`, empty without losses."""
+    """Return the detection settings of a receiver. `starts` is empty if no returns are lost."""
     loses = len(starts) > 0
     count = len(receiver.quantiles)
     return _Detection(
@@ -358,10 +358,10 @@ def _detection_of(receiver, starts):
 
 @inlined
 def _detected(energy, scan, number_in_scan, return_index, detection):
-    """Return whether a return is detected, as `detection.detected` does.
+    """Return whether a return is detected, with the same result as `detection.detected`.
 
-    `scan`, the beam's `number_in_scan` and the `return_index` within the beam, from 0, are the key
-    of the random numbers.
+    The keys of the random number are `scan`, the beam's `number_in_scan`, and the `return_index`
+    within the beam, from 0.
     """
     detected = (
         detection.dropout == 0
@@ -369,7 +369,7 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
     )
     if detected and detection.threshold > 0:
         signal = detection.threshold_sigmas * (energy / detection.threshold - 1)
-        detected = signal + detection.lowest > 0  # whatever is drawn
+        detected = signal + detection.lowest > 0  # detected with any random number
         if not detected and signal + detection.highest > 0:
             index = np.int64(
                 bits(detection.detection_start, scan, number_in_scan, return_index)
@@ -383,7 +383,7 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
     """Keep the detected returns of a beam, rows `begin` to `stop`, and return the next free row.
 
-    `scan` and the beam's `number_in_scan` are keys of random numbers (`_detected`).
+    `scan` and the beam's `number_in_scan` are keys of the random numbers (`_detected`).
     """
     count = begin
     for k in range(begin, stop):
@@ -392,12 +392,12 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
     return count
 
 
-@stage
+@noinline
 def _mark(energy, begin, stop, mode, shown):
-    """Mark which returns of a pulse a mode reports, the nearest of equally strong returns.
+    """Mark which returns of a pulse a mode reports, preferring near returns of equal strength.
 
-    "Dual" reports the strongest and the last return; if the strongest is the last, also the
-    second strongest. "Two strongest" reports the strongest and the second strongest.
+    "Dual" reports the strongest and the last return. If the strongest return is the last, it also
+    reports the second strongest. "Two strongest" reports the strongest and the second strongest.
     """
     strongest = begin
     second_strongest = -1
@@ -417,7 +417,7 @@ def _mark(energy, begin, stop, mode, shown):
 
 @inlined
 def _start_of_scan(scan_starts, row):
-    """Return the first beam of a scan by its row, or a greater number after the last scan."""
+    """Return the first beam of a scan, or a very large number after the last scan."""
     return scan_starts[row] if row < len(scan_starts) else np.iinfo(np.int64).max
 
 
@@ -436,7 +436,7 @@ def _keep_reported(begin, stop, mode, scratch, output):
 
 @compiled()
 def mark_reported(ray, energy, mode, shown):
-    """Mark in `shown` (n,) which returns, in the order of rays, a mode reports."""
+    """Mark in `shown` (n,) which returns, sorted by ray, a mode reports."""
     begin = 0
     while begin < len(ray):
         stop = begin + 1
@@ -448,12 +448,12 @@ def mark_reported(ray, energy, mode, shown):
 
 @compiled()
 def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the returns of beams to `output`, `ReturnArrays`, for `separation.separated`.
+    """Write the returns of beams to `output`, for `separation.separate_hits`.
 
-    `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbors` are `Neighbors`,
-    `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost. Beams
-    are numbered from 0 at sub-ray 0; beam 0 is beam `keys.first` of the scans in `keys`.
-    Returns the number of returns.
+    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
+    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
+    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0;
+    beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
     """
     subrays = receiver.subrays
     size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
@@ -490,7 +490,7 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
         if not single:
             collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
-            if exceeds_gap:  # few beams hit an edge or graze a surface
+            if exceeds_gap:  # only few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)
             _mark_returns(
                 hits,

@@ -1,4 +1,4 @@
-"""Loops over pulses that cross boxes of spray: see spray.py."""
+"""Compiled loops over pulses that cross boxes of spray, see spray.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Floats, Ints
 from ...base.elementary_loops import exp
@@ -16,51 +16,51 @@ from .particle_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-MAX_CLUMPS = 255  # clumps of spray that a beam meets: a ray has so many random numbers
-_GUIDE_PARTS = 1024  # parts of a table for looking up a column
+MAX_CLUMPS = 255  # largest number of clumps that a beam can meet, limited by its random numbers
+_GUIDE_PARTS = 1024  # number of parts of a lookup table for columns
 
 
-class CellPairs(NamedTuple):
-    """Pairs of a cell of consecutive rays and a box that may meet, in the order of cells."""
+class BoxPairs(NamedTuple):
+    """Pairs of a cell of consecutive rays and a box that may meet, sorted by cell."""
 
     cell: Ints  # (p,): number of the cell
     box: Ints  # (p,): row of `SprayBoxes`
-    cell_rays: int  # rays of a cell
+    cell_rays: int  # number of rays per cell
 
 
 class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
-    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, meters
-    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box is left behind.
+    boxes: Floats  # (b, 12): center and half of the sides as vectors, in the scene frame, meters
+    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box was created.
     presence_ns: Floats
-    # (b,): when the box is left behind, as a multiple of `Survey.spray_g_m3`.
+    # (b,): density when the box is created, as a multiple of `Survey.spray_g_m3`.
     density: Floats
-    lasts_ns: float  # time after which a box is gone
+    lasts_ns: float  # lifetime of a box
     decay_ns: float  # time until exp(-1) of the density is left
 
 
-class Crossings(NamedTuple):
-    """Crossings of beams and boxes, with the crossings of a beam in sequence."""
+class BoxCrossings(NamedTuple):
+    """BoxCrossings of beams and boxes. The crossings of a beam are consecutive."""
 
     beam: Ints  # (k,): number of the beam in the batch
-    # (3, k): ranges at which the beam enters and leaves the box, meters, and the density of the box
-    # at that time, as a multiple of `Survey.spray_g_m3`.
+    # (3, k): ranges in meters at which the beam enters and leaves the box, and the density of the
+    # box at that time as a multiple of `Survey.spray_g_m3`.
     spans: Floats
 
 
 class ClumpTables(NamedTuple):
-    """Tables of clumps of spray that may be detected, as `air.DetectableParticles`."""
+    """Tables of detectable clumps of spray, as in `particles.DetectableParticles`."""
 
-    mean: float  # detectable clumps that a beam would meet in air of density `Survey.spray_g_m3`
-    by_range: Floats  # (5, shares): columns, ascending in range, that hold equal shares of `mean`
-    step_mm: float  # diameter that exp(-1) of the drops exceed
+    mean: float  # detectable clumps per beam in air of density `Survey.spray_g_m3`
+    by_range: Floats  # (5, shares): columns of ascending range that hold equal shares of `mean`
+    step_mm: float  # diameter that a share exp(-1) of the drops exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 
-@stage
+@noinline
 def _ball_radii(boxes):
-    """Return the radii of balls around boxes (b, 12): (b,), meters."""
+    """Return the radii in meters of the bounding spheres of boxes (b, 12)."""
     radii = np.zeros(len(boxes))
     for b in range(len(boxes)):
         for side in range(3, 12):
@@ -71,9 +71,9 @@ def _ball_radii(boxes):
 
 @inlined
 def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
-    """Return where a ray enters and leaves a box, meters, in this order if the ray meets the box.
+    """Return where a ray enters and leaves a box, in meters, ascending only if it meets the box.
 
-    `to_middle` is the vector from the ray's start to the middle of the box.
+    `to_middle` is the vector from the ray's origin to the center of the box.
     """
     p, q, r = to_middle
     u, v, w = direction
@@ -98,9 +98,9 @@ def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a 
 
 @inlined
 def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
-    """Write a crossing of ray `k` and box `b` as row `count`, if `crossings` has room.
+    """Write a crossing of ray `k` and box `b` to row `count` if `crossings` is large enough.
 
-    `span` is the result of `_span_in_box`, `time` the time of the ray, ns.
+    `span` is the result of `_span_in_box`, and `time` is the time of the ray in nanoseconds.
     """
     if count < len(crossings.beam):
         negative_age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
@@ -114,11 +114,11 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 
 @compiled()
 def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
-    """Write where rays (6, n), to `reach` (n,), meters, cross boxes, and return the number.
+    """Write where rays cross boxes, and return the number of crossings.
 
-    Rows of rays are origins and directions, `times` (n,) are in ns; `pairs` are `CellPairs`, and
-    `spray_boxes` `SprayBoxes`. As many crossings are written as `crossings` has room for; all are
-    counted.
+    `rays` (6, n) are origins and directions, `times` (n,) are in nanoseconds, and `reach` (n,) are
+    the lengths of the rays in meters. `pairs` is a `BoxPairs`, and `spray_boxes` a `SprayBoxes`.
+    All crossings are counted, but only as many are written as `crossings` can hold.
     """
     boxes = spray_boxes.boxes
     presence_ns = spray_boxes.presence_ns
@@ -144,7 +144,7 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
                 radius = radii[b]
                 aside_square = (p * p + q * q) + r * r - ahead * ahead
                 if aside_square > radius * radius or ahead > reach[k] + radius:
-                    continue  # the ray misses the ball around the box
+                    continue  # the ray misses the bounding sphere of the box
                 if not presence_ns[b, 0] <= times[k] <= presence_ns[b, 1]:
                     continue
                 span = _span_in_box(boxes, b, (p, q, r), (u, v, w), reach[k])
@@ -157,14 +157,13 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
     return count
 
 
-@stage
+@noinline
 def _column(ranges, guide, part_m, distance):
-    """Return the first column at a distance or farther.
+    """Return the first column at the given distance or farther.
 
-    numba's search takes long to compile.
-
-    `ranges` are the ranges of the columns, meters, ascending. The search starts at the column of
-    `guide` for the distance (`_guide`); a part of the guide is `part_m` long.
+    `ranges` are the ascending ranges of the columns in meters. The search starts at the column that
+    `guide` has for the distance (`_guide`); `part_m` is the length of a guide part. A search by
+    numba would take long to compile.
     """
     column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
     while column < len(ranges) and ranges[column] < distance:
@@ -172,12 +171,12 @@ def _column(ranges, guide, part_m, distance):
     return column
 
 
-@stage
+@noinline
 def _guide(ranges, part_m):
-    """Return columns at which searches for distances start: (_GUIDE_PARTS + 4,).
+    """Return the columns at which searches for distances start.
 
-    `guide[k]` is the first column at `(k - 1) * part_m` or farther: a part early, so that rounding
-    of a distance never starts its search too late.
+    `guide[k]` is the first column at ``(k - 1) * part_m`` or farther. It is one part early, so that
+    a rounded distance never starts its search too late.
     """
     guide = np.zeros(_GUIDE_PARTS + 4, np.int64)
     for part in range(1, len(guide)):
@@ -187,12 +186,12 @@ def _guide(ranges, part_m):
 
 @compiled()
 def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
+    """Sample the clumps of spray that beams meet, from crossing `k` on, until `hits` is full.
 
-    `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
-    that the light of each sub-ray reaches, meters. The depth between two clumps, as the mean number
-    of clumps in it, is exponential. Writes `SampledHits`; returns the first crossing that is not
-    sampled yet, and the number of hits.
+    `tables` is a `ClumpTables`, `keys` a `RandomKeys`, and `reach` (beams * subrays,) is the range
+    in meters that the light of each sub-ray reaches. The depth between two clumps, measured as the
+    mean number of clumps in it, is exponentially distributed. The function writes `SampledHits`,
+    and returns the first crossing that has not been sampled and the number of hits.
     """
     beam = crossings.beam
     spans = crossings.spans
@@ -223,7 +222,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
             max_depth += spans[2, k] * columns
             k += 1
         if depth > 1.001 * max_depth * clumps_per_column:
-            continue  # most beams meet too little, by a rough bound
+            continue  # a rough bound excludes most beams
         k = begin
         while k < len(beam) and beam[k] == this_beam:
             rate = spans[2, k] * clumps_per_column  # depth of a column in this box
@@ -251,10 +250,10 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
 
 @compiled()
 def attenuate(crossings, subrays, extinction, reach, hits):
-    """Multiply the energies of `SampledHits` of surfaces by the transmission of spray, both ways.
+    """Multiply the energies of surface hits by the two-way transmission of spray.
 
-    `extinction` is the extinction of spray of density 1, 1/m; `reach` (beams * subrays,) is the
-    range that the light of each sub-ray reaches, meters.
+    `hits` is a `SampledHits`, `extinction` is the extinction in 1/m of spray of density 1, and
+    `reach` (beams * subrays,) is the range in meters that the light of each sub-ray reaches.
     """
     beam = crossings.beam
     spans = crossings.spans

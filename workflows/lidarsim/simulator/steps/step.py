@@ -1,8 +1,8 @@
-"""Steps of the simulation: a step is one effect on the pulses of a sensor.
+"""Interface of the simulation steps. A step is one effect on the pulses of a sensor.
 
 `step_list.py` lists the steps in their order. A step is a class that declares its role, when it
 applies, the columns that it reads and writes, its random numbers and its memory. Nothing else
-decides whether a step acts: how rays are cast follows from the roles of the steps that apply.
+decides whether a step acts, and how rays are cast follows from the roles of the steps that apply.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from raybeam import Pattern, SubRays
 
 from ...base.arrays import Floats, Indices, Ints
 from ...base.random_numbers import Purpose
-from ...base.vectors import turned
+from ...base.vectors import rotate
 from ...columns.table import VELOCITY
 from ...scene.scene import Scene
 from ...sensor import Noise, Returns, Sensor
@@ -28,36 +28,36 @@ from ...survey.faults import Fault, FaultKind
 from ...survey.survey import Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces
+from ..casting.surfaces import SceneSurfaces
 from ..returns import Keys, Planes, PulseReturns
 
 
 class Role(Flag):
-    """Kinds of effects of a step on pulses. Each step declares a flag or several."""
+    """Kinds of effects on pulses. Each step declares one or more flags."""
 
     AIMS = auto()  # deflects beams before they are cast
-    ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
-    CHANGES = auto()  # a ray may then have no return, several, a changed energy or a waveform
-    # as CHANGES, by returns that the receiver adds or joins before `SelectionStep`
+    ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation, not horizontally and vertically
+    CHANGES = auto()  # can remove or add returns, change energies, or add waveforms
+    # like CHANGES, for returns that the receiver adds or merges before `SelectionStep`
     RECEIVES = auto()
-    # acts once on the selected and thinned-out returns of all pulses that are cast together
+    # acts once on the selected, thinned-out returns of all pulses that are cast together
     ON_REPORTED = auto()
-    FRAME = auto()  # casts rays, makes returns of hits or selects returns, for the other steps
+    FRAME = auto()  # casts rays, combines hits into returns, or selects returns
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A sensor of a survey in a scene. The setup selects the steps."""
+    """A sensor of a survey in a scene, which determines the steps that apply."""
 
     scene: Scene
     survey: Survey
-    number: int  # number of the sensor
-    # Roles of all steps that apply, without `Role.FRAME`; None until the steps are chosen.
+    number: int  # number of the sensor in the survey
+    # Roles of all steps that apply, except `Role.FRAME`; None until the steps have been chosen.
     roles: Role | None
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor."""
+        """Sensor that is simulated."""
         return self.survey.carried[self.number].sensor
 
     @property
@@ -67,12 +67,12 @@ class Setup:
 
     @property
     def reporting(self) -> Returns:
-        """Beam of the sensor, and the mode that selects the reported returns."""
+        """Beam profile of the sensor, and the mode that selects the reported returns."""
         return self.survey.returns_each[self.number]
 
     @property
     def half_pulse_m(self) -> float:
-        """Half of the pulse's length in space, meters: the smallest gap between two returns."""
+        """Half of the pulse length in meters, which is the smallest gap between two returns."""
         return self.reporting.min_gap_m(self.sensor.optics)
 
     @property
@@ -82,24 +82,24 @@ class Setup:
 
     @property
     def leafy(self) -> bool:
-        """Whether the scene has crowns: bodies or voxels with leaves."""
+        """Whether the scene has crowns, which are bodies or voxels with leaves."""
         crowns = any(m.leaf_area_density is not None for m in self.survey.materials)
         return crowns or bool(self.scene.has_voxels.any())
 
     @property
     def has_onward_light(self) -> bool:
-        """Whether surfaces transmit or mirror light."""
+        """Whether surfaces transmit light or reflect it specularly."""
         glass = any(m.transparent == "pass" for m in self.survey.materials)
         return glass or self.has_mirrors or self.leafy
 
     @property
     def has_mirrors(self) -> bool:
-        """Whether surfaces mirror light."""
+        """Whether surfaces reflect light specularly."""
         return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
 
     @property
     def refracts(self) -> bool:
-        """Whether light is refracted."""
+        """Whether any medium refracts light."""
         return any(m.refractive_index is not None for m in self.survey.materials)
 
     @property
@@ -109,55 +109,55 @@ class Setup:
 
     @property
     def waveform_samples(self) -> int:
-        """Samples of the recorded waveform of each return."""
+        """Number of samples in the recorded waveform of each return."""
         return self.survey.waveform_samples
 
     @property
     def return_count_varies(self) -> bool:
-        """Whether a ray that hits a surface may have no return or several, instead of a single."""
-        if self.has(Role.CHANGES | Role.RECEIVES):
+        """Whether a ray that hits a surface may have several returns or none."""
+        if self.has_role(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
         return self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses
 
     @property
     def has_received_returns(self) -> bool:
-        """Whether the receiver adds or joins returns of a pulse before the selection."""
-        return self.has(Role.RECEIVES)
+        """Whether the receiver adds or merges returns of a pulse before the selection."""
+        return self.has_role(Role.RECEIVES)
 
-    def has(self, roles: Role) -> bool:
-        """Return True if a step that applies has a role among `roles`.
+    def has_role(self, roles: Role) -> bool:
+        """Return True if any step that applies has one of the roles.
 
         Raises
         ------
         RuntimeError
-            If the steps are not chosen yet.
+            If the steps have not been chosen yet.
         """
         if self.roles is None:
             raise RuntimeError("only a step with Role.FRAME may depend on which other steps apply")
         return bool(self.roles & roles)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return the faults of the sensor of these kinds, by their numbers in the survey."""
+        """Return the sensor's faults of the given kinds, by their number in the survey."""
         return self.survey.faults_of(self.number, *kinds)
 
 
 class Sizes(NamedTuple):
-    """Numbers of rays and returns in memory, if all rays hit a surface."""
+    """Numbers of rays and returns in memory if all rays hit a surface."""
 
     rays: int  # rays of all scans whose memory is estimated
     beams: float  # beams of one `PulseBatch`
     subrays: int  # sub-rays of one `PulseBatch`
-    return_count: float  # returns of `rays`
-    points: float  # returns that become points: every n-th (`Survey.keep_every`)
+    return_count: float  # returns of all `rays`
+    points: float  # returns that become points, which are every n-th (`Survey.keep_every`)
 
 
 class Memory(NamedTuple):
-    """Peak memory of casting, in bytes."""
+    """Peak memory of casting in bytes."""
 
-    retained: float = 0.0  # bytes from the step until columns are made of the returns
+    retained: float = 0.0  # from the step until columns are computed from the returns
     casting: float = 0.0  # while the beams of a `PulseBatch` are cast
-    # after all are cast: while returns are counted, and every n-th is kept
+    # after all beams are cast, while returns are counted and thinned out
     counting: float = 0.0
 
 
@@ -167,11 +167,11 @@ class Emitter:
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
         carried = setup.survey.carried[setup.number]
-        # Axis of the head's revolutions, carrier frame: the sub-rays of an oval beam lie across
-        # the axis and towards the axis.
-        axis = turned(np.array([[0.0, 0, 1]]), setup.sensor.axes)
-        self._axis = turned(axis, carried.mount.rotation)[0]
-        self._about_axis = self.beam.oval or setup.has(Role.ABOUT_AXIS)
+        # Rotation axis of the head in the platform frame. The sub-rays of an oval beam are spread
+        # perpendicular to the axis and along it.
+        axis = rotate(np.array([[0.0, 0, 1]]), setup.sensor.axes)
+        self._axis = rotate(axis, carried.mount.rotation)[0]
+        self._about_axis = self.beam.oval or setup.has_role(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:
         """Return the number of sub-rays of a beam."""
@@ -190,50 +190,51 @@ class Emitter:
         Parameters
         ----------
         pattern
-            Rays in the middles of the beams.
+            Central rays of the beams.
         offsets
-            (n, 2): angles that are added to the directions of the n divided beams, radians
+            (n, 2): angles in radians that are added to the directions of the n beams
             (`PulseBatch.deflect`).
         beam_indices
-            (n,): rows of `pattern` that are divided; by default all.
+            (n,): rows of `pattern` that are divided, by default all.
         by_head
-            Whether the beams are in the frame of the head, not of the carrier.
+            Whether the beams are in the head frame instead of the platform frame.
         """
         if len(self) == 1 and offsets is None:
             return pattern
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
         sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self._about_axis else None)
-        return pattern.divided(sub_rays, offsets, beam_indices)
+        return pattern.with_sub_rays(sub_rays, offsets, beam_indices)
 
 
 @dataclass(eq=False)
 class PulseBatch:
-    """Consecutive rays of scans that are cast together, and results of steps for later steps.
+    """Consecutive rays of scans that are cast together, and data that steps pass to later steps.
 
-    `PulseCaster.scan` divides the rays of its scans into such batches. A beam is here a ray of the
-    scans, numbered from 0 at the first scan; a batch has the beams `start` to `stop`.
+    `PulseCaster.scan` divides the rays of its scans into such batches. A beam is a ray of the
+    scans, numbered from 0 at the first scan. A batch has the beams `start` to `stop`.
     """
 
-    keys: Keys  # scans and ray numbers of all beams of the scans, for random numbers
+    keys: Keys  # scan and ray numbers of all beams of the scans, for random numbers
     start: int  # number of the batch's first beam
-    stop: int  # one past the last
-    pattern: Pattern  # rays of beams, in the frame of the head or the carrier
+    stop: int  # one past the batch's last beam
+    pattern: Pattern  # rays of beams, in the head or platform frame
     first: int  # row of beam 0 in the pattern, which repeats
     poses: CastPoses  # poses of all beams of the scans
     firings: Firings  # firings of all beams of the scans
     emitter: Emitter
-    # (stop - start, 2): angles added to the directions of beams, radians (`deflect`)
+    # (stop - start, 2): angles in radians added to the directions of beams (`deflect`)
     offsets: Floats | None = None
-    # Hits of sub-rays on surfaces, and with waveforms in the air, in the order of sub-rays, which
-    # are numbered from 0 at the batch's start.
+    # Hits of sub-rays on surfaces and, with waveforms, in the air, sorted by sub-ray. Sub-rays are
+    # numbered from 0 at the start of the batch.
     hits: PulseReturns | None = None
     planes: Planes | None = None  # planes of `hits`; None if beams have a single sub-ray
     air: PulseReturns | None = None  # hits in the air that are not among `hits`
 
     def deflect(self, offsets: Floats) -> None:
-        """Add angles to the directions of the batch's beams before they are cast: (n, 2), radians.
+        """Add angles (n, 2) in radians to the directions of the batch's beams before casting.
 
-        With `Role.ABOUT_AXIS` the angles are azimuth and elevation, else across and up.
+        With `Role.ABOUT_AXIS`, the angles are azimuth and elevation, otherwise horizontal and
+        vertical.
         """
         earlier = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
         self.offsets = earlier + offsets
@@ -249,15 +250,15 @@ class PulseBatch:
 
     @property
     def subrays_per_beam(self) -> int:
-        """Number of sub-rays of a beam."""
+        """Number of sub-rays per beam."""
         return len(self.emitter)
 
     @cached_property
     def beams(self) -> Pattern:
         """Sub-rays of the batch's beams or, if no beam is deflected, of all rays of the pattern.
 
-        `window` has the batch's rows in either. A pattern that is not deflected is shared by
-        batches, so it is not cut.
+        `window` has the batch's rows in this pattern. If no beam is deflected, batches share the
+        pattern, so it is not sliced.
         """
         beam_indices = np.arange(self.first + self.start, self.first + self.stop)
         pattern_rows = None if self.offsets is None else beam_indices
@@ -267,7 +268,7 @@ class PulseBatch:
 
     @property
     def row_range(self) -> slice:
-        """Rows of the batch's firings in `firings`, in complete firings."""
+        """Rows of `firings` that belong to the batch, which consists of complete firings."""
         channels = self.firings.sensor.channels
         return slice(self.start // channels, self.stop // channels)
 
@@ -279,14 +280,14 @@ class PulseBatch:
 
     @cached_property
     def subray_poses(self) -> CastPoses:
-        """Poses of the batch's sub-rays, which are numbered from 0."""
-        return self.poses.part(self.start, self.stop, self.subrays_per_beam)
+        """Poses of the batch's sub-rays, numbered from 0."""
+        return self.poses.for_subrays(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins (n, 3), meters, and directions (n, 3) of the first sub-ray of each beam.
+        """Origins (n, 3) in meters and directions (n, 3) of the central sub-ray of each beam.
 
-        The first sub-ray is in the middle of the beam. In the scene frame.
+        The central sub-ray is the first of each beam. Both arrays are in the scene frame.
         """
         subray_indices = np.arange(self.stop - self.start) * self.subrays_per_beam
         origins, directions = self.subray_poses.rays(self.beams, subray_indices, self.window[0])
@@ -296,35 +297,36 @@ class PulseBatch:
 class PulseStep(ABC):
     """An effect on the pulses of a sensor.
 
-    A subclass without a `role` is a TypeError: the role decides how rays are cast.
+    Defining a subclass without a `role` raises a TypeError, because the role decides how rays are
+    cast.
     """
 
     role: ClassVar[Role]
-    effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about the step
-    reads: ClassVar[tuple[str, ...]] = ()  # fields of `PulseReturns` that the step uses
+    effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md that describe the step
+    reads: ClassVar[tuple[str, ...]] = ()  # fields of `PulseReturns` that the step reads
     writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
-    causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` of the returns that the step adds
-    purposes: ClassVar[tuple[Purpose, ...]] = ()  # purposes of the random numbers of the step
+    causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` for returns that the step adds
+    purposes: ClassVar[tuple[Purpose, ...]] = ()  # purposes of the step's random numbers
 
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "role", None):
             raise TypeError(f"step {cls.__name__} has no role. Set `role` to flags of `Role`")
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         self.setup = setup
         self.caster = caster
         self.surfaces = surfaces
 
-    def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return the step for a scene with moved instances, with its setup and surfaces.
+    def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
+        """Return the step for a scene in which instances have moved.
 
-        By default, a new step is made; a step that takes long to make, and stores no positions of
-        surfaces, returns `repointed`.
+        By default, a new step is created. A step that takes long to create and stores no surface
+        positions returns `with_setup` instead.
         """
         return type(self)(setup, self.caster, surfaces)
 
-    def repointed(self, setup: Setup, surfaces: Surfaces) -> Self:
-        """Return a copy of the step with another setup and other surfaces."""
+    def with_setup(self, setup: Setup, surfaces: SceneSurfaces) -> Self:
+        """Return a copy of the step with a different setup and different surfaces."""
         step = copy(self)
         step.setup = setup
         step.surfaces = surfaces
@@ -333,23 +335,23 @@ class PulseStep(ABC):
     @staticmethod
     @abstractmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the step acts on a sensor, else False."""
+        """Return True if the step acts on the sensor."""
 
     @staticmethod
-    def added(setup: Setup) -> float:
+    def added_returns(setup: Setup) -> float:
         """Return the mean number of returns that the step adds to a pulse, or an upper bound."""
         return 0.0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory that the step takes, in bytes."""
+        """Return the memory that the step requires, in bytes."""
         return Memory()
 
     @abstractmethod
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch after the step.
 
-        Before `SeparationStep` or `WaveformStep` makes returns of hits, `returns` are the hits of
-        sub-rays, with sub-ray numbers in `ray`. A step that changes the hits assigns the result to
-        `batch.hits` as well, and selects hits by `batch.select`.
+        Until `SeparationStep` or `WaveformStep` combines hits into returns, `returns` are the hits
+        of sub-rays, and `ray` has sub-ray numbers. A step that changes hits must also assign the
+        result to `batch.hits`. To select hits, it must use `batch.select`.
         """

@@ -1,4 +1,4 @@
-"""The steps of the simulation, in the order that pulses pass them."""
+"""The simulation steps, in the order in which they act on pulses."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from .stray_light import StrayLightStep
 from .waveform import WaveformStep
 from .waveform_samples import RecordingStep
 
-# If no step applies, each ray has one return, its hit.
+# If no step applies, each ray has one return, which is its hit.
 STEPS: list[type[PulseStep]] = [
     AngleNoiseStep,
     RippleStep,
     CastStep,  # follows light at mirrors, glass, water and leaves
-    WeatherStep,  # rain, snow, fog and dust; light that is lost on its way: casting/surfaces.py
+    WeatherStep,  # rain, snow, fog and dust; casting/surfaces.py attenuates the light
     SprayStep,
     DirtStep,  # dirt on the window
-    SeparationStep,  # makes returns of hits, without waveforms
-    WaveformStep,  # makes returns of hits otherwise
+    SeparationStep,  # combines hits into returns, without waveforms
+    WaveformStep,  # combines hits into returns, with waveforms
     DetectionStep,
     StrayLightStep,
     FalseAlarmStep,
@@ -59,29 +59,31 @@ def steps_of(setup: Setup) -> list[type[PulseStep]]:
 
 
 def received_causes() -> list[int]:
-    """Return the causes, indices into `CAUSES`, of returns that steps of `Role.RECEIVES` add.
+    """Return the causes, as indices into `CAUSES`, of returns that the receiver adds.
 
-    At the points of such returns is nothing that sent light back, so they have no velocity.
+    Such returns do not come from a point that reflects light, so they have no velocity.
     """
     return [cause for step in STEPS if Role.RECEIVES in step.role for cause in step.causes]
 
 
 def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> None:
-    """Let the simulation in this process apply a step of another package.
+    """Add a step from another package to all simulations in this process.
 
     Parameters
     ----------
     step
         A subclass of `PulseStep`.
     before
-        The step before which pulses pass the new step. By default, beams are deflected just before
-        they are cast, hits of sub-rays changed just before returns are made of the hits, returns
-        received just before they saturate the receiver, and reported returns changed at the end.
+        The existing step before which the new step acts. The default depends on the role: steps
+        that deflect beams act just before beams are cast, steps that change hits just before hits
+        are combined into returns, steps that add received returns just before saturation, and steps
+        that change reported returns at the end.
 
     Raises
     ------
     ValueError
-        If the step would have no effect at its position, is of `Role.FRAME`, or is a step already.
+        If the step would have no effect at its position, has the role `Role.FRAME`, or has already
+        been added.
 
     Examples
     --------
@@ -122,18 +124,18 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
 
 
 def remove_step(step: type[PulseStep]) -> None:
-    """Undo `add_step`."""
+    """Remove a step that was added with `add_step`."""
     STEPS.remove(step)
 
 
-# {role: the step before which a step of the role is inserted}, the first that matches.
+# {role: step before which a step with this role is inserted}; the first match applies.
 _POSITIONS = (
     (Role.AIMS, CastStep),
     (Role.RECEIVES, SaturationStep),
     (Role.CHANGES, SeparationStep),
 )
-# (role, first, last): a step of the role acts only after step `first` and not after step `last`.
-# Returns are received once there are returns, and before `SelectionStep` selects returns.
+# (role, first, last): a step with this role must act after `first` and not after `last`. Returns
+# can be received once there are returns, and before `SelectionStep` selects returns.
 _SPANS = (
     (Role.RECEIVES, DetectionStep, SelectionStep),
     (Role.CHANGES, CastStep, RangeNoiseStep),

@@ -1,4 +1,4 @@
-"""Stray light: a receiver gets a little light of retro-reflectors beside its beam."""
+"""Stray light: a receiver gets a small part of the light of retroreflectors beside its beam."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
 from ...base.random_numbers import Purpose
-from ...base.vectors import into_axes, length, products, turned
+from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, sensor_light_of
-from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
-from .detection import passes
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
+from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
+from .detection import exceeds_threshold
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 STRAY = Purpose(22, "energy noise of stray light")
 BLOOMING = CAUSES.index("blooming")
-NEAREST_TRIANGLES = 4  # number of triangles of a cluster, nearest by angle, compared with a ray
-CLUSTER_M = 1.0  # size of a cluster of triangles, which are compared with rays together
-FAINTEST = 0.1  # share of the detection threshold: fainter light is never detected
+NEAREST_TRIANGLES = 4  # number of a cluster's triangles, nearest by angle, compared with a ray
+CLUSTER_M = 1.0  # size of a cluster of triangles that are compared with rays together
+FAINTEST = 0.1  # fainter light, as a share of the detection threshold, is never detected
 
 
 class StrayLightStep(PulseStep):
-    """Adds stray light of retro-reflectors beside beams."""
+    """Adds stray light of retroreflectors beside beams."""
 
     role = Role.RECEIVES
     effects = ("Blooming",)
@@ -42,26 +42,26 @@ class StrayLightStep(PulseStep):
     causes = (BLOOMING,)
     purposes = (STRAY,)
 
-    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._sensor_light = sensor_light_of(setup.survey, setup.sensor)
         self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the noise of the sensor has stray light."""
+        """Return True if the noise of the sensor includes stray light."""
         return setup.noise.stray_light > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the causes of returns, and of central rays, in bytes."""
+        """Return the memory of return causes and of central rays, in bytes."""
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch with the returns of stray light.
+        """Return the returns of a batch together with stray light.
 
-        A beam adds its strongest stray light if the light is detected, in range, visible from the
-        beam's origin, and not within the gap of another return of the beam.
+        A beam adds its strongest stray light if this light is detected, in range, visible from the
+        beam's origin, and not too close to another return of the beam to be separated from it.
         """
         if not self._clusters:
             return returns
@@ -72,8 +72,8 @@ class StrayLightStep(PulseStep):
         light = self._strongest(batch, times)
         row = np.flatnonzero(light.energy > FAINTEST * noise.threshold)
         scan, number = batch.keys.scan_and_number(rays[row])
-        row = row[passes(noise, STRAY, light.energy[row], scan, number)]
-        distance = np.sqrt(products(light.points[row].T, light.points[row].T))
+        row = row[exceeds_threshold(noise, STRAY, light.energy[row], scan, number)]
+        distance = np.sqrt(dot(light.points[row].T, light.points[row].T))
         in_range = (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
         row = row[in_range]
         distance = distance[in_range]
@@ -87,14 +87,15 @@ class StrayLightStep(PulseStep):
         stray = returns_without_surface(
             returns, rays[row], distance[visible], light.energy[row], BLOOMING
         )
-        return merged(returns, stray)
+        return merge_returns(returns, stray)
 
     def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
-        """Return the strongest stray light of the central rays of beams.
+        """Return the strongest stray light for the central ray of each beam.
 
-        `times` (n,) are the times of the beams, ns. Points are in the axes of the scene frame.
+        `times` (n,) are the firing times of the beams in nanoseconds. Points are relative to the
+        rays' origins, along the axes of the scene frame.
         """
-        from . import stray_loops  # not before: numba takes half a second to import
+        from . import stray_loops  # imported here because numba takes half a second to import
 
         origins, directions = batch.central_rays
         count = batch.stop - batch.start
@@ -115,20 +116,21 @@ class StrayLightStep(PulseStep):
             if actor is not None:
                 positions, rotations = batch.subray_poses.actor_trajectories[actor].poses(0, times)
             cells = _ray_cells(
-                into_axes(origins - positions, rotations), into_axes(directions, rotations)
+                rotate_into_frames(origins - positions, rotations),
+                rotate_into_frames(directions, rotations),
             )
             light.new[:] = False
             for cluster in clusters:
                 triangles = self._triangles(cluster, table)
                 stray_loops.find_stray_light(cells, triangles, limits, chosen, light)
-            if rotations is not None:  # back to the scene frame
+            if rotations is not None:  # rotate back to the scene frame
                 row_indices = np.flatnonzero(light.new)
                 to_scene = rotations[row_indices].transpose(0, 2, 1)
-                light.points[row_indices] = into_axes(light.points[row_indices], to_scene)
+                light.points[row_indices] = rotate_into_frames(light.points[row_indices], to_scene)
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
-        """Return the triangles of a cluster for loops, with the light that they return head-on."""
+        """Return the triangles of a cluster for loops, with their energy at normal incidence."""
         from .stray_loops import RetroTriangles
 
         white = np.ones(len(cluster.triangles))
@@ -136,9 +138,10 @@ class StrayLightStep(PulseStep):
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether beams `ray` (n,) have a return near distances (n,), meters: (n,).
+        """Return whether beams `ray` (n,) have a return close to the given distances (n,).
 
-        Near is within half of the pulse's length: the receiver cannot tell such returns apart.
+        Two returns are close if they are within half a pulse length, so that the receiver cannot
+        separate them.
         """
         first = np.searchsorted(returns.ray, ray, side="left")
         last = np.searchsorted(returns.ray, ray, side="right")
@@ -153,7 +156,7 @@ class StrayLightStep(PulseStep):
 
 
 def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
-    """Return rays (n, 3) for loops, with cones around cells of consecutive rays."""
+    """Return rays (n, 3) for compiled loops, with cones around cells of consecutive rays."""
     from . import stray_loops
 
     cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
@@ -163,36 +166,36 @@ def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
 
 
 class _Bounds(NamedTuple):
-    """Bounds of triangles."""
+    """Bounding sphere and centers of triangles."""
 
-    middles: Floats  # (k, 3)
-    center: Floats  # (3,): of a ball around the triangles
-    radius: float  # radius of the ball, meters
+    middles: Floats  # (k, 3): centers of the triangles
+    center: Floats  # (3,): center of the bounding sphere
+    radius: float  # radius of the bounding sphere, meters
 
 
 @dataclass(frozen=True)
 class _RetroCluster:
-    """A cluster of triangles of retro-reflectors."""
+    """A cluster of retroreflecting triangles."""
 
     triangles: Ints32  # (k,): numbers among all triangles of the scene
     corners: Floats  # (k, 3, 3): in the scene frame, or in the frame of an actor
-    actor: int | None = None  # number of the actor; None in the still scene
+    actor: int | None = None  # number of the actor, or None in the static scene
 
     @cached_property
     def bounds(self) -> _Bounds:
-        """Middles of the triangles, and a ball around the triangles."""
+        """Centers and bounding sphere of the triangles."""
         a, b, c = self.corners.transpose(1, 0, 2)
         center = self.corners.reshape(-1, 3).mean(axis=0)
-        radius = float(length(self.corners.reshape(-1, 3) - center).max())
+        radius = float(norm(self.corners.reshape(-1, 3) - center).max())
         return _Bounds(((a + b) + c) / 3, center, radius)
 
 
 def _retro_clusters(
-    scene: Scene, surfaces: Surfaces, unseen: Bools | None
+    scene: Scene, surfaces: SceneSurfaces, unseen: Bools | None
 ) -> Iterator[_RetroCluster]:
-    """Yield the retro-reflectors of a scene, its instances and actors, in clusters.
+    """Yield the retroreflectors of a scene, its instances and its actors, in clusters.
 
-    Objects of the mask `unseen` (objects,) are left out.
+    Objects in the mask `unseen` (objects,) are omitted.
     """
     retro = surfaces.materials.retro
     owners = surfaces.triangle_kinds.material_kinds.object
@@ -204,9 +207,9 @@ def _retro_clusters(
     def clusters_of(
         faces: Integers, vertices: Floats, first: int, actor: int | None = None
     ) -> Iterator[_RetroCluster]:
-        """Yield the clusters of the retro-reflecting `faces`.
+        """Yield the clusters of the retroreflecting triangles among `faces`.
 
-        Triangles of the faces are numbered from `first` on.
+        The triangles of `faces` are numbered from `first` on.
         """
         face_indices = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
         return _clusters(first + face_indices, vertices[faces[face_indices]], actor)
@@ -219,7 +222,7 @@ def _retro_clusters(
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
             mesh = shared.mesh_parts[part]
             if has_retro[owner]:
-                vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
+                vertices = rotate(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
                 yield from clusters_of(mesh.faces, vertices, first)
             first += len(mesh.faces)
     for number, actor in enumerate(scene.actors):
@@ -232,7 +235,7 @@ def _retro_clusters(
 def _clusters(
     triangles: Integers, corners: Floats, actor: int | None = None
 ) -> Iterator[_RetroCluster]:
-    """Divide triangles with corners (k, 3, 3) into clusters, by the cells of a grid."""
+    """Divide triangles with corners (k, 3, 3) into clusters by the cells of a grid."""
     if not len(triangles):
         return
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Loops over rays that receive other light: see stray_light.py and crosstalk.py."""
+"""Compiled loops over rays that receive other light, see stray_light.py and crosstalk.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,18 +9,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
-from raybeam.ray_loops import any_axes
+from raybeam.compiled import compiled, inlined, noinline
+from raybeam.ray_loops import perpendicular_axes
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.elementary_loops import arctan2, sin_cos
 from ...sensor.optics import LIGHT_M_NS
 from ..casting.surface_loops import at_right_angles
 
-CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
+CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
 MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
-# Rays to an edge of a triangle are moved by this share of the way to its middle, to hit the
-# triangle.
+# Rays to an edge of a triangle are moved towards its center by this share of the distance, so that
+# they hit the triangle.
 INWARDS = 0.02
 
 
@@ -29,42 +29,42 @@ class RayCells(NamedTuple):
 
     origins: Floats  # (3, n)
     directions: Floats  # (3, n)
-    # (c, 5): axis, half angle, radians, and largest distance of an origin from the first, meters.
+    # (c, 5): axis, half angle in radians, and largest distance in meters from the first origin.
     cones: Floats
 
 
 class RetroTriangles(NamedTuple):
-    """A cluster of triangles of retro-reflectors."""
+    """A cluster of retroreflecting triangles."""
 
     corners: Floats  # (t, 3, 3)
-    middles: Floats  # (t, 3)
-    center: Floats  # (3,): of a ball around the triangles
-    radius: float  # radius of the ball, meters
-    # (t,): energy that a beam head-on at 10 m returns, relative to a white surface.
+    middles: Floats  # (t, 3): centers of the triangles
+    center: Floats  # (3,): center of the bounding sphere
+    radius: float  # radius of the bounding sphere, meters
+    # (t,): energy that a beam at normal incidence returns from 10 m, relative to a white surface.
     back: Floats
 
 
 class StrayLimits(NamedTuple):
-    """Limits of stray light."""
+    """Detection limits of stray light."""
 
     min_range_m: float
-    share_at_degree: float  # energy at an angle of 1 degree, as a share of that in the beam
+    share_at_degree: float  # energy at an angle of 1 degree, as a share of the energy in the beam
     faintest: float  # smallest energy that may be detected
     extinction: float  # 1/m
 
 
 class StrayLight(NamedTuple):
-    """Strongest stray light of rays, written by loops."""
+    """Strongest stray light of rays, written by compiled loops."""
 
     energy: Floats  # (n,)
-    # (n, 3), meters: from the ray's origin to where the light comes from, in the axes of the rays
-    # and triangles that a loop was given.
+    # (n, 3), meters: from the ray's origin to the source of the light, along the axes in which rays
+    # and triangles were given.
     points: Floats
-    new: Bools  # (n,): set where a loop has written light
+    new: Bools  # (n,): True where a loop has written light
 
 
 class SpotPairs(NamedTuple):
-    """Pairs of a spot and the rays that may see the spot: (p,) each."""
+    """Pairs of a spot and the rays that may see it, as arrays of shape (p,)."""
 
     spot: Ints  # row of `LitSpots`
     first: Ints  # first ray, as a row of `ReceivingRays.order`
@@ -74,34 +74,34 @@ class SpotPairs(NamedTuple):
 class ReceivingRays(NamedTuple):
     """Rays of a receiver, in the scene frame."""
 
-    order: Ints  # (n,): rows in the order of firing times
+    order: Ints  # (n,): rows sorted by firing time
     fired_ns: Floats  # (n,)
     origins: Floats  # (n, 3)
     directions: Floats  # (n, 3)
 
 
 class LitSpots(NamedTuple):
-    """Spots on surfaces, lit by pulses of foreign sensors, in the scene frame."""
+    """Spots on surfaces that pulses of other sensors illuminate, in the scene frame."""
 
-    time_ns: Floats  # (s,): when the pulse lights the spot
+    time_ns: Floats  # (s,): when the pulse illuminates the spot
     positions: Floats  # (s, 3), meters
 
 
 class ReceptionLimits(NamedTuple):
-    """Limits of the pulses that a receiver gets."""
+    """Limits within which a receiver gets pulses of other sensors."""
 
     cosine: float  # cosine of the largest angle between a ray and a spot
-    min_range_m: float  # least distance that the spot may seem to have
+    min_range_m: float  # smallest apparent distance of a spot
     max_range_m: float
 
 
 class ReceivedSpots(NamedTuple):
-    """Arrays for loops to write rays to that receive the light of spots: (k,) each."""
+    """Arrays of shape (k,) to which loops write rays that receive the light of spots."""
 
     row: Ints  # row of the ray, in `ReceivingRays`
     spot: Ints  # row of `LitSpots`
-    distance: Floats  # at which the spot seems to be, meters
-    range_m: Floats  # at which the spot is, meters
+    distance: Floats  # apparent distance of the spot, meters
+    range_m: Floats  # actual distance of the spot, meters
 
     def first(self, count: int) -> ReceivedSpots:
         """Return views of the first `count` rows, which a loop has written."""
@@ -112,7 +112,7 @@ class ReceivedSpots(NamedTuple):
 
 @inlined
 def _angle(cosine):
-    """Return the angle of a cosine, radians, for a cosine that may be rounded beyond 1."""
+    """Return the angle in radians for a cosine that rounding may have moved beyond 1."""
     cosine = min(max(cosine, -1.0), 1.0)
     return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
 
@@ -148,23 +148,24 @@ def bound_cells(origins, directions, cones):
         cones[c, 4] = math.sqrt(max_square)
 
 
-@stage
+@noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
-    """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
+    """Return the tangent of the angle between a ray and a triangle, and the point nearest by angle.
 
-    `ray` is its origin and direction. The point is a vector from the ray's origin. The tangent is 0
-    if the ray meets the triangle, and -1 if the triangle is not in front of the ray.
+    `ray` is an origin and a direction. The point is a vector from the ray's origin. The tangent is
+    0 if the ray hits the triangle, and -1 if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
-    a, b, c, d, e, f = any_axes(dx, dy, dz)
+    a, b, c, d, e, f = perpendicular_axes(dx, dy, dz)
     min_tangent = np.inf
     nearest = (0.0, 0.0, 0.0)
     all_left = True
     all_right = True
     for corner in range(3):
         next_corner = corner + 1 if corner < 2 else 0
-        # p and q are the two corners as seen from the origin, p_depth and q_depth their depths; on
-        # a plane at a distance of 1, (x, y) is the first corner, and (u, v) leads to the second.
+        # p and q are the two corners relative to the origin, and p_depth and q_depth are their
+        # depths. On a plane at distance 1, (x, y) is the first corner and (u, v) leads to the
+        # second.
         px = corners[t, corner, 0] - ox
         py = corners[t, corner, 1] - oy
         pz = corners[t, corner, 2] - oz
@@ -185,7 +186,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
         step = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
         tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
         if tangent < min_tangent:
-            # A step on the plane is not the same share of the way between the corners.
+            # A step on the plane corresponds to a different share of the edge in space.
             share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
             nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
             min_tangent = tangent
@@ -196,9 +197,9 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 def _reach_of_cell(rays, c, triangles, limits):
     """Return whether cell `c` of rays may receive light of triangles, and a cosine.
 
-    The cosine belongs to the largest angle between a ray of the cell and the center of the
-    triangles at which the ray may receive light: beyond, the light of the nearest triangle is too
-    faint. All triangles are taken to return as much light as the first.
+    The cosine is that of the largest angle between a ray of the cell and the center of the
+    triangles at which the ray may receive light. At larger angles, the light of the nearest
+    triangle is too faint. All triangles are assumed to return as much light as the first.
     """
     cones = rays.cones
     first = c * CELL_RAYS
@@ -225,9 +226,9 @@ def _reach_of_cell(rays, c, triangles, limits):
 
 @inlined
 def _choose_triangles(middles, ray, chosen):
-    """Write the triangles whose middles are nearest to a ray by angle, and return their number.
+    """Write the triangles whose centers are nearest to a ray by angle, and return their number.
 
-    `middles` are (t, 3); `chosen` has room for as many triangles as are compared.
+    `middles` has shape (t, 3). The length of `chosen` is the number of triangles to choose.
     """
     ox, oy, oz, dx, dy, dz = ray
     count = min(len(middles), len(chosen))
@@ -253,7 +254,7 @@ def _choose_triangles(middles, ray, chosen):
 
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
-    """Write the light of triangle `t` to row `k` of `strongest` if the light is stronger."""
+    """Write the light of triangle `t` to row `k` of `strongest` if it is stronger."""
     middles = triangles.middles
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
@@ -274,12 +275,12 @@ def _add_light(k, t, ray, triangles, limits, strongest):
 
 @compiled()
 def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
-    """Write the light of `triangles` to rows of `strongest` where the light is stronger.
+    """Write the light of `triangles` to the rows of `strongest` in which it is stronger.
 
-    `rays` are `RayCells`, `triangles` `RetroTriangles` in the frame of the rays, `limits`
-    `StrayLimits`, and `strongest` is `StrayLight`. The light comes from the point of the triangles
-    that is nearest to a ray by angle. `chosen` is scratch memory: of the triangles, those nearest
-    to a ray are compared, as many as `chosen` has elements.
+    `rays` is a `RayCells`, `triangles` a `RetroTriangles` in the frame of the rays, `limits` a
+    `StrayLimits`, and `strongest` a `StrayLight`. The light comes from the point on the triangles
+    that is nearest to a ray by angle. Only the triangles nearest to a ray are compared with it;
+    their number is the length of `chosen`, which is scratch memory.
     """
     center = triangles.center
     origins = rays.origins
@@ -308,11 +309,11 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
 
 @compiled()
 def receive(pairs, rays, spots, limits, output):
-    """Write rays that receive the light of spots to `output`, `ReceivedSpots`, and their number.
+    """Write which rays receive the light of spots to `output`, and return their number.
 
-    `pairs` are `SpotPairs`, `rays` `ReceivingRays`, `spots` `LitSpots`, and `limits`
-    `ReceptionLimits`. The distance of a spot is the distance of a pulse which the ray would have
-    sent.
+    `pairs` is a `SpotPairs`, `rays` a `ReceivingRays`, `spots` a `LitSpots`, `limits` a
+    `ReceptionLimits`, and `output` a `ReceivedSpots`. The apparent distance of a spot is computed
+    as if the ray had emitted the pulse.
     """
     origins = rays.origins
     directions = rays.directions

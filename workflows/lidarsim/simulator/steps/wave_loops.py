@@ -1,4 +1,4 @@
-"""Loops over pulses that sample waveforms and find returns in the samples: see waveform.py."""
+"""Compiled loops that sample waveforms and find returns in the samples, see waveform.py."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled, inlined, stage
+from raybeam.compiled import compiled, inlined, noinline
 
 from ...base.arrays import Bools, Floats, Ints
 from ...base.elementary_loops import exp, log
@@ -17,84 +17,86 @@ from ...sensor.optics import CUT
 from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 
 # In standard deviations of the system waveform:
-# hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
+# hits within this distance form one Gaussian in closed form, with errors of 1e-3 in position and
+# height
 NARROW = 0.25
-# two neighboring hits whose planes meet within this distance are on one surface
+# two neighboring hits are on one surface if their planes meet within this distance
 # (`continue_surfaces`)
 MEET = 1.0
 # Gaussians that are farther apart are fitted separately
 APART = 6.0
-# Gaussians that are nearer are one return
+# Gaussians that are closer form one return
 CLOSE = 1.0
-# largest distance that a fit moves a Gaussian from its first guess
+# largest distance that a fit may move a Gaussian from its initial position
 MOVES = 2.0
 
-FAINT = 0.01  # lowest peak that is found, as a share of the highest sample of the waveform
-CURVED = 0.005  # smallest curvature times variance of a Gaussian that is found, as such a share
+FAINT = 0.01  # lowest peak that is found, as a share of the waveform's highest sample
+CURVED = 0.005  # smallest curvature times variance of a detectable Gaussian, as such a share
 TOGETHER = 4  # largest number of Gaussians that are fitted together
-STEPS = 30  # largest number of steps of Levenberg and Marquardt
-GAIN = 1e-3  # share of the sum of squares that a step has to gain for the fit to go on
+STEPS = 30  # largest number of Levenberg-Marquardt steps
+GAIN = 1e-3  # smallest relative reduction of the sum of squares for which a fit continues
 ENOUGH = 1e-9  # sum of squares at which a fit stops
 HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
 _AREA = math.sqrt(2 * math.pi)  # area of a Gaussian of height and standard deviation 1
-_KEY_STEPS = 1024  # steps of a sample for comparing times of hits and peaks
+_KEY_STEPS = 1024  # subdivisions of a sample for comparing the times of hits and peaks
 
 
 class WaveMarks(NamedTuple):
-    """Marks of hits in the order of beams and distances: (n,) each."""
+    """Marks of hits sorted by beam and distance, each of shape (n,)."""
 
-    solid: Bools  # whether the hit is on a surface, not in the air
-    # Whether a waveform starts at the hit, after `divide_into_waveforms`; in waveforms that
-    # `search_waveforms` searches, whether a peak does. `make_returns` clears the marks of hits that
-    # continue a surface: then a return starts at each mark.
+    solid: Bools  # whether the hit is on a surface rather than in the air
+    # Whether a waveform starts at the hit, as set by `divide_into_waveforms`. In waveforms that
+    # `search_waveforms` searches, whether a peak starts. `make_returns` clears the marks of hits
+    # that continue a surface; then a return starts at each mark.
     starts: Bools
-    starts_surface: Bools  # False if the surface of the hit before continues at the hit
-    searched: Bools  # whether the hit is `solid`, in a waveform too wide for the closed form
-    all_start: Bools  # always True: before a search, `continue_surfaces` takes each hit as a return
+    starts_surface: Bools  # False if the surface of the previous hit continues at the hit
+    searched: Bools  # whether the hit is `solid` in a waveform that is too wide for the closed form
+    # Always True; before a search, `continue_surfaces` treats each hit as a return.
+    all_start: Bools
 
 
 class WaveHits(NamedTuple):
-    """Hits that have energy, in the order of beams and distances."""
+    """Hits that have energy, sorted by beam and distance."""
 
     beam: Ints  # (n,): number of the beam in the batch
     pulses: PulseHits  # sub-rays, distances and original rows of the hits
-    energy: Floats  # (n,): as if all of the beam were in the hit's sub-ray
-    velocity: Floats  # (n,): radial, m/s; empty if returns have none
+    energy: Floats  # (n,): energy as if the hit's sub-ray carried the whole beam
+    velocity: Floats  # (n,): radial, m/s; empty if returns have no velocity
     marks: WaveMarks
 
 
 class WaveLight(NamedTuple):
-    """Light of hits in the order of beams and distances: (n,) each."""
+    """Light of hits sorted by beam and distance, each array of shape (n,)."""
 
-    time: Floats  # samples from range 0
-    energy: Floats  # height of the hit's Gaussian: the hit's share of the energy of the beam
+    time: Floats  # in samples, counted from range 0
+    energy: Floats  # height of the hit's Gaussian, which is its share of the beam's energy
 
 
 class WaveSampling(NamedTuple):
     """Sampling and search of waveforms."""
 
     sigma: float  # standard deviation of the system waveform, samples
-    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; otherwise peaks are found
 
 
 class WavePeaks(NamedTuple):
-    """Peak that each hit belongs to, in the waveforms that `search_waveforms` searches."""
+    """The peak that each hit belongs to, in the waveforms that `search_waveforms` searches."""
 
     number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
-    # (3, n): time of the peak, samples from range 0, energy, and width as a multiple of the system
-    # waveform's width.
+    # (3, n): time of the peak in samples from range 0, energy, and width as a multiple of the
+    # system waveform's width.
     shapes: Floats
 
 
 class WaveReturnArrays(NamedTuple):
-    """Arrays that returns are written to: (k,) each."""
+    """Arrays of shape (k,) to which returns are written."""
 
     beam: Ints  # number of the beam in the batch
     row: Ints  # row of the strongest hit, in the table of hits before sorting
     distance: Floats  # meters
     energy: Floats
     velocity: Floats  # radial, m/s
-    width: Floats  # multiple of the width of the system waveform
+    width: Floats  # as a multiple of the system waveform's width
 
     def first(self, count: int) -> WaveReturnArrays:
         """Return copies of the first `count` returns, which a loop has written."""
@@ -111,15 +113,16 @@ class WaveReturnArrays(NamedTuple):
 class FitScratch(NamedTuple):
     """Scratch memory for a fit of up to `TOGETHER` Gaussians to up to `length` samples.
 
-    Heights are shares of the highest sample, positions and widths are in standard deviations of
-    the system waveform.
+    Heights are shares of the highest sample. Positions and widths are in standard deviations of the
+    system waveform.
     """
 
-    best: Floats  # (3, TOGETHER): heights, positions and widths; first the guess, then the fit
-    guess: Floats  # (3, TOGETHER): the same of the guess
-    trial: Floats  # (3, TOGETHER): the same after the step that is tried
-    lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): Cholesky's lower triangle
-    slopes: Floats  # (3 * TOGETHER, length): derivatives of the sum by each parameter
+    # (3, TOGETHER): heights, positions and widths, first of the guess, then of the fit.
+    best: Floats
+    guess: Floats  # (3, TOGETHER): the same for the guess
+    trial: Floats  # (3, TOGETHER): the same after the current trial step
+    lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): lower triangle of the Cholesky factor
+    slopes: Floats  # (3 * TOGETHER, length): derivatives of the sum with respect to each parameter
     new_slopes: Floats  # (3 * TOGETHER, length)
     residual: Floats  # (length,)
     new_residual: Floats  # (length,)
@@ -127,13 +130,13 @@ class FitScratch(NamedTuple):
 
 
 class GaussianScratch(NamedTuple):
-    """Scratch memory for a decomposition of `length` samples into Gaussians: (length,) each."""
+    """Scratch memory to decompose `length` samples into Gaussians; arrays of shape (length,)."""
 
     curvature: Floats  # second differences of the samples
-    minima: Ints  # samples where the curvature has a minimum
+    minima: Ints  # samples at which the curvature has a minimum
     x: Floats  # samples of a piece, in standard deviations of the system waveform
     y: Floats  # samples of a piece, as shares of the highest sample
-    time: Floats  # times of the Gaussians, samples from range 0
+    time: Floats  # times of the Gaussians, in samples from range 0
     height: Floats  # heights in units of the samples
     width: Floats  # widths in standard deviations of the system waveform
     fit: FitScratch
@@ -144,7 +147,7 @@ class SearchScratch(NamedTuple):
 
     samples: Floats  # (length,)
     peaks: Floats  # (3, length): peaks of a waveform, as in `WavePeaks.shapes`
-    stops: Ints  # (length,): where peaks end, in `_KEY_STEPS` of a sample, from the first sample
+    stops: Ints  # (length,): ends of the peaks, in 1 / `_KEY_STEPS` samples from the first sample
     gaussians: GaussianScratch
 
 
@@ -158,11 +161,11 @@ class SampledWaveform(NamedTuple):
     sigma: float  # standard deviation of the system waveform, samples
 
 
-@stage
+@noinline
 def _sample(light, begin, stop, first, length, sigma, samples):
-    """Write the sum of the pulses of hits `begin` to `stop`, and return the highest sample.
+    """Write the summed pulses of hits `begin` to `stop`, and return the highest sample.
 
-    `samples` are numbered from `first` on; `length` samples are written.
+    The first of the `length` samples has the number `first`.
     """
     time = light.time
     energy = light.energy
@@ -201,12 +204,12 @@ def _vertex(samples, peak):
     return shift, height
 
 
-@stage
+@noinline
 def _peaks(wave, stops, peaks):
     """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
 
-    `SearchScratch` describes the arguments. Times and heights come from the Gaussian through three
-    samples, energies are the areas between the lowest samples to both sides.
+    The arguments are described in `SearchScratch`. Times and heights come from the Gaussian through
+    three samples. Energies are the areas between the lowest samples on both sides.
     """
     samples = wave.samples
     length = wave.length
@@ -221,7 +224,7 @@ def _peaks(wave, stops, peaks):
         peak = s
         last = s
         s += 1
-        while s < length:  # go to the next peak, or the end
+        while s < length:  # advance to the next peak or to the end
             if samples[s] < samples[last]:
                 last = s
             if s < length - 1 and _is_peak(samples, s, top):
@@ -241,9 +244,9 @@ def _peaks(wave, stops, peaks):
     return count
 
 
-@stage
+@noinline
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
-    """Write residual and slopes of a sum of `count` Gaussians, and return the sum of squares.
+    """Write residual and derivatives of a sum of `count` Gaussians, and return the sum of squares.
 
     `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
     a `FitScratch`.
@@ -268,9 +271,9 @@ def _residual(x, y, sample_count, gaussians, count, residual, slopes):
     return cost
 
 
-@stage
+@noinline
 def _solve(lower, size, step):
-    """Solve equations by their Cholesky factor, and replace the right side `step` by the result."""
+    """Solve a system by its Cholesky factor, replacing the right-hand side `step` by the result."""
     for row in range(size):
         for k in range(row):
             step[row] -= lower[row, k] * step[k]
@@ -282,9 +285,9 @@ def _solve(lower, size, step):
         step[row] /= lower[row, row]
 
 
-@stage
+@noinline
 def _step(residual, slopes, sample_count, count, damping, lower, step):
-    """Write a step of Levenberg and Marquardt for `count` Gaussians, by Cholesky's method."""
+    """Write a Levenberg-Marquardt step for `count` Gaussians, solved by Cholesky factorization."""
     size = 3 * count
     for row in range(size):
         gradient = 0.0
@@ -306,13 +309,13 @@ def _step(residual, slopes, sample_count, count, damping, lower, step):
     _solve(lower, size, step)
 
 
-@stage
+@noinline
 def _fit(x, y, sample_count, count, scratch):
-    """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x`, by least squares.
+    """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x` by least squares.
 
-    The method is by Levenberg and Marquardt; the fit stops when a step gains too little, or
-    after `STEPS`. Heights are at most `HIGHEST`, positions within `MOVES` of the guess, and widths,
-    standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess, and
+    The Levenberg-Marquardt method stops when a step gains too little, or after `STEPS` steps.
+    Heights are at most `HIGHEST`, positions are within `MOVES` of the guess, and widths (standard
+    deviations) are at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess and
     receives the fit.
     """
     best = scratch.best
@@ -370,12 +373,12 @@ def _fit(x, y, sample_count, count, scratch):
         damping = damping / 10 if better else damping * 10
 
 
-@stage
+@noinline
 def _find_minima(wave, scratch):
-    """Write the samples with minimal second derivative, and return their number.
+    """Write the samples at which the second derivative is minimal, and return their number.
 
-    Each minimum is the first guess of a Gaussian. `scratch` is a `GaussianScratch`, whose `minima`
-    receive indices of samples.
+    Each minimum is the initial guess of a Gaussian. `scratch` is a `GaussianScratch`, whose
+    `minima` receive sample indices.
     """
     samples = wave.samples
     length = wave.length
@@ -394,12 +397,12 @@ def _find_minima(wave, scratch):
     return count
 
 
-@stage
+@noinline
 def _fit_piece(wave, begin, stop, first, end, scratch):
     """Fit Gaussians `begin` to `stop` of `scratch` to samples `first` to `end` of a waveform.
 
-    Writes `time`, `height` and `width` of `scratch`, a `GaussianScratch`, whose `minima` are the
-    guess.
+    This writes `time`, `height` and `width` of `scratch`, a `GaussianScratch`, whose `minima` are
+    the initial guess.
     """
     samples = wave.samples
     sigma = wave.sigma
@@ -421,18 +424,18 @@ def _fit_piece(wave, begin, stop, first, end, scratch):
     for k in range(stop - begin):
         area += fit[0, k] * fit[2, k]
     for k in range(begin, stop):
-        # Samples say nothing about what is beyond a cut, so the energies of a piece are scaled to
-        # the sum of its samples.
+        # Samples do not determine the waveform beyond a cut, so the energies of a piece are scaled
+        # to match the sum of its samples.
         scratch.height[k] = fit[0, k - begin] * (total / area / (sigma * _AREA))
         scratch.time[k] = fit[1, k - begin] * sigma + (origin + wave.first)
         scratch.width[k] = fit[2, k - begin]
 
 
-@stage
+@noinline
 def _sort_gaussians(scratch, count, faintest):
-    """Sort Gaussians by time, without any lower than `faintest`, and return their number.
+    """Sort Gaussians by time, drop those lower than `faintest`, and return the remaining number.
 
-    A fit may move a Gaussian beyond its piece.
+    Sorting is needed because a fit may move a Gaussian out of its piece.
     """
     time = scratch.time
     height = scratch.height
@@ -457,12 +460,12 @@ def _sort_gaussians(scratch, count, faintest):
     return sorted_count
 
 
-@stage
+@noinline
 def _join_gaussians(wave, scratch, count, stops, peaks):
-    """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
+    """Merge close Gaussians into peaks, write `stops` and `peaks`, and return the number of peaks.
 
-    `SearchScratch` describes the arguments. A peak has the sum, mean and variance of its Gaussians,
-    and ends half-way to the next peak.
+    The arguments are described in `SearchScratch`. A peak has the sum, mean and variance of its
+    Gaussians, and ends half-way to the next peak.
     """
     sigma = wave.sigma
     time = scratch.time
@@ -495,16 +498,16 @@ def _join_gaussians(wave, scratch, count, stops, peaks):
     return peak
 
 
-@stage
+@noinline
 def _gaussians(wave, scratch, stops, peaks):
-    """Decompose a waveform into Gaussians, and write and return the same as `_peaks`.
+    """Decompose a waveform into Gaussians, with the same arguments and result as `_peaks`.
 
-    Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who take the
-    points of inflection around the minima), none narrower than the system waveform.
+    Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who use the
+    inflection points around the minima). None is narrower than the system waveform.
     """
     minima = scratch.minima
     count = _find_minima(wave, scratch)
-    # A piece is fitted by itself: `begin` is its first Gaussian, `first` its first sample.
+    # Each piece is fitted separately; `begin` is its first Gaussian, and `first` its first sample.
     begin = 0
     first = 0
     while begin < count:
@@ -525,9 +528,9 @@ def _gaussians(wave, scratch, stops, peaks):
 
 @compiled()
 def order_hits(subrays, ray, distance, energy, row):
-    """Write the rows of hits that have energy to `row[:, 0]`, by beam, then by distance.
+    """Write the rows of hits that have energy to `row[:, 0]`, sorted by beam and distance.
 
-    Hits are in the order of rays, which are sub-rays: `subrays` of each beam. `row` is
+    Hits are in the order of rays, which are sub-rays, with `subrays` per beam. `row` is
     `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
     of hits that have energy, and the largest number of hits of a beam.
     """
@@ -553,7 +556,7 @@ def order_hits(subrays, ray, distance, energy, row):
 
 @inlined
 def _end_of_beam(beam, begin):
-    """Return the row after the last hit of a beam whose first hit is row `begin`."""
+    """Return the row after the last hit of the beam whose first hit is in row `begin`."""
     end = begin + 1
     while end < len(beam) and beam[end] == beam[begin]:
         end += 1
@@ -562,7 +565,7 @@ def _end_of_beam(beam, begin):
 
 @inlined
 def _has_several_surfaces(starts_surface, first, end):
-    """Return whether hits `first` to `end` are on several surfaces, by their marks."""
+    """Return whether hits `first` to `end` are on several surfaces, according to their marks."""
     several = False
     for k in range(first + 1, end):
         several |= starts_surface[k]
@@ -571,16 +574,16 @@ def _has_several_surfaces(starts_surface, first, end):
 
 @compiled()
 def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
-    """Mark where waveforms start, write the waveforms to search, and return their number.
+    """Mark where waveforms start, write which waveforms to search, and return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
-    the Gaussian of the hit before. A waveform is searched if its hits are farther apart than
-    `NARROW` standard deviations, and not on one surface.
+    the previous hit's Gaussian. A waveform is searched if its hits are more than `NARROW` standard
+    deviations apart and not on one surface.
 
-    `hits` are `WaveHits`, whose marks `starts`, `starts_surface` and `searched` are written.
-    `sigma_m` is the standard deviation of the system waveform in range, meters, and `neighbors`
-    are `pulse_loops.Neighbors`. `hit_ranges` (k, 2) receives the first hit, and the hit after the
-    last, of each waveform to search.
+    `hits` is a `WaveHits`, whose marks `starts`, `starts_surface` and `searched` are written.
+    `sigma_m` is the standard deviation of the system waveform in meters of range, and `neighbors`
+    is a `pulse_loops.SubrayNeighbors`. `hit_ranges` (k, 2) receives the first hit, and one past
+    the last hit, of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
@@ -653,7 +656,7 @@ def scratch_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return the number of the peak, among `count`, that a hit at a time belongs to."""
+    """Return which of `count` peaks a hit at a given time belongs to."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
@@ -666,8 +669,8 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
     """Sample waveforms, and write the peak that each of their hits belongs to.
 
     Waveform k has the hits `hit_ranges[k, 0]` to `hit_ranges[k, 1]` of `light`, a `WaveLight`.
-    `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. Writes `peaks`, `WavePeaks`,
-    and marks in `starts` (n,) the first hits of peaks.
+    `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. The function writes `peaks`, a
+    `WavePeaks`, and marks the first hit of each peak in `starts` (n,).
     """
     sigma = sampling.sigma
     time = light.time
@@ -701,12 +704,13 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
 def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
-    `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbors` `pulse_loops.Neighbors`, and `output`
-    is a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in range. A
-    return starts at each mark `starts`, unless the hit continues a surface: such marks are cleared.
-    Hits of a return are one Gaussian with their mean and variance. Returns the number of returns.
+    `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.SubrayNeighbors`, and
+    `output` a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in
+    range. A return starts at each mark in `starts`, unless the hit continues a surface; these marks
+    are cleared. Hits of a return form one Gaussian with their mean and variance. Returns the number
+    of returns.
 
-    The arrays are taken from their tuples once: numba counts references at each access.
+    Arrays are read from their tuples only once, because numba counts references at each access.
     """
     beam = hits.beam
     energy = hits.energy
@@ -749,7 +753,7 @@ def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noq
             output.energy[count] = sum_energy / neighbors.subrays
             output.velocity[count] = sum_velocity / sum_energy
             output.width[count] = math.sqrt(1 + spread / sum_energy)
-            # A peak whose hits are all in the return replaces the Gaussian of the hits.
+            # If all hits of a peak are in the return, the peak replaces the Gaussian of the hits.
             if number[begin] >= 0 and number[begin] == number[k - 1]:
                 output.distance[count] = peaks.shapes[0, begin] / samples_per_m
                 output.energy[count] = peaks.shapes[1, begin]

@@ -1,10 +1,11 @@
-"""Waveforms: the light of a pulse that a receiver gets over time, and the returns in a waveform.
+"""Waveforms: the light of a pulse that a receiver records over time, and the returns in it.
 
-Pulse and receiver are Gaussian. So a waveform is a sum of Gaussians, one for each hit of a sub-ray,
-as wide as the pulse appears to the receiver: the system waveform (Wagner et al. 2006). Its height
-is in units of energy: a return that no slope has stretched is as high as its energy.
+Pulse and receiver response are Gaussian, so a waveform is a sum of Gaussians, one for each hit of a
+sub-ray. Each is as wide as the pulse appears to the receiver, which is the system waveform (Wagner
+et al. 2006). Heights are in units of energy: a return that is not stretched by a slope is as high
+as its energy.
 
-Loops of wave_loops.py find the returns, pulse by pulse, so batches do not change the result.
+The loops in wave_loops.py find returns pulse by pulse, so batches do not affect the result.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ class WaveformStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the sensor finds returns in waveforms."""
+        """Return True if the sensor finds returns in waveforms."""
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns in the waveforms of the hits of a batch, with the beam as `ray`."""
+        """Return the returns found in the waveforms of a batch, with the beam as `ray`."""
         digitizer = Digitizer.for_sensor(self.setup)
         in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
@@ -50,7 +51,7 @@ class Digitizer:
 
     sigma_ns: float  # standard deviation of the system waveform, ns
     sample_ns: float  # time between samples, ns
-    decomposes: bool  # whether waveforms are decomposed into Gaussians; else peaks are found
+    decomposes: bool  # whether waveforms are decomposed into Gaussians; otherwise peaks are found
 
     @classmethod
     def for_sensor(cls, setup: Setup) -> Digitizer:
@@ -61,29 +62,30 @@ class Digitizer:
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of the system waveform in range, meters."""
+        """Standard deviation of the system waveform, in meters of range."""
         return self.sigma_ns * LIGHT_M_NS / 2
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the system waveform, samples."""
+        """Standard deviation of the system waveform, in samples."""
         return self.sigma_ns / self.sample_ns
 
     @property
     def reach(self) -> int:
-        """Number of samples before, and behind, the peak of a return where the return is not 0."""
+        """Number of samples before or after the peak of a return at which the return is not 0."""
         return int(np.ceil(CUT * self.sigma))
 
     @property
     def samples_per_m(self) -> float:
-        """Samples in a meter of range."""
+        """Number of samples per meter of range."""
         return 2 / LIGHT_M_NS / self.sample_ns
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
-        """Return heights of returns (n,) by energy and full width at half maximum, ns.
+        """Return the heights of returns (n,) with the given energies and widths.
 
-        A return as wide as the system waveform is as high as its energy. A width of 0 is unknown,
-        and taken as the width of the system waveform.
+        `width` is the full width at half maximum in ns. A return as wide as the system waveform is
+        as high as its energy. A width of 0 means that the width is unknown; it is then assumed to
+        be the width of the system waveform.
         """
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
@@ -92,28 +94,29 @@ class Digitizer:
 def returns_in(
     hits: PulseReturns, digitizer: Digitizer, subrays: int = 1, planes: Planes | None = None
 ) -> PulseReturns:
-    """Return the returns in the waveforms of beams, in the order of beams and distances.
+    """Return the returns found in the waveforms of beams, sorted by beam and distance.
 
-    Hits that lie close together, or on one surface (`pulse_loops.continue_surfaces`), are one
+    Hits that are close together, or on one surface (`pulse_loops.continue_surfaces`), form one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
     and color of a return come from its strongest hit.
 
     Parameters
     ----------
     hits
-        Hits of sub-rays, in the order of sub-rays; `ray` is the sub-ray, counted in the batch.
+        Hits of sub-rays, sorted by sub-ray. `ray` is the number of the sub-ray in the batch.
     digitizer
         Sampling of the waveforms.
     subrays
-        Sub-rays of a beam.
+        Number of sub-rays per beam.
     planes
-        Planes of the hits; None if no surface continues from sub-ray to sub-ray.
+        Planes of the hits. If None, no surface continues from sub-ray to sub-ray.
 
     Returns
     -------
-    Returns whose `ray` is the beam, counted in the batch. Hits without energy are dropped.
+    PulseReturns
+        Returns whose `ray` is the number of the beam in the batch. Hits without energy are dropped.
     """
-    from . import wave_loops  # not before: numba takes half a second to import
+    from . import wave_loops  # imported here because numba takes half a second to import
 
     wave_hits = _wave_hits(hits, subrays)
     count = len(wave_hits.beam)
@@ -148,7 +151,7 @@ def returns_in(
 
 
 def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
-    """Return the hits that have energy, sorted by beam, then by distance, for loops.
+    """Return the hits that have energy, sorted by beam and distance, for compiled loops.
 
     `marks.solid` and `marks.all_start` are filled in; loops write the other marks.
     """
@@ -186,9 +189,9 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
 
 
 def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, hit_ranges: Ints) -> WavePeaks:
-    """Return the peaks of hits in waveforms that are searched, and mark where peaks start.
+    """Return the peaks of hits in searched waveforms, and mark where peaks start.
 
-    `hit_ranges` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
+    `hit_ranges` (k, 2) are the first hit and one past the last hit of each waveform. This writes
     `hits.marks.starts`.
     """
     from . import wave_loops

@@ -1,4 +1,4 @@
-"""Recorded waveforms: the samples around each return."""
+"""Recorded waveforms, which are the samples around each return."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from ...base.random_numbers import Purpose, normal, raw
 from ...columns.waveforms import FAINTEST, ZERO, record
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
-from ..returns import Keys, PulseReturns, numbers, required
+from ..returns import Keys, PulseReturns, number_within_ray, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
 SAMPLES = Purpose(50, "stream of the samples of a waveform")
 SAMPLE = Purpose(51, "noise of a sample")
-BLOCK_SAMPLES = 1 << 20  # samples that are computed at a time
+BLOCK_SAMPLES = 1 << 20  # number of samples that are computed at a time
 
 
 class Windows(NamedTuple):
-    """Windows of consecutive samples of waveforms: arrays (n,)."""
+    """Windows of consecutive waveform samples, as arrays of shape (n,)."""
 
-    beam: Ints  # counted from the first beam of the batch
-    begin: Ints  # first sample, counted in samples from the firing
+    beam: Ints  # number of the beam in the batch
+    begin: Ints  # number of the first sample, counted from the firing
     first_hit: Ints  # row of the first hit of the beam
     stop_hit: Ints  # one past the row of the last hit of the beam
 
     def take(self, row_range: slice) -> Windows:
-        """Return the windows of a slice of rows."""
+        """Return the windows in a slice of rows."""
         return Windows(*(column[row_range] for column in self))
 
 
 class RecordingStep(PulseStep):
-    """Records the waveforms of returns, with the noise of the receiver."""
+    """Records the waveforms of returns, including receiver noise."""
 
     role = Role.CHANGES
     effects = ("Waveforms",)
@@ -59,9 +59,9 @@ class RecordingStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns with their recorded waveforms.
 
-        A window starts where the signal of the window's first return starts. Later returns of the
-        pulse share the window if their signals stop within it. Overlapping windows of a pulse hold
-        the same samples.
+        A window starts where the signal of its first return starts. Later returns of the pulse
+        share the window if their signals end within it. Overlapping windows of a pulse contain
+        identical samples.
         """
         digitizer = Digitizer.for_sensor(self.setup)
         count = self.setup.waveform_samples
@@ -74,7 +74,7 @@ class RecordingStep(PulseStep):
         for start in range(0, len(windows.beam), size):
             block = windows.take(slice(start, start + size))
             samples = _signal_samples(batch, digitizer, block, count)
-            steps, exponents = digitized(self._received(samples, block, batch))
+            steps, exponents = digitize(self._received(samples, block, batch))
             first, stop = np.searchsorted(window_of_return, [start, start + size])
             window_indices = window_of_return[first:stop] - start
             records["samples"][first:stop] = steps[window_indices]
@@ -82,7 +82,7 @@ class RecordingStep(PulseStep):
         return returns._replace(waveform=records)
 
     def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
-        """Add the receiver's noise to samples (windows, count) in place. Return clipped samples."""
+        """Add receiver noise to samples (windows, count) in place, and clip the samples."""
         noise = self.setup.noise
         if noise.threshold:
             keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
@@ -95,10 +95,11 @@ class RecordingStep(PulseStep):
 
 
 def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, count: int) -> Ints:
-    """Return the first sample of the window of each return (n,), in samples after firing.
+    """Return the first sample of each return's window, counted from the firing.
 
-    `distance` (n,) is in meters, `return_number` (n,) counts the returns of each pulse from 0;
-    windows have `count` samples. Returns that share a window have the same first sample.
+    `distance` (n,) is in meters, `return_number` (n,) counts the returns of each pulse from 0, and
+    `count` is the number of samples per window. Returns that share a window have the same first
+    sample.
     """
     time = distance * digitizer.samples_per_m
     first = np.maximum(np.floor(time).astype(np.int64) - digitizer.reach, 0)
@@ -116,8 +117,8 @@ def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, 
 def _windows(
     returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
 ) -> tuple[Windows, Ints]:
-    """Return windows of `count` samples, and the row of each return's window: (n,)."""
-    return_number = numbers(returns.ray)
+    """Return windows of `count` samples, and the row of each return's window."""
+    return_number = number_within_ray(returns.ray)
     begin = _window_starts(returns.distance, return_number, digitizer, count)
     starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
     beam = returns.ray[starts_window] - batch.start
@@ -131,14 +132,14 @@ def _windows(
 def _signal_samples(
     batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int
 ) -> Floats:
-    """Return samples of all hits' signals, summed, in windows, without noise: (windows, count)."""
+    """Return the summed signals of all hits in each window, without noise."""
     hits = required(batch.hits)
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)
     first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
     row_indices = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
     time = hits.distance[row_indices] * digitizer.samples_per_m
-    first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
+    first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first nonzero sample
     sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
     height *= required(hits.energy)[row_indices, None] / batch.subrays_per_beam
@@ -149,10 +150,10 @@ def _signal_samples(
     return samples.reshape(len(hit_counts), count).astype(np.float64)
 
 
-def digitized(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples (n, k) to integers around `ZERO`, in steps of a power of two for each row.
+def digitize(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+    """Round samples (n, k) to integers around `ZERO`, with a power-of-two step for each row.
 
-    Returns the integers, uint16 (n, k), and the exponents of the steps (n,).
+    Returns the integers as uint16 (n, k), and the exponents of the steps (n,).
     """
     scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
     _, exponents = np.frexp(scale)

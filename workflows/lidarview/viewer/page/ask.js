@@ -1,4 +1,4 @@
-// Asks the server of this page, or an exported page itself: an answer is JSON, with arrays beside it.
+// Requests data from the server or, in an exported page, from the page itself: JSON and arrays.
 
 const TYPES = {
   float32: Float32Array, float64: Float64Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
@@ -10,7 +10,7 @@ export async function ask(what, asked = {}, signal = undefined) {
   return unpacked(await answerTo(what, `${what}?${query}`, signal));
 }
 
-// A server that starts, or that is busy, is asked again after these pauses.
+// If the server is starting or busy, requests are repeated after these delays.
 const PAUSES_MS = [250, 500, 1000, 0];
 
 async function answerTo(what, address, signal) {
@@ -40,7 +40,7 @@ function unpacked(bytes) {
   return { ...header, arrays };
 }
 
-// -- an exported page: it holds answers, and of the points one for all questions -----------
+// -- an exported page, which contains all answers, and a single answer with all points ------
 
 const inFile = (question) => document.querySelector(`script[data-question="${question}"]`);
 const known = new Map(); // {question: answer}
@@ -57,7 +57,7 @@ async function read(question) {
   return unpacked(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
 }
 
-// Values of a column, as `packing.py` has packed them: planes of bytes of differences in zigzag.
+// Unpacks the values of a column from byte planes of zigzag differences; see `packing.py`.
 const columns = new Map(); // {name: values}
 function column(cloud, name) {
   if (columns.has(name)) return columns.get(name);
@@ -75,7 +75,7 @@ function column(cloud, name) {
   return values;
 }
 
-// A function that writes the color of a row to an array, 4 bytes each.
+// Returns a function that writes the color of a row to an array, 4 bytes per row.
 function painter(cloud, name, limits) {
   const legend = cloud.legends[name], { arrays } = cloud, of = (part) => column(cloud, part);
   if (name === "rgb" && !cloud.packed.rgb) {
@@ -101,7 +101,7 @@ function painter(cloud, name, limits) {
   };
 }
 
-// Whether the values of a row are within the limits of a filter.
+// Returns whether the values of a row are within the limits of a filter.
 function testsOf(cloud, filter) {
   return filter.split(";").filter(Boolean).map((limit) => {
     const [text, low, high] = limit.split(","), name = text.replace(/^!/, ""), values = column(cloud, name);
@@ -135,7 +135,7 @@ async function pointsOf({ color, filter = "", scans, most, limits }) {
   return { count: all.length, legend: legendWith(cloud.legends[color], ends), arrays: { positions, colors, rows } };
 }
 
-// The legend of a color scale whose limits were set by hand.
+// Returns the legend of a color scale with limits that the user has set.
 function legendWith(legend, limits) {
   if (!limits || !legend.limits) return legend;
   const [low, high] = limits, middle = legend.logarithmic && low > 0 ? Math.sqrt(low * high) : (low + high) / 2;

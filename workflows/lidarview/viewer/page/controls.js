@@ -1,4 +1,4 @@
-// Controls of the panel: elements that call a function when a user changes them.
+// Controls of the panel: elements that call a function when the user changes them.
 
 export function element(tag, properties = {}, ...children) {
   const { style, dataset, ...rest } = properties;
@@ -34,7 +34,7 @@ const ICONS = {
   theme: '<circle cx="8" cy="8" r="5.5"/><path class="full" d="M8 2.5a5.5 5.5 0 0 1 0 11z"/>',
 };
 
-// Names a control that has no text, for the mouse and for screen readers.
+// Labels a control without text, for tooltips and screen readers.
 export function explain(control, title) {
   control.title = title;
   control.setAttribute("aria-label", title);
@@ -51,7 +51,7 @@ export function setIcon(button, icon) {
   button.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true">${ICONS[icon]}</svg>`;
 }
 
-// Switches between light and dark; at first as users have chosen, else as their system is.
+// Switches between light and dark. The default is the user's last choice or the system setting.
 export function themeButton(show = () => {}) {
   const systemDark = matchMedia("(prefers-color-scheme: dark)");
   const saved = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
@@ -62,7 +62,7 @@ export function themeButton(show = () => {}) {
   const use = () => set(saved() ?? (systemDark.matches ? "dark" : "light"));
   use();
   systemDark.addEventListener("change", use);
-  addEventListener("storage", use); // another page has changed it, as the one around this one
+  addEventListener("storage", use); // changed by another page, such as the enclosing one
   return iconButton("theme", "Switch between light and dark mode", () => {
     const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
     try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
@@ -116,7 +116,7 @@ export function tick(title, checked, act) {
   return line;
 }
 
-// Two ends of a range of numbers; null for an end that limits nothing.
+// The two ends of a range of numbers; null for an end without a limit.
 export function dual(title, low, high, step, ends, words, act) {
   const span = high - low || 1;
   const inputs = [0, 1].map((end) =>
@@ -146,9 +146,9 @@ export function dual(title, low, high, step, ends, words, act) {
   return element("div", {}, line, element("div", { className: "ends" }, first, last));
 }
 
-// only: value of the label that is shown alone, or null; act(value) when a label is pressed; names:
-// {value: name} of those that the server knows by their numbers only; hidden: values that are off;
-// change(value) when one is switched on or off.
+// only: value of the only label that is shown, or null; act(value): called when a label is clicked;
+// names: {value: name} for values that the server knows only by number; hidden: values that are off;
+// change(value): called when a value is switched on or off.
 export function legend(told, only, act, names = {}, hidden = new Set(), change = null) {
   const box = element("div", { className: "legend" });
   if (!told) return box;
@@ -179,7 +179,7 @@ export function legend(told, only, act, names = {}, hidden = new Set(), change =
   return box;
 }
 
-// A number with some four digits that matter.
+// Formats a number with about four significant digits.
 export function number(value, step = Number.isInteger(value) ? 1 : Math.abs(value) / 1000) {
   const digits = step > 0 ? Math.min(6, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))) : 0;
   return (+value.toFixed(digits) + 0).toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });

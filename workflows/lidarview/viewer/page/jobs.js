@@ -1,15 +1,15 @@
-// The list of jobs: how many are done, a table of some, points of one, and charts.
+// The job list: the progress, a table of some jobs, the points of one job, and charts.
 import { ask } from "./ask.js";
 import { element, themeButton } from "./controls.js";
 import { follow, meter, replace, slots, stop } from "./run.js";
 
 const NEWS_MS = 1000;
-const SETTLED_MS = 1500; // after its page is loaded, the viewer of a job has drawn
+const SETTLED_MS = 1500; // time in which a job's viewer draws after its page has loaded
 
 const $ = (id) => document.getElementById(id);
 const whole = (value) => Math.round(value).toLocaleString("en");
 
-// 12,345 up to six digits, then 1.23 M
+// 12,345 with up to six digits, then 1.23 M
 function short(value) {
   for (const [size, letter] of [[1e12, "T"], [1e9, "G"], [1e6, "M"]]) {
     if (value >= size) return `${(value / size).toPrecision(3)} ${letter}`;
@@ -43,14 +43,14 @@ function showRun(told) {
 
 // -- the table ---------------------------------------------------------------------------
 
-// The name of a job leads to its page, if its points can be shown.
+// The name of a job links to its page if its points can be shown.
 function nameOf(job) {
   if (!job.opens) return cell(job.name);
   return element("td", {}, element("a", { href: `job/${job.number}/`, target: "_blank", title: "Open the point cloud of this job", textContent: job.name }));
 }
 const cell = (text, className = "") => element("td", { textContent: text, className });
 
-// A path may be broken after its dots.
+// Paths may wrap after dots.
 const broken = (name) => name.split(/(?<=\.)/).flatMap((part, k) => (k ? [element("wbr"), part] : [part]));
 
 function group(title, remark, width, rows) {
@@ -71,7 +71,7 @@ function showJobs(told) {
   });
   const failed = told.failures.flatMap((job, k) => {
     const own = line(job, cell("failed", "text"), "", "");
-    if (told.failures[k + 1]?.error === job.error) return [own]; // a reason stands below all that have it
+    if (told.failures[k + 1]?.error === job.error) return [own]; // a reason is shown once below all jobs that have it
     const reason = element("td", { className: "reason", colSpan: width }, element("span", { textContent: job.error }));
     return [own, element("tr", {}, reason)];
   });
@@ -90,9 +90,9 @@ function showJobs(told) {
 // -- points of a job ---------------------------------------------------------------------
 
 let shown = null, follows = true, isLoading = false;
-let isStill = false; // of a data set, whose jobs are all there
+let isStill = false; // for a data set, whose jobs are all complete
 
-// The viewer of a job takes the place of the one before once it has drawn.
+// The viewer of a job replaces the previous one once it has drawn.
 function showCloud(newest) {
   if (!newest || isLoading || newest[0] === shown || (shown !== null && !follows)) return;
   const [number, name] = newest;
@@ -116,7 +116,7 @@ function showCloud(newest) {
 
 // -- news --------------------------------------------------------------------------------
 
-// The page's content policy refuses styles in text, but not those that a script sets.
+// The content policy refuses inline styles in HTML, but not styles that a script sets.
 function showCharts(svg) {
   $("charts").innerHTML = svg.replaceAll(' style="', ' data-style="');
   for (const styled of $("charts").querySelectorAll("[data-style]")) {
@@ -140,7 +140,7 @@ async function show(told) {
 $("buttons").append(themeButton(), stop);
 follow("jobs", () => ({ newest: follows && !document.hidden ? 1 : undefined }), NEWS_MS, show).catch((error) => {
   console.warn(error);
-  $("slots").replaceChildren(); // it goes on no more
+  $("slots").replaceChildren(); // the run has ended
   $("state").textContent = error.message;
   $("state").className = "bad";
 });

@@ -1,24 +1,24 @@
-// The page: what is asked of the server, the controls, and the time that is played.
+// The page: requests to the server, the controls, and playback.
 import { ask } from "./ask.js";
 import { button, dual, element, explain, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
 import { count, follow, replace, slots, stop } from "./run.js";
 
-const FIRST_LOOK = 200_000; // points that are asked for first
-const POINTER_MS = 60; // for which the mouse rests before its place is looked for
-const REST_MS = 250; // for which the camera stands still before points are asked for
+const FIRST_LOOK = 200_000; // number of points in the first request
+const POINTER_MS = 60; // time for which the mouse must rest before its position is determined
+const REST_MS = 250; // time for which the camera must rest before points are requested
 const NEWS_MS = 500;
-const CACHED = 300e6; // bytes of points of single sweeps
-const AHEAD = 3; // sweeps that are asked for before they are played
-const GROWING = 300_000; // points of all sweeps up to now, while they are played
+const CACHED = 300e6; // memory for the points of single sweeps, in bytes
+const AHEAD = 3; // number of sweeps that are requested in advance during playback
+const GROWING = 300_000; // points of all sweeps up to the current time during playback
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
 const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all so far"]];
 const HIDDEN = "hidden";
-const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
-const READING = "Loading points …"; // until the first are there
-const FAINT = 0.2; // opacity of gray surfaces before points, so that these come first
-const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
+const OPEN = 3e38; // an end of a range without a limit, which fits into float32
+const READING = "Loading points …"; // shown until the first points arrive
+const FAINT = 0.2; // opacity of gray surfaces in front of points, so that the points remain visible
+const NARROW = matchMedia("(max-width: 799px)"); // where the panel is a drawer
 
 const $ = (id) => document.getElementById(id);
 for (const kind of ["error", "unhandledrejection"])
@@ -26,15 +26,15 @@ for (const kind of ["error", "unhandledrejection"])
 const picture = new Picture($("canvas"), $("labels"), $("handles"), $("axes"), $("scale"), () => moved());
 const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
-// What users have chosen; a link holds it.
+// The user's choices, which a link stores.
 const chosen = {
   color: "z", scene: "gray", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: false,
   budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: false, follow: false, tool: "point", limits: null, clipBox: false,
 };
-let state = null; // of the server: {…, arrays}
-let sweeps = []; // [{first, last, begin, sensor, index}] in order of their beginnings
+let state = null; // answer of the server: {…, arrays}
+let sweeps = []; // [{first, last, begin, sensor, index}] in the order of their start times
 let playing = false;
-let drives = false; // a result with a carrier that moves
+let drives = false; // whether the result has a moving vehicle
 let picked = []; // points: {place, local, columns}
 
 // -- the server --------------------------------------------------------------------------
@@ -54,7 +54,7 @@ function sayRead() {
   if ($("hint").textContent === READING) say("");
 }
 
-// Says how far a run is, unless something else is said.
+// Shows the progress of a run, unless another message is shown.
 let saidState = "";
 function sayState(words) {
   if (["", READING, "Loading …", saidState].includes($("hint").textContent)) say(words);
@@ -68,7 +68,7 @@ function say(words, bad = false) {
 
 // -- points ------------------------------------------------------------------------------
 
-const requests = { base: null, detail: null }; // what is under way
+const requests = { base: null, detail: null }; // requests in flight
 const cache = new Map(); // {key: points of sweeps}, the last used at the end
 let shownKey = null, restTimer = 0, complete = false;
 
@@ -105,7 +105,7 @@ function questionAt(time) {
 
 const keyOf = (asked) => JSON.stringify([asked, state.version, chosen.budget]);
 
-// Shows the points that are chosen; returns whether they are there already.
+// Shows the selected points, and returns whether they are already available.
 function refresh() {
   if (!state) return true;
   const asked = questionAt(chosen.time), key = keyOf(asked);
@@ -154,7 +154,7 @@ async function loadBase(asked) {
   if (!complete) await loadDetail();
 }
 
-// More points: all if they are few enough, else those of the picture.
+// Requests more points: all if there are few enough, otherwise those in the view.
 async function loadDetail() {
   const base = picture.layers.base?.told;
   if (!base || complete || chosen.show !== "all" || requests.base) return;
@@ -229,7 +229,7 @@ const onlyObject = (name) => {
   return limits && limits[1] === limits[2] ? limits[1] : null;
 };
 
-// Values of a column that are switched off: entries of the filter whose names begin with "!".
+// Returns the values of a column that are switched off: filter entries that begin with "!".
 const hiddenOf = (name) => new Set(chosen.filter.filter(([column]) => column === `!${name}`).map(([, value]) => value));
 const ofColumn = (name) => ([column]) => column === name || column === `!${name}`;
 
@@ -244,7 +244,7 @@ function showLegend(told) {
   if (told?.labels?.length && column !== "result") tellCounts(panel.legend, column).catch(failed);
 }
 
-// The ends of the color scale, to be set by hand.
+// Lets the user set the ends of the color scale.
 function limitInputs(limits) {
   const inputs = limits.map((value, end) => {
     const input = element("input", { type: "number", step: "any", value: +value.toPrecision(6) });
@@ -266,7 +266,7 @@ function setColorLimits(limits) {
   refresh();
 }
 
-// Writes beside each label how many points it has.
+// Writes the number of points beside each label.
 async function tellCounts(box, column) {
   const { counts, exact } = await ask("counts", { name: column });
   const known = new Map(counts);
@@ -274,7 +274,7 @@ async function tellCounts(box, column) {
     shown.textContent = `${exact ? "" : "≈ "}${(known.get(+shown.dataset.value) ?? 0).toLocaleString("en")}`;
 }
 
-// A legend whose labels choose values of a column, or switch them off.
+// Creates a legend whose labels select values of a column, or switch them off.
 const labels = (told, column) => legend(
   told, onlyObject(column), (value) => toggle(column, value), column === "class" ? state.classes : {},
   hiddenOf(column), (value) => switchValue(column, value));
@@ -295,7 +295,7 @@ function tellFacts() {
   if (!state || !panel.facts) return;
   const layers = Object.values(picture.layers).map((points) => points.told);
   const some = layers[0]?.count ?? (chosen.color === HIDDEN ? state.points : 0);
-  const count = state.sampled ? state.points : some; // of a run, some parts are read
+  const count = state.sampled ? state.points : some; // during a run, only a part has been read
   const drawn = Math.min(picture.drawn, count), n = (value) => value.toLocaleString("en");
   const parts = [`<b>${n(count)} ${count === 1 ? "point" : "points"}</b>`];
   if (count < state.points) parts.push(`of ${n(state.points)}`);
@@ -312,7 +312,7 @@ function setLimits(name, limits) {
 
 const objectLimits = () => chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null;
 
-// Its labels choose objects, or materials of points.
+// The labels select objects or materials of points.
 function showSceneLegend() {
   const column = panel.sceneTold?.column ?? "object", acts = state.columns.some(({ name }) => name === column);
   panel.sceneLegend?.replaceChildren(acts ? labels(panel.sceneTold, column) : legend(panel.sceneTold, null, () => {}));
@@ -421,7 +421,7 @@ function buildPanel() {
     parts.push(section("Scene", true,
       menu("color", [...state.scene_colors, HIDDEN], chosen.scene, (value) => {
         chosen.scene = value;
-        panel.opacity.set(value === "gray" ? FAINT : 1); // a color is to be seen
+        panel.opacity.set(value === "gray" ? FAINT : 1); // so that the color is visible
         loadSurface().catch(failed);
       }),
       panel.sceneLegend,
@@ -474,7 +474,7 @@ function showPanel(on) {
   document.documentElement.classList.toggle("no-panel", !on);
 }
 
-// Has the server write the points that are shown, and saves its file.
+// Lets the server write a file with the displayed points, and saves the file.
 async function download(format) {
   const cut = chosen.clip.flatMap(([low, high], axis) => (low === null && high === null ? [] :
     [["xyz"[axis], low === null ? -OPEN : low + state.origin[axis], high === null ? OPEN : high + state.origin[axis]]]));
@@ -527,14 +527,14 @@ async function loadSurface() {
     const cut = Math.min(told.roof_cut ?? Infinity, state.cut ?? Infinity);
     if (Number.isFinite(cut) && !loadSurface.linked) setClip([[null, null], [null, null], [null, cut]]);
     if (told.roof_cut !== null) {
-      picture.roofed = true; // seen from higher up, no wall is in the way
+      picture.roofed = true; // from above, no wall obstructs the view
       if (!drives && !new URLSearchParams(location.hash.slice(1)).has("camera")) look("all");
     }
     showPath();
   }
 }
 
-// Rays are of all sweeps.
+// Rays belong to all sweeps.
 function showRays() {
   picture.raysShown = chosen.rays && (chosen.show === "all");
   picture.showObjects(picture.onlyObjects, picture.hiddenObjects);
@@ -544,7 +544,7 @@ const showPath = () => picture.setPath(state.path, loadSurface.floor ?? state.bo
 
 // -- picked points and measurements ------------------------------------------------------
 
-// {tool: [title, most points, what to click]}
+// {tool: [title, maximum number of points, what to click]}
 const TOOLS = {
   point: ["Inspect a point (1)", 1, "Click a point to inspect it. Shift-click another point to measure the distance."],
   distance: ["Measure a distance (2)", 2, "Click two points."],
@@ -582,7 +582,7 @@ const length = (vector) => Math.hypot(...vector);
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const digits = (value, unit, places = 3) => `${value.toLocaleString("en", { minimumFractionDigits: places, maximumFractionDigits: places })} ${unit}`;
 
-// What is measured between places: [name, words], the result first.
+// Returns the measurements between positions as [name, text], the main result first.
 function measured(tool, places) {
   if (tool === "distance" && places.length === 2) {
     const way = less(places[1], places[0]);
@@ -595,7 +595,7 @@ function measured(tool, places) {
     return [["angle", digits((Math.acos(Math.min(1, Math.max(-1, cosine))) * 180) / Math.PI, "°", 2)],
       ["sides", `${digits(length(a), "m")}, ${digits(length(b), "m")}`]];
   }
-  if (tool === "area" && places.length > 2) { // half of the sum of cross products, for any plane
+  if (tool === "area" && places.length > 2) { // half the sum of cross products, in any plane
     const round = places.map((place, k) => [less(place, places[0]), less(places[(k + 1) % places.length], places[0])]);
     const sum = round.map(([a, b]) => cross(a, b)).reduce((a, b) => a.map((value, k) => value + b[k]));
     return [["area", digits(length(sum) / 2, "m²")], ["seen from above", digits(Math.abs(sum[2]) / 2, "m²")],
@@ -604,7 +604,7 @@ function measured(tool, places) {
   return [];
 }
 
-// A click is answered at once: by a mark on the point, or by words where no point is.
+// Responds to a click at once, with a mark on the point or a message if there is no point.
 async function pick(x, y, measure) {
   const found = picture.pick(x, y);
   if (!found) {
@@ -636,7 +636,7 @@ function showPicked() {
     element("tr", {}, element("td", { textContent: name }), element("td", { textContent: value })))));
 }
 
-// The result beside the tools, where the panel may be hidden.
+// Shows the result beside the tools, because the panel may be hidden.
 function tellMeasured(rows) {
   const point = picked.at(-1), box = $("measured");
   const lines = rows.length ? rows.map(([name, words]) => `${name} ${words}`)
@@ -668,8 +668,8 @@ function showClipBox(on) {
 
 // -- time --------------------------------------------------------------------------------
 
-let steps = []; // beginnings of the sweeps of the sensors that are shown, ascending
-let stationAt = new Map(); // {beginning of a sweep: its station}
+let steps = []; // start times of the sweeps of displayed sensors, ascending
+let stationAt = new Map(); // {start time of a sweep: its station}
 const clock = {};
 
 function buildSteps() {
@@ -681,7 +681,7 @@ function buildSteps() {
   drawTicks();
 }
 
-// The slider has the time of a drive, or the number of a sweep where nothing moves but from station to station.
+// The slider selects a time or, if the sensor only moves between stations, the number of a sweep.
 const stationary = () => state.stations.length > 0;
 const duration = () => Math.max(state.duration, 1e-9);
 const sliderEnd = () => (stationary() ? Math.max(steps.length - 1, 1) : duration());
@@ -708,7 +708,7 @@ function buildTime() {
   clock.follow.title = "Follow the platform with the camera";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
-  clock.images.hidden = Boolean(state.offline); // a file does not hold them
+  clock.images.hidden = Boolean(state.offline); // not available in an exported page
   $("time").replaceChildren(
     element("div", { className: "line" }, clock.slider, clock.ticks),
     element("div", { className: "transport" },
@@ -720,7 +720,7 @@ function buildTime() {
   showToggles();
 }
 
-// The camera takes its place behind the carrier, and keeps it while the carrier drives and turns.
+// Moves the camera behind the vehicle, where it stays while the vehicle drives and turns.
 function setFollow(on) {
   chosen.follow = picture.follow = on;
   if (on) look("sensor");
@@ -744,7 +744,7 @@ function drawTicks() {
     pen.fillStyle = style.getPropertyValue("--muted");
     pen.font = "11px system-ui, sans-serif";
     pen.textAlign = "center";
-    let free = 0; // where no number is yet
+    let free = 0; // first position without a label
     steps.forEach((time, k) => {
       const x = room + ((width - 2 * room) * k) / sliderEnd();
       if (x < free || stationAt.get(time) === stationAt.get(steps[k - 1])) return;
@@ -754,7 +754,7 @@ function drawTicks() {
     return;
   }
   if (steps.length < width / 3) for (const time of steps) pen.fillRect(at(time), 0, 1, 4);
-  if (!state.duration) return; // one sweep of a cloud alone: nobody knows how long it took
+  if (!state.duration) return; // a single sweep of a cloud has an unknown duration
   const most = width / 70, step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(duration() / most))).find((n) => duration() / n <= most);
   pen.fillStyle = style.getPropertyValue("--muted");
   pen.font = "11px system-ui, sans-serif";
@@ -775,7 +775,7 @@ function setShow(value) {
   tellTime();
 }
 
-// Playing and stepping shows single sweeps, unless a user has chosen what is shown.
+// Playing and stepping show single sweeps, unless the user has chosen another mode.
 function leaveAll() {
   if (chosen.show === "all" && !clock.own && !state.preview) setShow("sweep");
 }
@@ -816,7 +816,7 @@ function setPlaying(on) {
   if (chosen.time >= duration() - 1e-6) setTime(0);
 }
 
-// The time of a sweep does not pass before its points are there.
+// Playback waits until the points of a sweep have arrived.
 function play(seconds) {
   let time = chosen.time + seconds * chosen.speed, ended = time >= duration();
   if (stationary()) {
@@ -909,7 +909,7 @@ function linkText() {
   return new URLSearchParams(words).toString();
 }
 
-let written = location.hash; // what this page has read or written last
+let written = location.hash; // the state that this page has last read or written
 
 function writeLink(words) {
   history.replaceState(null, "", `#${words}`);
@@ -926,11 +926,11 @@ async function copyLink() {
   }
 }
 
-// The address holds the view, so that it can be shared and opened again.
+// The URL stores the view, so that it can be shared and opened again.
 let linked = "";
 function keepLink() {
   if (playing || lost || state.live || document.documentElement.classList.contains("plain")) return;
-  if (location.hash !== written) return; // another link was entered, with which the page loads again
+  if (location.hash !== written) return; // the user has entered another link, which reloads the page
   const words = linkText();
   if (words !== linked && linked) writeLink(words);
   linked = words;
@@ -983,7 +983,7 @@ function readCamera(words) {
   }
 }
 
-// -- the beginning, news of a run, and the frames ----------------------------------------
+// -- start-up, updates from a run, and frames ---------------------------------------------
 
 function takeState(told) {
   state = told;
@@ -1012,7 +1012,7 @@ function takeState(told) {
   document.title = state.title;
 }
 
-// Places the sensors and actors of a scanner as its last sweep has met them, at a time in seconds.
+// Places the sensors and actors of a scanner as in its last sweep, at a time in seconds.
 function placeMoved(arrays, time) {
   const times = Float64Array.of(time), part = (name, k, size) => arrays[name].subarray(size * k, size * k + size);
   for (const [k, sensor] of picture.sensors.entries()) {
@@ -1026,7 +1026,7 @@ function placeMoved(arrays, time) {
   picture.setTime(time);
 }
 
-// What is new of a run, or of a scanner.
+// Handles updates from a run or a scanner.
 const known = { rays: null, hits: null, ends: 0, over: false };
 async function news(told) {
   if (told.rays_version !== known.rays) {
@@ -1034,7 +1034,7 @@ async function news(told) {
     picture.setRays(told.arrays.rays);
   }
   tellRun(told);
-  if (told.over && panel.rays?.box.checked && !known.over) panel.rays.box.click(); // they hide the points of a result
+  if (told.over && panel.rays?.box.checked && !known.over) panel.rays.box.click(); // rays would hide the points of a result
   known.over = told.over;
   if (told.arrays.actor_places) placeMoved(told.arrays, told.time);
   else if (told.time !== null && !told.over) picture.setTime(told.time);
@@ -1066,7 +1066,7 @@ async function news(told) {
   }
 }
 
-// Of a large file, a sample is shown first, and more points while they are read.
+// For a large file, a sample is shown first, and more points as they are read.
 async function grow() {
   const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error, share, version }) => {
     say(`Loading points … ${Math.round(100 * share)} %`);
@@ -1082,7 +1082,7 @@ async function grow() {
   const { origin } = state;
   takeState(await ask("state"));
   if (picture.touched) picture.shift(less(origin, state.origin));
-  else picture.frame(state.box, state.arrays.corners, state.bounds); // the sample lacks its sides
+  else picture.frame(state.box, state.arrays.corners, state.bounds); // the sample does not cover all of the cloud
   buildPanel();
   legendText = "";
   shownKey = null;
@@ -1103,8 +1103,8 @@ function tellRun(told) {
 
 const isTextField = (target) => target.isContentEditable || target.tagName === "TEXTAREA" || (target.tagName === "INPUT" && ["text", "number", "search"].includes(target.type));
 
-// Keys act wherever the focus is, except in text fields. Enter presses the focused control, and the
-// keys up and down change a focused slider or menu.
+// Keys work regardless of the focus, except in text fields. Enter presses the focused control, and the
+// up and down keys change a focused slider or menu.
 function keys(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || isTextField(event.target)) return;
   const { target, key } = event;
@@ -1124,7 +1124,7 @@ function keys(event) {
   act();
 }
 
-// A button acts on its space when the key is released.
+// Buttons react to the space key when it is released.
 function releaseKey(event) {
   if (event.key === " " && !$("time").hidden && !isTextField(event.target)) event.preventDefault();
 }
@@ -1170,7 +1170,7 @@ function mouse() {
   canvas.addEventListener("pointerleave", () => { clearTimeout(restingTimer); showPlace(); });
 }
 
-// The coordinates under the mouse, once it rests: to look among all points takes up to 0.2 s.
+// Shows the coordinates under the mouse once it rests, because finding the point takes up to 0.2 s.
 let restingTimer = 0;
 function tellPlace(event) {
   clearTimeout(restingTimer);
@@ -1182,7 +1182,7 @@ function tellPlace(event) {
   }, POINTER_MS);
 }
 
-// Digits after the point that hold on surfaces, which are drawn up to 2 cm further inwards.
+// Number of decimals that are reliable on surfaces, which are drawn up to 2 cm further inward.
 function surfacePlaces() {
   const inwards = Math.min(1e-4 * length(less(state.bounds[1], state.bounds[0])), 0.02);
   return Math.min(3, Math.max(0, Math.floor(-Math.log10(inwards || 1))));
@@ -1202,17 +1202,17 @@ async function begin() {
   fit();
   const told = await follow("state", () => ({}), NEWS_MS, (it) => {
     if (it.columns) return true;
-    $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
+    $("panel").replaceChildren(panel.progress, stop); // its only job has not started
     tellRun(it);
     if (it.failures[0]) say(it.failures[0].error, true);
     return false;
   });
   say(READING);
   picture.resize();
-  picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
+  picture.frame(told.box, told.arrays.corners, told.bounds); // the size of the sensor marks depends on the view
   drives = !told.live && told.sensors.some((sensor) => sensor.moves);
-  chosen.rays = Boolean(told.live); // they show how a run goes on, and hide the points of a result
-  if (told.offline) chosen.budget = BUDGETS.at(-1); // all points are here
+  chosen.rays = Boolean(told.live); // rays show the progress of a run, but hide the points of a result
+  if (told.offline) chosen.budget = BUDGETS.at(-1); // all points are in the page
   if (told.results.length) chosen.color = "result";
   takeState(told);
   if (told.by_sweep) chosen.show = "sweep";
@@ -1225,7 +1225,7 @@ async function begin() {
   buildTime();
   buildTools();
   picture.setTime(chosen.time);
-  picture.resize(); // the player and the panel take their places
+  picture.resize(); // the player and the panel need space
   look(drives && !picture.isFlying ? "sensor" : "all");
   if (!$("time").hidden) tellTime();
   setClip(chosen.clip);
@@ -1240,7 +1240,7 @@ async function begin() {
   showPlace();
   addEventListener("keydown", keys);
   addEventListener("keyup", releaseKey);
-  addEventListener("hashchange", () => location.reload()); // another link was entered
+  addEventListener("hashchange", () => location.reload()); // the user has entered another link
   document.addEventListener("visibilitychange", () => { if (document.hidden) setPlaying(false); });
   let before = performance.now();
   const frame = (now) => {
@@ -1253,7 +1253,7 @@ async function begin() {
   if (state.live) {
     follow("news", () => ({}), NEWS_MS, news).catch((error) => {
       failed(error);
-      panel.progress.replaceChildren(); // it goes on no more
+      panel.progress.replaceChildren(); // the run has ended
     });
   }
   refresh();
@@ -1264,5 +1264,5 @@ async function begin() {
 
 begin().catch(failed);
 
-// For tests and for the console of curious users.
+// For tests and for the browser console.
 Object.assign(window, { lidarpool: { picture, chosen, get state() { return state; }, get playing() { return playing; }, get steps() { return steps; } } });

@@ -1,20 +1,20 @@
-// The 3D picture: points with eye-dome lighting, surfaces, sensors, actors, path, camera.
+// The 3D view: points with eye-dome lighting, surfaces, sensors, actors, the path, and the camera.
 import * as THREE from "./three.min.js";
 import { element, saveFile } from "./controls.js";
 
-THREE.ColorManagement.enabled = false; // colors are those of the legends
+THREE.ColorManagement.enabled = false; // so that colors match the legends
 
 const THEMES = {
   light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
   dark: { back: 0x14171c, grid: 0x363e48, surface: 0x3c434d, rays: 0x8f3c48 },
 };
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
-const FOV = 45; // degrees, from the upper to the lower edge
+const FOV = 45; // vertical field of view in degrees
 const SIDES = { all: [0.55, -1, 0.62], inside: [0.12, -0.25, 1], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
-const FLIGHT_M = 10; // height of a carrier that flies
+const FLIGHT_M = 10; // minimum height of a flying platform
 const PICKED_WITHIN = 6; // pixels
-const SAME_SURFACE = 1.03; // times the distance of the nearest
-const AS_POINTS = 0.25; // alpha of pixels that are points: only these get eye-dome lighting
+const SAME_SURFACE = 1.03; // as a multiple of the distance of the nearest point
+const AS_POINTS = 0.25; // alpha of pixels with points, which get eye-dome lighting
 
 const POINT_VERTEX = `
   uniform float size, pixels, least, most;
@@ -39,8 +39,8 @@ const POINT_FRAGMENT = `
   }`;
 
 // Eye-dome lighting: Boucheny, "Visualization scientifique de grands volumes de données" (2009).
-// A pixel is darker the more its neighbors lie before it. Surfaces are a picture of their own,
-// which is laid over: lightly where it is before something, so that walls do not hide the points.
+// A pixel is darker the more its neighbors are in front of it. Surfaces are rendered separately and
+// blended: almost transparent in front of points, so that walls do not hide the points.
 const SHADE_VERTEX = `
   varying vec2 at;
   void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }`;
@@ -75,7 +75,7 @@ const SHADE_FRAGMENT = `
 
 const lerp = (a, b, share) => a + (b - a) * share;
 
-// Index of the last of ascending numbers that is not above one; -1 if all are.
+// Returns the index of the last of ascending numbers that is at most a value, or -1.
 export function lastNotAbove(numbers, value) {
   let low = 0, high = numbers.length;
   while (low < high) {
@@ -86,13 +86,13 @@ export function lastNotAbove(numbers, value) {
   return low - 1;
 }
 
-// Ends of the twelve edges of a box.
+// Returns the ends of the twelve edges of a box.
 function edgesOf({ min, max }) {
   const corner = (k) => [k & 1 ? max.x : min.x, k & 2 ? max.y : min.y, k & 4 ? max.z : min.z];
   return [1, 2, 4].flatMap((side) => [0, 1, 2, 3, 4, 5, 6, 7].filter((k) => !(k & side)).flatMap((k) => [...corner(k), ...corner(k + side)]));
 }
 
-// Position at a time of something that was at places (k, 3) at ascending times.
+// Interpolates positions (k, 3) at ascending times.
 function placeAt(times, places, time, moves, width = 3) {
   const before = Math.max(0, lastNotAbove(times, time));
   const after = Math.min(before + 1, times.length - 1);
@@ -101,7 +101,7 @@ function placeAt(times, places, time, moves, width = 3) {
   return Array.from({ length: width }, (_, axis) => lerp(places[width * before + axis], places[width * after + axis], share));
 }
 
-// Bends the mesh of an actor as it is at a frame: at 1.5 half way from its second pose to the third.
+// Deforms the mesh of an actor to a fractional frame: 1.5 is halfway between its second and third pose.
 function bend({ mesh, poses, faces }, frame) {
   const [count, vertices] = poses.shape, at = frame - (count - 1) * Math.floor(frame / (count - 1));
   const corners = mesh.geometry.attributes.position;
@@ -110,7 +110,7 @@ function bend({ mesh, poses, faces }, frame) {
   corners.needsUpdate = true;
 }
 
-// Names of the stations of a sensor that does not move, each once: [text, place, class].
+// Returns the distinct station names of a stationary sensor: [text, place, class].
 function stationsOf({ name, labels, places, at }) {
   const distinct = new Map(labels.map((label, k) => [label, places.subarray(3 * k, 3 * k + 3)]));
   if (distinct.size < 2) return [[name || "sensor", at]];
@@ -137,7 +137,7 @@ export class Picture {
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.18, zoomToCursor: true, screenSpacePanning: true });
     this.controls.addEventListener("change", () => { this.dirty = true; changed(); });
-    this.controls.addEventListener("start", () => { this.touched = true; }); // by a user
+    this.controls.addEventListener("start", () => { this.touched = true; }); // by the user
     this.pointMaterial = new THREE.ShaderMaterial({
       vertexShader: POINT_VERTEX, fragmentShader: POINT_FRAGMENT,
       uniforms: {
@@ -200,9 +200,9 @@ export class Picture {
     this.changed();
   }
 
-  // -- what is shown ---------------------------------------------------------------------
+  // -- content -----------------------------------------------------------------------------
 
-  // box: [low, high] that is looked at; corners: those of the scene, and sensors; bounds: of all
+  // box: [low, high] to show; corners: corners of the scene, and sensors; bounds: bounds of everything
   frame(box, corners, bounds) {
     this.corners = [];
     for (let k = 0; k < corners.length; k += 3) this.corners.push(new THREE.Vector3(...corners.subarray(k, k + 3)));
@@ -210,7 +210,7 @@ export class Picture {
     this.bounds = bounds.map((corner) => new THREE.Vector3(...corner));
     this.extent = this.box[0].distanceTo(this.box[1]) || 1;
     const ends = ["x", "y", "z"].map((axis) => this.corners.map((corner) => corner[axis]).reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]));
-    this.middle = new THREE.Vector3(...ends.map(([low, high]) => (low + high) / 2)); // of the first picture
+    this.middle = new THREE.Vector3(...ends.map(([low, high]) => (low + high) / 2)); // center of the first view
     this.reach = this.bounds[0].distanceTo(this.bounds[1]) || 1;
     this.setClip([[null, null], [null, null], [null, null]]);
     this.addGrid();
@@ -285,7 +285,7 @@ export class Picture {
     return Object.values(this.layers).reduce((sum, points) => sum + points.told.arrays.rows.length, 0);
   }
 
-  // Points can be seen where there are few, and told apart where there are many.
+  // Points are visible where there are few, and distinguishable where there are many.
   sizePoints() {
     const count = Math.max(1, this.drawn);
     const { size, least, most } = this.pointMaterial.uniforms;
@@ -318,7 +318,7 @@ export class Picture {
     this.showObjects(this.onlyObjects, this.hiddenObjects);
   }
 
-  // limits: [lowest, highest] object that is shown, or null; hidden: those that are switched off
+  // limits: [lowest, highest] displayed object, or null; hidden: objects that are switched off
   showObjects(limits, hidden) {
     Object.assign(this, { onlyObjects: limits, hiddenObjects: hidden });
     const shown = (object) => (!limits || (object >= limits[0] && object <= limits[1])) && !hidden.has(object);
@@ -342,7 +342,7 @@ export class Picture {
     this.actors = actors;
     const made = new Map(); // {corners: geometry that actors share}
     for (const actor of actors) {
-      if (actor.poses) actor.corners = actor.corners.slice(); // each is in another pose
+      if (actor.poses) actor.corners = actor.corners.slice(); // each actor has its own pose
       const geometry = made.get(actor.corners) ?? new THREE.BufferGeometry();
       made.set(actor.corners, geometry);
       actor.shown = !this.actorsHidden;
@@ -367,7 +367,7 @@ export class Picture {
     this.dirty = true;
   }
 
-  // by: "object" for a color each, "color" for those of their files
+  // by: "object" for one color per actor, "color" for the colors in their files
   colorActors(by) {
     for (const actor of this.actors) {
       const { material } = actor.mesh, own = by === "color" && actor.own;
@@ -407,7 +407,7 @@ export class Picture {
     for (const made of this.sensorParts) this.scene.add(made);
   }
 
-  // Draws the trajectory of a moving sensor, in place of an earlier one.
+  // Draws the trajectory of a moving sensor, replacing the previous one.
   drawWay({ way, places }) {
     for (const { geometry, material } of way.children) {
       geometry.dispose();
@@ -449,7 +449,7 @@ export class Picture {
     this.scene.add(this.path);
   }
 
-  // Places sensors and actors as they are at a time, seconds.
+  // Places sensors and actors as at a time in seconds.
   setTime(time) {
     const before = this.carrier;
     this.time = time;
@@ -474,7 +474,7 @@ export class Picture {
     this.dirty = true;
   }
 
-  // Moves and turns the camera as the carrier has moved from a place and turned from a heading.
+  // Moves and rotates the camera with the vehicle, starting from a previous position and heading.
   moveWith(before, heading) {
     const turn = Math.atan2(this.heading.y, this.heading.x) - Math.atan2(heading.y, heading.x);
     for (const place of [this.camera.position, this.controls.target])
@@ -482,7 +482,7 @@ export class Picture {
     this.controls.update();
   }
 
-  // Horizontal direction in which a moving sensor moves now; along x if it does not move.
+  // Returns the current horizontal direction of a moving sensor, or the x axis if it is stationary.
   headingOf(moving) {
     const ahead = new THREE.Vector3(1, 0, 0);
     if (!moving?.moves) return ahead;
@@ -517,7 +517,7 @@ export class Picture {
 
   // -- camera ----------------------------------------------------------------------------
 
-  // So far away that all corners are within 0.9 of the picture.
+  // Places the camera so that all corners are within 0.9 of the view.
   look(side) {
     const away = new THREE.Vector3(...SIDES[side === "all" && this.roofed ? "inside" : side]).normalize();
     const up = new THREE.Vector3(0, side === "top" ? 1 : 0, side === "top" ? 0 : 1);
@@ -527,7 +527,7 @@ export class Picture {
     const target = away.clone().multiplyScalar(depth);
     let distance = 0;
     for (const [axis, tangent] of [[right, slope * this.perspective.aspect], [tall, slope]]) {
-      // The sides of the picture touch the outermost corners; those ahead are larger in it.
+      // The edges of the view touch the outermost corners, and closer corners appear larger.
       const ends = [1, -1].map((sign) => Math.max(...this.corners.map((corner, k) =>
         sign * corner.dot(axis) + (side === "all" ? tangent * (ahead[k] - depth) : 0))));
       target.addScaledVector(axis, (ends[0] - ends[1]) / 2);
@@ -537,15 +537,15 @@ export class Picture {
     this.useParallel(side !== "all");
   }
 
-  // Whether a moving carrier is far above what is looked at.
+  // Whether a moving platform is far above the displayed content.
   get isHigh() {
     return this.sensors.some((sensor) => sensor.moves) && this.carrier.z - this.middle.z > 0.1 * this.extent;
   }
 
-  // A car does not fly, however small its surroundings are.
+  // A car is not a flying platform, however small its surroundings are.
   get isFlying() { return this.isHigh && this.carrier.z - this.middle.z > FLIGHT_M; }
 
-  // Behind and above the carrier, looking ahead; or to the middle, if it stands.
+  // Places the camera behind and above the platform, looking forward or, if it is stationary, to the center.
   lookFromSensor() {
     if (!this.carrier) return;
     const moving = this.sensors.find((sensor) => sensor.moves);
@@ -565,7 +565,7 @@ export class Picture {
   }
 
   place(position, target) {
-    // Exactly from above, the controls would not know what is up.
+    // Exactly from above, the controls cannot determine the up direction.
     const eye = position.clone();
     if (Math.hypot(eye.x - target.x, eye.y - target.y) < 1e-4 * eye.distanceTo(target)) eye.y -= 1e-4 * eye.distanceTo(target);
     for (const camera of [this.perspective, this.parallel]) camera.position.copy(eye);
@@ -597,7 +597,7 @@ export class Picture {
     this.changed();
   }
 
-  // Meters from the upper to the lower edge, where the camera looks.
+  // Returns the height of the view in meters at the camera's target.
   get viewHeight() {
     if (this.isParallel) return (this.parallel.top - this.parallel.bottom) / this.parallel.zoom;
     return 2 * Math.tan((FOV * Math.PI) / 360) * this.perspective.position.distanceTo(this.controls.target);
@@ -618,7 +618,7 @@ export class Picture {
 
   // -- drawing ---------------------------------------------------------------------------
 
-  // Called for each frame; draws if anything has changed.
+  // Called for each frame. Draws if anything has changed.
   draw() {
     this.controls.update();
     if (!this.dirty) return;
@@ -662,11 +662,11 @@ export class Picture {
     for (const [text, place, kind = ""] of this.labeled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
-      // Stations have their number on their mark, other things their name beside it.
+      // Stations have their number on their mark; other labels are beside their mark.
       const on = kind.startsWith("station"), wide = 7 * text.length + (on ? 11 : 14), tall = on ? 18 : 22;
       const y = ((1 - at.y) / 2) * height - (on ? 9 : 24);
       const x = Math.max(0, Math.min(((at.x + 1) / 2) * width + (on ? -wide / 2 : 8), width - wide));
-      const over = on ? 5 : 0; // pixels by which marks may overlap each other
+      const over = on ? 5 : 0; // number of pixels by which marks may overlap
       const [left, top, right, bottom] = [x + over, y + over, x + wide - over, y + tall - over];
       if (taken.some((box) => left < box[2] && box[0] < right && top < box[3] && box[1] < bottom)) continue;
       taken.push([left, top, right, bottom]);
@@ -713,8 +713,8 @@ export class Picture {
 
   // -- the mouse -------------------------------------------------------------------------
 
-  // The point under the mouse: {row, layer, place} or null. It is the nearest to the mouse of those
-  // on the first surface.
+  // Returns the point under the mouse, {row, layer, place}, or null. Among the points on the front
+  // surface, it is the one closest to the mouse.
   pick(x, y) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const m = this.matrix.elements, found = [];
@@ -740,7 +740,7 @@ export class Picture {
     return first.reduce((a, b) => (b.away < a.away ? b : a));
   }
 
-  // The place on a surface under the mouse, [x, y, z], or null.
+  // Returns the position on a surface under the mouse, [x, y, z], or null.
   surfaceAt(x, y) {
     if (!this.surface || !this.opacity) return null;
     const { clientWidth: width, clientHeight: height } = this.canvas, { low, high } = this.pointMaterial.uniforms;
@@ -748,7 +748,7 @@ export class Picture {
     const way = end.sub(start), { geometry } = this.surface, p = geometry.attributes.position.array, index = geometry.index?.array;
     const [dx, dy, dz] = way.toArray(), [ox, oy, oz] = start.toArray();
     let nearest = Infinity;
-    for (let k = 0, count = index?.length ?? p.length / 3; k < count; k += 3) { // by Möller and Trumbore, 1997
+    for (let k = 0, count = index?.length ?? p.length / 3; k < count; k += 3) { // Möller and Trumbore, 1997
       const a = 3 * (index ? index[k] : k), b = a + 3, c = a + 6;
       const e1x = p[b] - p[a], e1y = p[b + 1] - p[a + 1], e1z = p[b + 2] - p[a + 2];
       const e2x = p[c] - p[a], e2y = p[c + 1] - p[a + 1], e2z = p[c + 2] - p[a + 2];
@@ -767,8 +767,8 @@ export class Picture {
     return nearest < Infinity ? start.addScaledVector(way, nearest).toArray() : null;
   }
 
-  // places: of points that are marked, with lines between them; text: of what they measure; closed:
-  // whether a line leads back to the first
+  // places: positions of marked points, connected by lines; text: the measurement; closed: whether
+  // a line connects the last point to the first
   mark(places, text = "", closed = false) {
     for (const mark of this.marks) if (mark.made) this.scene.remove(mark.made);
     const material = new THREE.MeshBasicMaterial({ color: MARK, depthTest: false });
@@ -793,7 +793,7 @@ export class Picture {
 
   // -- the clip box ----------------------------------------------------------------------
 
-  // A box with a handle at each of its sides; moved(axis, end, value) when one is dragged.
+  // A box with a handle on each side; moved(axis, end, value) is called when a handle is dragged.
   showClipBox(on, moved) {
     this.handles?.forEach(({ press }) => press.remove());
     if (this.clipEdges) this.scene.remove(this.clipEdges);
@@ -805,7 +805,7 @@ export class Picture {
     this.drawClipBox();
   }
 
-  // [lowest, highest] of the clip box along each axis: those of the scene where nothing is cut.
+  // Returns [lowest, highest] of the clip box along each axis, by default those of the scene.
   get clipEnds() {
     return this.clip.map(([low, high], axis) => [low ?? this.bounds[0].getComponent(axis), high ?? this.bounds[1].getComponent(axis)]);
   }
@@ -834,7 +834,7 @@ export class Picture {
     return { press, axis, end };
   }
 
-  // Place of a handle: the middle of its side.
+  // Returns the position of a handle, which is the center of its side.
   handlePlace(axis, end) {
     const place = new THREE.Vector3(...this.clipEnds.map(([low, high]) => (low + high) / 2));
     return place.setComponent(axis, this.clipEnds[axis][end]);
@@ -845,7 +845,7 @@ export class Picture {
     return [((at.x + 1) / 2) * this.canvas.clientWidth, ((1 - at.y) / 2) * this.canvas.clientHeight, at.z];
   }
 
-  // How far the middle of the clip box moves in the picture, pixels, if it moves along an axis.
+  // Returns how many pixels the center of the clip box moves in the view if it moves along an axis.
   pixelsPerMeter(axis) {
     const step = 1e-3 * this.extent, middle = new THREE.Vector3(...this.clipEnds.map(([low, high]) => (low + high) / 2));
     const [a, b] = [middle.clone(), middle.clone().setComponent(axis, middle.getComponent(axis) + step)].map((place) => this.pixelsOf(place));
@@ -865,7 +865,7 @@ export class Picture {
     }
   }
 
-  // The picture as a PNG file.
+  // Returns the view as a PNG file.
   save(name) {
     this.dirty = true;
     this.draw();

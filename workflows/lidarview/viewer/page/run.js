@@ -1,4 +1,4 @@
-// What the list of jobs and the viewer of the only one have in common: bars, and news of the run.
+// Shared by the job list and the viewer of a single job: progress bars, and updates from the run.
 import { ask } from "./ask.js";
 import { element } from "./controls.js";
 
@@ -16,19 +16,19 @@ export const slots = ([label, share, whole]) => element(
   element("span", { textContent: `${Math.round(100 * share)} % of ${whole}`, title: "in the last few seconds" }), meter(share),
 );
 
-// Leaves alone what shows this already.
+// Changes an element only if its content differs.
 export function replace(box, ...children) {
   const made = element("div", {}, ...children);
   if (made.innerHTML !== box.innerHTML) box.replaceChildren(...made.childNodes);
 }
 
-// Asks again and again, until the server has ended or `show` returns true, and returns the last answer.
+// Polls until the server has ended or `show` returns true, and returns the last answer.
 export async function follow(what, asked, ms, show) {
   stop.hidden = false;
   try {
     for (;;) {
       const told = await ask(what, asked());
-      stop.hidden = told.stops === false; // it is no run
+      stop.hidden = told.stops === false; // there is no run to stop
       stop.textContent = told.over ? "Close" : told.state === "stopping" ? "Stopping" : "Stop";
       if (await show(told)) return told;
       const pause = told.wait_ms ?? ms;

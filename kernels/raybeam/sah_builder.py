@@ -1,9 +1,9 @@
-"""A binary hierarchy by a full sweep with the surface area heuristic.
+"""Top-down builder of binary hierarchies by the surface area heuristic (SAH).
 
-From the root down, every node is divided where the heuristic is least, over all positions between
-its boxes sorted along each of the three axes. No builder that uses only boxes gives better trees in
-general; bins are a few per cent worse. All nodes of a level are divided together, in
-tens of operations on whole arrays.
+Starting at the root, each node is divided where the heuristic has its minimum, over all positions
+between its boxes sorted along each of the three axes. This full sweep generally gives the best
+trees among the builders that only use boxes. Trees from binned builders are a few percent worse.
+All nodes of a level are divided together, in tens of operations on whole arrays.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ import numpy as np
 
 from .arrays import Floats, Floats32, Indices
 
-_APART = 8.0  # more than the distance of boxes within [-2, 2]
-# Levels that are divided by the heuristic; deeper ones are halved. Boxes that shrink along a line
-# would be split off singly, and as many nodes would wait in a traversal.
+_NODE_SPACING = 8.0  # offset between consecutive nodes; exceeds the extent of boxes within [-2, 2]
+# Number of levels that are divided by the heuristic. On deeper levels, nodes are halved, because
+# boxes that shrink along a line would otherwise be split off one by one, which makes the tree very
+# deep.
 _LEVELS = 32
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Nodes of two boxes and more at a level of the tree.
+    """The nodes with at least two boxes on one level of the tree.
 
     Attributes
     ----------
     orders
-        Three arrays (m,): the boxes, node by node, sorted by their centers along each axis.
+        For each axis, the boxes (m,), grouped by node and sorted by their centers along the axis.
     start, stop
         (k,): range of each node's boxes in these arrays.
     """
@@ -37,21 +38,21 @@ class _Level:
     stop: Indices
 
 
-def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
-    """Divide boxes in two, again and again, down to single boxes.
+def build_by_sah(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
+    """Divide boxes recursively until each part contains a single box.
 
     Parameters
     ----------
     lower, upper
-        float32 (3, n): corners of the boxes, within [-2, 2]; n at least 1.
+        float32 (3, n): corners of the n > 0 boxes, within [-2, 2].
     weight
-        (n,): cost to test a box's contents, a whole number such as the number of triangles.
+        (n,): cost of testing the contents of each box, an integer such as the number of triangles.
 
     Returns
     -------
     levels
-        The nodes of each level, from the root down: (k, 2), two children each. A child is the
-        number of a box or, for node j of the next level, ``-1 - j``.
+        The children (k, 2) of the nodes on each level, starting at the root. A child is the index
+        of a box, or ``-1 - j`` for node j of the next level.
     """
     middles = lower.astype(np.float64) + upper
     n = lower.shape[1]
@@ -60,7 +61,7 @@ def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
     while n > 1 and len(level.start):
         node = np.repeat(np.arange(len(level.start)), level.stop - level.start)
         if len(levels) < _LEVELS:
-            axis, split = _cheapest(lower, upper, weight, level, node)
+            axis, split = _cheapest_splits(lower, upper, weight, level, node)
         else:
             axis = np.zeros_like(level.start)
             split = (level.start + level.stop) // 2 - 1
@@ -69,18 +70,21 @@ def divide(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indices]:
     return levels
 
 
-def _cheapest(
+def _cheapest_splits(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> tuple[Indices, Indices]:
-    """Return the cheapest division of each node: axis, and last position of the first part."""
+    """Return the axis and position of the cheapest split of each node.
+
+    The position is the last one of the first part.
+    """
     best = np.full(len(level.start), np.inf)
     axis, split = np.zeros((2, len(level.start)), np.intp)
     for k, order in enumerate(level.orders):
-        cost = _costs(lower[:, order], upper[:, order], weight[order], level, node)
+        cost = _split_costs(lower[:, order], upper[:, order], weight[order], level, node)
         min_cost = np.minimum.reduceat(cost, level.start)
         cheapest = np.flatnonzero(cost == min_cost[node])
         position = cheapest[np.searchsorted(cheapest, level.start)]
-        # Equal boxes cost the same wherever they are divided: halve them.
+        # If all splits have the same cost, as for equal boxes, split in the middle.
         max_cost = np.maximum.reduceat(np.where(np.isinf(cost), -np.inf, cost), level.start)
         position = np.where(max_cost <= min_cost, (level.start + level.stop) // 2 - 1, position)
         better = min_cost < best
@@ -90,25 +94,29 @@ def _cheapest(
     return axis, split
 
 
-def _costs(
+def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
-    """Return the cost of a division behind each position, boxes and weights sorted by an axis."""
-    area_before = _areas(lower, upper, node)
-    area_after = _areas(lower[:, ::-1], upper[:, ::-1], (node[-1] - node)[::-1])[::-1]
+    """Return the cost of a split after each position.
+
+    The boxes and weights are sorted along an axis.
+    """
+    area_before = _prefix_half_areas(lower, upper, node)
+    area_after = _prefix_half_areas(lower[:, ::-1], upper[:, ::-1], (node[-1] - node)[::-1])[::-1]
     sums = np.cumsum(weight)
     sums_from_zero = np.concatenate([[0.0], sums])
     cost = np.full(len(node), np.inf)
     cost[:-1] = area_before[:-1] * (sums - sums_from_zero[level.start][node])[:-1]
     cost[:-1] += area_after[1:] * (sums_from_zero[level.stop][node] - sums)[:-1]
-    cost[level.stop - 1] = np.inf  # no box would be left for the second part
+    cost[level.stop - 1] = np.inf  # The second part would be empty.
     return cost
 
 
-def _areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
-    """Return half the surface of the box around each position's box and its node's boxes before."""
-    # Shifted apart node by node, so that a single pass over all nodes restarts at each node.
-    shift = _APART * node
+def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
+    """Return half the surface area of each box combined with the earlier boxes of its node."""
+    # Each node is shifted by a different offset, so that one pass over all nodes restarts at each
+    # node.
+    shift = _NODE_SPACING * node
     x, y, z = (
         np.maximum.accumulate(b + shift) - shift - (np.minimum.accumulate(a - shift) + shift)
         for a, b in zip(lower, upper, strict=True)
@@ -119,7 +127,7 @@ def _areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
 def _split_nodes(
     level: _Level, node: Indices, axis: Indices, split: Indices
 ) -> tuple[Indices, _Level]:
-    """Return the children (k, 2) of each node, and the level below."""
+    """Return the children (k, 2) of each node, and the next level."""
     right = np.zeros(int(max(order.max() for order in level.orders)) + 1, np.bool_)
     for k, order in enumerate(level.orders):
         split_on_axis = (axis == k)[node]
@@ -128,7 +136,7 @@ def _split_nodes(
     start = np.stack([level.start, split + 1], axis=1).reshape(-1)
     stop = np.stack([split + 1, level.stop], axis=1).reshape(-1)
     inner = stop - start > 1
-    below = np.cumsum(inner)  # node j of the next level is counted as j + 1
+    below = np.cumsum(inner)  # j + 1 for node j of the next level
     children = np.where(inner, -1 * below, orders[0][start]).reshape(-1, 2)
     in_inner = np.repeat(inner, stop - start)
     sizes = (stop - start)[inner]

@@ -1,4 +1,4 @@
-"""Triangles of a scene as the page draws them, and their colors."""
+"""Simplify and color the triangles of a scene for display on the page."""
 
 from __future__ import annotations
 
@@ -14,32 +14,44 @@ from lidarsim.scene.simplified import simplified
 
 from ..render.coloring import (
     NORMALS,
-    colors_of,
-    colors_of_normals,
+    make_coloring,
+    normal_colors,
 )
 from ..render.hit_density import density_label, hit_colors, hits_title
 from ..render.surface import separate_objects
-from ..render.theme import mapped
-from .legends import Legend, legend_of, scale_legend
+from ..render.theme import apply_colormap
+from .legends import Legend, make_legend, scale_legend
 
-# Surfaces are moved inwards by this share of the scene's diagonal, or of `_MAX_SIZE_M` if that is
-# smaller: two centimeters.
+# Surfaces are moved inward by this share of the scene's diagonal, but by at most 2 cm, the same
+# share of `_MAX_SIZE_M`.
 _INWARD_SHARE = 1e-4
 _MAX_SIZE_M = 200.0
-HITS_SAMPLE = 500_000  # sample for the density of hits on large triangles
+HITS_SAMPLE = 500_000  # points for estimating the hit density on large triangles
 
-MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colors
+# The page receives all triangles, 50 bytes each, whenever the coloring changes.
+MAX_TRIANGLES = 300_000
 
-MAX_PIECES = 60_000  # further triangles from dividing large triangles, to show hits
+MAX_PIECES = 60_000  # additional triangles from dividing large ones
 
 
-class ShownSurface:
-    """A scene's triangles in chosen colors, simplified to a maximum number.
+class DisplayMesh:
+    """The triangles of a scene, simplified to a maximum number, in selectable colors.
 
-    Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
-    triangle that vanishes go to a neighbor. `reflectance` is the share of the light that each
-    object reflects, (objects,), if known; `face_materials` (f,) are indices into the names of
-    materials, -1 for none.
+    Vertices in the same grid cell are merged (Rossignac and Borrel, 1993). Hits on a triangle that
+    vanishes are counted for a neighbor.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    reflectance
+        (objects,) share of light that each object reflects, or None if unknown.
+    max_triangles
+        Maximum number of triangles.
+    face_materials
+        (f,) indices into `material_names`, -1 for faces without a material.
+    material_names
+        Names of the materials.
     """
 
     def __init__(
@@ -52,7 +64,7 @@ class ShownSurface:
     ) -> None:
         self.coarse = scene
         self._reflectance = reflectance
-        # (f,): shown triangle that replaces each triangle of the scene; -1 if none does.
+        # (f,) displayed triangle that replaces each triangle of the scene, -1 if there is none
         self._replacements = np.arange(len(scene.faces))
         if len(scene.faces) > max_triangles:
             self.coarse, self._replacements = simplified(scene, max_triangles)
@@ -62,42 +74,55 @@ class ShownSurface:
             self._materials = np.full(len(self.coarse.faces), -1)
             is_shown = self._replacements >= 0
             self._materials[self._replacements[is_shown]] = face_materials[is_shown]
-        self._objects = self.coarse.face_object.astype(np.int32)  # type that browsers have
+        self._objects = self.coarse.face_object.astype(np.int32)  # browsers lack int64 arrays
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
-    def colored(
+    def color_by(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return corners (k, 3, 3), objects (k,), colors (k, 3, 3) at the corners, and a legend.
+        """Return the arrays for a coloring, and its legend.
 
-        Corners are local, meters; objects are indices of static objects.
+        Parameters
+        ----------
+        by
+            One of the names that `available_colorings` returns for the scene.
+        hit_counts
+            (f,) hits on each triangle of the original scene. Used by "hits" only.
+        points
+            (n, 3) sample of the hit points, local, in meters. Used by "hits" only.
 
-        `by` is a name of `colors_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        a sample of the hit points, (n, 3). Colors of "gray" are left out: the page has them.
+        Returns
+        -------
+        arrays
+            Local corner positions "corners" (k, 3, 3) in meters, indices "objects" (k,) of the
+            static objects, and "colors" (k, 3, 3) at the corners. The colors are omitted for
+            "gray", which the page draws itself.
+        legend
+            The legend, or None.
         """
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
         if by == "hits":
-            return self._colored_by_hits(hit_counts, points)
+            return self._color_by_hits(hit_counts, points)
         if by == "object":
-            coloring = colors_of(self._objects, OBJECT, self.coarse.names)
+            coloring = make_coloring(self._objects, OBJECT, self.coarse.names)
             colors = coloring.paint(self._objects)
-            legend = legend_of(coloring)
+            legend = make_legend(coloring)
         elif by == "reflectance" and self._reflectance is not None:
-            colors = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
-            grays = mapped("gray", np.linspace(0.1, 1.0, 9))
+            colors = apply_colormap("gray", 0.1 + 0.9 * self._reflectance[self._objects])
+            grays = apply_colormap("gray", np.linspace(0.1, 1.0, 9))
             legend = scale_legend("reflectance", ("0", "0.5", "1"), grays)
         elif by == "material" and self._materials is not None:
-            coloring = colors_of(self._materials, TABLE["material"], self._material_names)
+            coloring = make_coloring(self._materials, TABLE["material"], self._material_names)
             colors = coloring.paint(self._materials)
-            legend = legend_of(coloring)
+            legend = make_legend(coloring)
         elif by == "normals":
             a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
             normals = np.cross(b - a, c - a)
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            colors = colors_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
+            colors = normal_colors(normals / np.where(lengths > 0, lengths, np.nan)) / 255
             legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
         elif by == "color" and self.coarse.colors is not None:
             colors = self.coarse.colors.means() / 255
@@ -106,13 +131,13 @@ class ShownSurface:
         corners = as_bytes(colors).repeat(3, axis=0).reshape(-1, 3, 3)
         return arrays | {"colors": corners}, legend
 
-    def _colored_by_hits(
+    def _color_by_hits(
         self, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays and the legend of `colored`, for hits per square meter.
+        """Return the arrays and the legend of `color_by` for hits per square meter.
 
-        `hit_counts` (f,) are of the original scene's triangles; `points` (n, 3) are a sample of
-        hits, local, meters. Large triangles are divided, so that pieces show where the hits are.
+        Large triangles are divided, so that the colors show where the hits are. The parameters are
+        the same as in `color_by`.
         """
         is_shown = self._replacements >= 0
         hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
@@ -130,13 +155,13 @@ class ShownSurface:
         return arrays, scale_legend(hits_title(limits), marks) if hits.any() else None
 
 
-def colors_for(
+def available_colorings(
     scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
 ) -> tuple[str, ...]:
-    """Return the names that `ShownSurface.colored` accepts for a scene.
+    """Return the names that `DisplayMesh.color_by` accepts for a scene.
 
-    "reflectance" needs several values (objects,), "material" materials of faces, "color" a scene
-    with colors.
+    "reflectance" is available if the objects have different values, "material" if the faces have
+    materials, and "color" if the scene has colors.
     """
     scene_colors = ("color",) if scene.colored else ()
     reflectances = (

@@ -1,4 +1,4 @@
-"""A task of a partition for each item of a pipe or an iterable, with a bounded number of tasks."""
+"""Tasks for the items of a pipe or an iterable, the implementation of `Partition.for_each`."""
 
 from __future__ import annotations
 
@@ -12,69 +12,69 @@ from typing import Any, Protocol
 from dask.utils import funcname
 from distributed import Client, Future, wait
 
-from ..errors import PipeFailed, PoolError
-from ..membership import prospects
-from ..pipe import Pipe, take_beside
-from ..worker_wait import WorkerWait, check_wait
+from .errors import PipeFailed, PoolError
+from .membership import request_capacity
+from .pipe import Pipe, take_items
+from .worker_wait import WorkerWait, check_wait_s
 
-LOOK_S = 5.0  # between looks at the number of slots
-MOST_PER_SLOT = 16  # tasks in flight, without a window
+CHECK_S = 5.0  # interval between requests for the number of slots
+MOST_PER_SLOT = 16  # maximum number of tasks in flight per slot if no window is given
 
 
-class Submitter(Protocol):
-    """What the tasks need of a partition."""
+class TaskSubmitter(Protocol):
+    """The part of a `Partition` that is used here."""
 
     name: str
-    by_rule: bool  # whether workers that join come by a rule
+    by_rule: bool  # whether the partition can be dissolved
 
     @property
     def client(self) -> Client:
-        """The client."""
+        """Client of the cluster."""
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
         """Submit a task."""
 
 
 class _PipeItems:
-    """Items that come through a pipe, whose producers wait meanwhile."""
+    """Items of a pipe, whose producers wait until the items are taken."""
 
     def __init__(self, pipe: Pipe) -> None:
         self.name = f"pipe {pipe.name!r}"
-        self.closed = False  # no item can come later than now
-        self.drained = False  # all items have been read
+        self.closed = False  # whether no further items can be put into the pipe
+        self.drained = False  # whether all items have been taken
         self._pipe = pipe
-        _ = pipe.client  # a thread of a worker that runs no task would get another client
+        _ = pipe.client  # on a worker, a thread without a task would create another client
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
-        """Return up to `limit` items, as soon as there are any or a task has ended."""
-        items, self.closed, self.drained = take_beside(self._pipe, futures, limit, seconds)
+        """Return up to `limit` items, after waiting for an item or for the end of a task."""
+        items, self.closed, self.drained = take_items(self._pipe, futures, limit, seconds)
         return items
 
     def fail(self, reason: str) -> None:
-        """Let the producers end."""
+        """Make the pipe fail, so that its producers end."""
         with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
             self._pipe.fail(reason)
 
 
 class _IterableItems:
-    """Items of an iterable, taken one by one, as a slot is free."""
+    """Items of an iterable, which are read one at a time when a slot is free."""
 
     name = "the iterable"
-    closed = True  # none comes by itself
+    closed = True  # items never arrive on their own
 
     def __init__(self, iterable: Iterable[Any]) -> None:
         self.drained = False
         self._iterator = iter(iterable)
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
-        """Return the next item, as soon as the iterable has it."""
+        """Return the next item, or an empty list at the end of the iterable."""
         for item in self._iterator:
             return [item]
         self.drained = True
         return []
 
     def fail(self, reason: str) -> None:
-        """Do nothing: nobody waits."""
+        """Do nothing, because there are no producers."""
 
 
 def _items_of(source: object) -> _PipeItems | _IterableItems:
@@ -86,52 +86,53 @@ def _items_of(source: object) -> _PipeItems | _IterableItems:
 
 
 class ItemTasks:
-    """Tasks for the items of a pipe or an iterable, at most `window` of them under way.
+    """Tasks for the items of a pipe or an iterable, of which at most `window` are in flight.
 
-    No window is two tasks a slot, so that each slot has the next item at hand. The number doubles
-    if fewer tasks than slots are left of a full window by the time this process notices: then slots
-    were idle. Items that have no task yet stay where they are, so that producers wait when the
-    tasks are slower than they are.
+    By default, the window is two tasks per slot, so that the next item is available when a task
+    ends. It doubles if this process finds that a full window has shrunk to fewer tasks than slots,
+    because this means that slots were idle. Items without a task remain in the pipe, so that
+    producers wait if they are faster than the tasks.
     """
 
     def __init__(
         self,
-        partition: Submitter,
+        partition: TaskSubmitter,
         source: Pipe | Iterable[Any],
         function: Callable[..., Any],
         window: int | None,
         options: dict[str, Any],
         empty_s: float,
     ) -> None:
-        check_wait(empty_s)
+        check_wait_s(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
             raise ValueError(
                 f"Invalid value {window!r} for `window`. Expected an integer of at least 1."
             )
-        self._count = 0  # items that have a task, or had
+        self._count = 0  # number of items for which a task was submitted
         self._partition = partition
         self._items = _items_of(source)
         self._function = function
         self._given_window = window
-        self._options = options  # takes `Partition.submit`, and keyword arguments of the function
-        # {key of a task: the task, the number of its item and the item}
+        self._options = options  # for `Partition.submit`, including arguments of the function
+        # {task key: (future, index of the item, item)}
         self._running: dict[str, tuple[Future, int, Any]] = {}
         self._window = window or 1
-        self._slots = 0  # of the partition
-        self._per_slot = 2  # tasks in flight, without a window
-        self._next_look = 0.0
-        self._until_next_s = LOOK_S
+        self._slots = 0  # number of slots in the partition
+        self._per_slot = 2  # number of tasks in flight per slot if no window is given
+        self._next_check = 0.0
+        self._until_next_s = CHECK_S
         self._wait = WorkerWait(partition.name, "`for_each`", empty_s)
         self._stopped = False
 
     def run(self) -> int:
-        """Run tasks until the items and all tasks have ended, and return the number of items.
+        """Run tasks until all items have been processed, and return the number of items.
 
-        An error of a task, or of the items, cancels the other tasks; the pipe fails with it.
+        If a task or the source of the items raises an error, the other tasks are canceled, the pipe
+        fails with the error, and the error is raised.
         """
         try:
             while self._running or not self._items.drained:
-                self._look()
+                self._update_slots()
                 free = max(0, self._window - len(self._running))
                 futures = self._futures()
                 if self._items.drained or (self._items.closed and not free):
@@ -141,7 +142,7 @@ class ItemTasks:
                     items = self._items.take(futures, free, self._until_next_s)
                     self._submit(items)
                 full = len(self._running) >= self._window
-                self._check()
+                self._check_tasks()
                 if full and len(self._running) < self._slots:
                     self._per_slot = min(2 * self._per_slot, MOST_PER_SLOT)
                     self._set_window()
@@ -153,43 +154,46 @@ class ItemTasks:
         return self._count
 
     def stop(self) -> None:
-        """End `run` in another thread: cancel the tasks, and fail the pipe."""
+        """End `run` from another thread, cancel the tasks, and make the pipe fail."""
         self._stopped = True
         self._items.fail(f"`for_each` with function {funcname(self._function)!r} was canceled.")
         self._cancel()
 
     def _cancel(self) -> None:
         """Cancel the tasks that have not started."""
-        if self._partition.client.status == "running":  # else it has cancelled them itself
+        if self._partition.client.status == "running":  # a closed client has canceled them itself
             self._partition.client.cancel(self._futures())
 
     def _futures(self) -> list[Future]:
         return [future for future, _, _ in list(self._running.values())]
 
-    def _look(self) -> None:
-        """Read the number of slots: partitions grow, shrink, and lose workers.
+    def _update_slots(self) -> None:
+        """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
 
-        PoolError if tasks could never run, or have waited for workers too long.
+        Raises
+        ------
+        PoolError
+            If the tasks could never run, or have waited too long for workers.
         """
-        if time.monotonic() <= self._next_look:
+        if time.monotonic() <= self._next_check:
             return
         partition = self._partition
-        of_partition = prospects(
+        of_partition = request_capacity(
             partition.client, partition.name, self._options["slots"], partition.by_rule
         )
-        self._slots = of_partition.running
+        self._slots = of_partition.max_running
         self._set_window()
         if self._running:
             self._wait.check(of_partition)
-        self._until_next_s = self._wait.until_next_check(LOOK_S)
-        self._next_look = time.monotonic() + self._until_next_s
+        self._until_next_s = self._wait.seconds_until_check(CHECK_S)
+        self._next_check = time.monotonic() + self._until_next_s
 
     def _set_window(self) -> None:
         if self._given_window is None:
             self._window = max(2, self._per_slot * self._slots)
 
     def _submit(self, items: Sequence[Any]) -> None:
-        """Submit a task for each item, unless this was stopped."""
+        """Submit a task for each item unless `stop` was called."""
         for item in items:
             if self._stopped:
                 raise CancelledError
@@ -197,10 +201,13 @@ class ItemTasks:
             self._running[future.key] = future, self._count, item
             self._count += 1
 
-    def _check(self) -> None:
-        """Forget tasks that have ended.
+    def _check_tasks(self) -> None:
+        """Remove ended tasks, and raise the error of a failed task.
 
-        Raises the error of a failed task, or an error that says that this has stopped.
+        Raises
+        ------
+        CancelledError
+            If `stop` was called.
         """
         if self._stopped:
             raise CancelledError
