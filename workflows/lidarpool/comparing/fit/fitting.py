@@ -1,7 +1,6 @@
-"""Fits the performance of a sensor to a recording, and writes a sensor file and its page.
+"""Fit the performance parameters of a sensor to a recording, and save a sensor file and a report.
 
-A figure is a number of the performance, such as the noise of ranges; intervals of figures are
-confidence intervals of 95 %. Arrays have the axes of `stack`.
+Confidence intervals have a level of 95 %. The axes of arrays are described in `stack`.
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ class Fit:
 
     @checked
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file and an .html page next to it, and return both paths.
+        """Write the sensor file, and an .html report next to it, and return both paths.
 
         Raises
         ------
         LidarError
-            If the file is not a .yaml file, or cannot be written.
+            If the file is not a .yaml file, or if it cannot be written.
         """
         model_path = Path(file)
         if model_path.suffix not in MODEL_FILES:
@@ -157,7 +156,7 @@ def fit(
 
 
 def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
-    """Return the fit of a sensor `base` to what was measured."""
+    """Create the fit of a sensor from the measured performance."""
     stack = measured.stack
     name = Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
@@ -184,7 +183,7 @@ def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
 
 
 def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    """Return True if each ring is near a beam of a model, or a calibration file has the beams."""
+    """Return True if each ring has a beam nearby, or if a calibration file defines the beams."""
     offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
     is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
     return model.needs_calibration or is_near
@@ -193,10 +192,11 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor with estimates in its performance.
+    """Return a sensor whose performance is updated with estimates.
 
-    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise
-    go together: an estimate of one replaces all of these, and `precision`.
+    `estimates` comes from `Measured`. Parameters without an estimate keep their values. The
+    parameters of range noise belong together: an estimate of one of them replaces all of them, and
+    `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()
@@ -214,7 +214,7 @@ def _with_performance(
 
 
 def recorded_sensor(stack: SweepStack) -> SensorModel:
-    """Return a sensor with the beams of a recording."""
+    """Return a sensor model with the beams of a recording."""
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "median angles of the recorded points"},

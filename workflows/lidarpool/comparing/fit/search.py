@@ -1,4 +1,4 @@
-"""Finds the motion of a sensor between two sweeps that most of the changed objects show."""
+"""Search for the motion of a sensor between two sweeps that explains most changed objects."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ _THINGS = 3  # things that are tried, the largest first
 def motion_between(
     stack: SweepStack, first: int, second: int, period_ns: float | None
 ) -> RigidMotion | None:
-    """Find the motion of a sensor between two sweeps, or None if the sensor may stand.
+    """Find the motion of a sensor between two sweeps, or return None if it may be stationary.
 
-    `period_ns` is the time from sweep to sweep, if known.
+    `period_ns` is the time between consecutive sweeps, or None if it is unknown.
     """
     changes = RangeChanges.between(stack, first, second)
     pair = SightPair.of_sweeps(Sight.of_sweep(stack, first), Sight.of_sweep(stack, second))
@@ -65,7 +65,7 @@ def motion_between(
 
 
 def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bool:
-    """Return True if more objects show a motion than speak against the motion."""
+    """Return True if more objects support a motion than contradict it."""
     if np.linalg.norm(motion.shift) < MIN_SHIFT_M and abs(motion.yaw_rad) < MIN_YAW_RAD:
         return False
     evidence = pair.evidence(motion), changes.evidence(motion)
@@ -78,9 +78,10 @@ def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bo
 def _shown_by_sight(
     pair: SightPair, changes: RangeChanges, max_shift_m: float
 ) -> RigidMotion | None:
-    """Search motions until one is shown, or few objects are left that changed.
+    """Search for a motion that is supported by objects, until few changed objects remain.
 
-    The motion that explains most points may be the motion of a car beside the sensor.
+    The motion that explains most points may belong to a car beside the sensor, in which case the
+    points that it explains are removed and the search is repeated.
     """
     remaining = pair
     for _ in range(_THINGS):
@@ -94,7 +95,7 @@ def _shown_by_sight(
 
 
 def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
-    """Find the motion that brings most points of two sweeps to one place."""
+    """Find the motion that aligns most points of two sweeps."""
     motions = _coarse_motions(_free_axes(changes), max_shift_m)
     sample = pair.sample(_COARSE_POINTS)
     scores = np.concatenate([pair.score(batch, *sample) for batch in _batches(motions)])
@@ -112,9 +113,9 @@ def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> 
 
 
 def _free_axes(changes: RangeChanges) -> Floats:
-    """Return axes (m, 3) along which the sensor may shift.
+    """Return the axes along which a shift of the sensor would change few ranges, with shape (m, 3).
 
-    If the sensor may shift along none, the two freest axes are returned.
+    If there are none, the two axes with the smallest changes are returned.
     """
     axes, shares = changes.axes()
     free = int((shares < _FREE_SHARE).sum())
@@ -122,7 +123,7 @@ def _free_axes(changes: RangeChanges) -> Floats:
 
 
 def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
-    """Return turns on the spot, and shifts along one axis or in the plane of two axes (m, 3)."""
+    """Return candidate motions: rotations in place, and shifts along one or two axes."""
     yaw_rad = np.radians(np.arange(_YAW_STEP_DEG, _MAX_YAW_DEG, _YAW_STEP_DEG))
     directions = axes[:1]
     if len(axes) > 1:
@@ -136,7 +137,6 @@ def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
 
 
 def _batches(motions: RigidMotion) -> Iterator[RigidMotion]:
-    """Yield the motions in batches that fit into memory."""
     for start in range(0, len(motions.shift), _BATCH):
         yield _chosen(motions, slice(start, start + _BATCH))
 
@@ -149,18 +149,18 @@ def _chosen(motions: RigidMotion, index: Any) -> RigidMotion:
 def _highest(
     pair: SightPair, motions: RigidMotion, sample: tuple[Floats, Floats]
 ) -> tuple[RigidMotion, int]:
-    """Return the first of the motions with the highest score, and the score."""
+    """Return the motion with the highest score, and its score. The first motion wins ties."""
     scores = pair.score(motions, *sample)
     return _chosen(motions, scores.argmax()), int(scores.max())
 
 
 def _moved_by(motion: RigidMotion, offsets: Floats) -> RigidMotion:
-    """Add shifts, and yaws at `ARM_M`, (…, 4) in meters, to a motion."""
+    """Add offsets of shape (…, 4) to a motion: shifts, and yaw at `ARM_M`, in meters."""
     return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
 
 
 def _centered(pair: SightPair, motion: RigidMotion) -> RigidMotion:
-    """Return the middle of the motions that explain two sweeps about as well as a motion."""
+    """Return the center of the motions that explain two sweeps nearly as well as `motion`."""
     sample = pair.sample(_FINE_POINTS)
     steps_m = np.arange(-_CENTER_STEPS, _CENTER_STEPS + 1) * _REFINEMENTS_M[-1]
     for axis in np.eye(4):
