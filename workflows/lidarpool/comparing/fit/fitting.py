@@ -33,7 +33,7 @@ from ...report.page.rendering import rendered
 from .charts import draw_charts
 from .estimates import Estimate
 from .known_poses import KnownPoses
-from .measured import Measured, measure_moving, measure_standing
+from .measured import SensorMeasurement, measure_moving, measure_standing
 from .performance import has_frontal_rays
 from .stack import SweepStack, check_sweeps
 from .standstill import moving_message
@@ -137,7 +137,7 @@ def fit(
         recording = open_recording(recording, sensor, intensity, name="the recording")
     check_sweeps(recording)
     loaded = Scene.load(scene) if isinstance(scene, str | Path) else scene
-    poses = KnownPoses.of_recording(recording, pose, loaded)
+    poses = KnownPoses.from_recording(recording, pose, loaded)
     speed = None if poses is None else poses.speed(recording)
     if poses is None or speed is None:
         measured = measure_standing(recording, white, loaded, poses)
@@ -155,7 +155,7 @@ def fit(
     return _fit_of(recording, measured, base)
 
 
-def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
+def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel) -> Fit:
     """Create the fit of a sensor from the measured performance."""
     stack = measured.stack
     name = Path(recording.name).name
@@ -192,11 +192,10 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor whose performance is updated with estimates.
+    """Return a sensor whose performance is updated with `SensorMeasurement.estimates`.
 
-    `estimates` comes from `Measured`. Parameters without an estimate keep their values. The
-    parameters of range noise belong together: an estimate of one of them replaces all of them, and
-    `precision`.
+    Parameters without an estimate keep their values. The parameters of range noise belong together:
+    an estimate of one of them replaces all of them, and `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()

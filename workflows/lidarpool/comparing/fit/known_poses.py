@@ -43,7 +43,7 @@ class KnownPoses:
     origin: Floats  # (3,): of the scene in the world, meters
 
     @classmethod
-    def of_recording(
+    def from_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
         """Return the poses given by the user, otherwise the recording's poses, or None if unknown.

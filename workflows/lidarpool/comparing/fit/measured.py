@@ -17,7 +17,7 @@ from lidarsim.simulator import Scanner
 from ...clouds.recording import Recording
 from .estimates import MIN_RAYS, Estimate
 from .known_poses import KnownPoses
-from .moving_pulses import Pulses, measure_pulses
+from .moving_pulses import ScenePulses, measure_pulses
 from .performance import alarm_share, fit_performance
 from .ring_bias import ring_bias
 from .smooth_surfaces import (
@@ -40,7 +40,7 @@ Curve = list[dict[str, float]]  # points, each with x, value, low and high
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class SensorMeasurement:
     """Rays on smooth surfaces, and the sensor performance fitted to their returns."""
 
     stack: SweepStack
@@ -105,7 +105,7 @@ class Measured:
 
 def measure_standing(
     recording: Recording, white: float | None, scene: Scene | None, poses: KnownPoses | None
-) -> Measured:
+) -> SensorMeasurement:
     """Measure a stationary sensor from its returns on smooth surfaces.
 
     `white` is the intensity of a white surface. Raises LidarError if the sensor moves, if it is not
@@ -132,12 +132,12 @@ def measure_standing(
     if estimates and (alarms := alarm_share(stack)):
         estimates["false_alarms"] = alarms
     bias = _bias(stack, rays, sigma, expected)
-    return Measured(stack, rays, energy, estimates, bias, lost_by_range)
+    return SensorMeasurement(stack, rays, energy, estimates, bias, lost_by_range)
 
 
 def measure_moving(
     recording: Recording, white: float | None, scene: Scene, poses: KnownPoses
-) -> Measured:
+) -> SensorMeasurement:
     """Measure a moving sensor from its pulses on the surfaces of a scene.
 
     `white` is the intensity of a white surface. Raises LidarError if the sensor is not at its poses
@@ -157,7 +157,9 @@ def measure_moving(
         estimates, sigma = fit_performance(rays, energy, all_known=True)
     lost = 1 - rays.return_counts.astype(np.float64)
     bias = _pulse_bias(pulses)
-    return Measured(stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True)
+    return SensorMeasurement(
+        stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True
+    )
 
 
 def _check_rays(count: int, name: str) -> None:
@@ -228,7 +230,7 @@ def _bias(
     return ring_bias(flat, stack.directions[cell], error_m)
 
 
-def _pulse_bias(pulses: Pulses) -> dict[int, Estimate]:
+def _pulse_bias(pulses: ScenePulses) -> dict[int, Estimate]:
     """Estimate the range bias of each row in meters from returns that are not too oblique."""
     returned = np.isfinite(pulses.residual) & (pulses.slope < FLAT_TANGENT * pulses.expected)
     return _mean_by_row(pulses.row[returned], pulses.residual[returned])

@@ -31,7 +31,7 @@ from .smooth_surfaces import (
     MAX_TANGENT,
     MIN_RANGE_M,
     SCENE_TOLERANCE_M,
-    Neighbors,
+    CellNeighbors,
     SmoothRays,
     among_smooth,
 )
@@ -46,13 +46,13 @@ _LIGHT_COLUMNS = 3  # cells on either side whose intensities count
 
 
 @dataclass(frozen=True, eq=False)
-class Pulses:
+class ScenePulses:
     """Pulses that hit smooth surfaces of a scene. All arrays have shape (n,)."""
 
     row: Ints
     column: Ints
     expected: Floats  # range of the scene, meters
-    slope: Floats  # growth of the range with the direction, meters in a radian
+    slope: Floats  # growth of the range with the direction, meters per radian
     residual: Floats  # range less `expected`, meters; NaN of a lost pulse
     intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
     difference: Floats  # residual less the residual of the next pulse of the ring; NaN if unknown
@@ -62,9 +62,9 @@ class Pulses:
         scatter_m = float(np.nanmedian(np.abs(self.difference))) / (0.6745 * np.sqrt(2))
         return np.hypot(scatter_m, ASSUMED_DIRECTION_NOISE_RAD * self.slope)
 
-    def select(self, chosen: Bools | Indices) -> Pulses:
+    def select(self, chosen: Bools | Indices) -> ScenePulses:
         """Select pulses by mask or index."""
-        return Pulses(*(values[chosen] for values in vars(self).values()))
+        return ScenePulses(*(values[chosen] for values in vars(self).values()))
 
     def near_scene(self, sigma: Floats) -> Bools:
         """Mark pulses that are lost, or whose range agrees with the scene.
@@ -100,7 +100,7 @@ class Pulses:
 class SweepPulses(NamedTuple):
     """Pulses on smooth surfaces of the scene, from one sweep or from all sweeps."""
 
-    pulses: Pulses
+    pulses: ScenePulses
     compared: int  # returns where the scene has a surface
     near: int  # returns of these within `SCENE_TOLERANCE_M` of the surface
 
@@ -108,7 +108,7 @@ class SweepPulses(NamedTuple):
     def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
         """Join the pulses of several sweeps. If there are too many, they are sampled evenly."""
         columns = zip(*(vars(sweep.pulses).values() for sweep in sweeps), strict=True)
-        pulses = Pulses(*map(np.concatenate, columns))
+        pulses = ScenePulses(*map(np.concatenate, columns))
         return cls(
             pulses.select(even_indices(len(pulses.row), _MAX_PULSES)),
             sum(sweep.compared for sweep in sweeps),
@@ -125,7 +125,7 @@ def measure_pulses(
     as `SweepStack.read`.
     """
     stack = SweepStack.read(recording, fired)
-    caster = _CellCaster.of_stack(stack, scene)
+    caster = _CellCaster.from_stack(stack, scene)
     sweeps = enumerate(stack.numbers.tolist())
     return stack, SweepPulses.joined(
         [_pulses_of_sweep(stack, index, caster, fired(number)) for index, number in sweeps]
@@ -143,12 +143,12 @@ class _CellReturns(NamedTuple):
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
 
     @classmethod
-    def of_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
+    def from_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
         """Find the returns for the cells of a sweep."""
         points = fired.points
         rings = fired.rings
         assert rings is not None
-        nearest = _NearestReturns.of_sweep(stack, sweep, points, rings)
+        nearest = _NearestReturns.from_sweep(stack, sweep, points, rings)
         index = nearest.indices
         ranges = np.linalg.norm(points, axis=1)[index]
         cell_ranges = stack.ranges[sweep]
@@ -176,7 +176,7 @@ class _NearestReturns(NamedTuple):
     spacing_deg: Floats  # (r, c): between the points before and after the cell
 
     @classmethod
-    def of_sweep(
+    def from_sweep(
         cls, stack: SweepStack, sweep: int, points: Floats, rings: Ints
     ) -> _NearestReturns:
         """Find the points that are closest in azimuth to the cells of a sweep.
@@ -193,7 +193,7 @@ class _NearestReturns(NamedTuple):
         bounds = np.searchsorted(rings[order], np.stack([stack.rings, stack.rings + 1], axis=1))
         indices_by_ring = [order[start:stop] for start, stop in bounds.tolist()]
         nearest = [
-            cls._of_ring(ring_cells, azimuth_deg[ring_points], ring_points)
+            cls._for_ring(ring_cells, azimuth_deg[ring_points], ring_points)
             for ring_cells, ring_points in zip(cell_deg, indices_by_ring, strict=True)
         ]
         indices, gap_deg, sides, spacing_deg = zip(*nearest, strict=True)
@@ -202,7 +202,7 @@ class _NearestReturns(NamedTuple):
         )
 
     @classmethod
-    def _of_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
+    def _for_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
         """Find the points of one ring that are closest to its cells.
 
         Points are sorted by azimuth.
@@ -253,7 +253,7 @@ class _CellCaster:
     directions: Floats  # (r, c, 3): unit directions in the sensor frame
 
     @classmethod
-    def of_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
+    def from_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
         """Create the caster for the cells of a stack."""
         rays = stack.directions.reshape(-1, 3)
         shot_ns = np.arange(len(rays), dtype=np.float64)
@@ -270,7 +270,7 @@ class _CellCaster:
         normal = np.full(shape, np.nan)
         distance[cell] = cloud["range"]
         normal[cell] = np.stack([cloud[name] for name in NORMAL], axis=1)
-        directions = _turned(rotations, self.directions)
+        directions = _rotate_vectors(rotations, self.directions)
         with np.errstate(invalid="ignore", divide="ignore"):
             cosine = (normal * directions).sum(axis=-1)
             slope = distance * np.sqrt(np.maximum(1 / cosine**2 - 1, 0))
@@ -279,7 +279,9 @@ class _CellCaster:
             points = positions.reshape(shape) + path
             smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
             tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance
-            smooth &= Neighbors.from_points(points).are_coplanar(points, scaled_normal, tolerance_m)
+            smooth &= CellNeighbors.from_points(points).are_coplanar(
+                points, scaled_normal, tolerance_m
+            )
         return _SceneSurfaces(distance, slope, path, scaled_normal, smooth)
 
 
@@ -287,7 +289,7 @@ class _SceneSurfaces(NamedTuple):
     """Surfaces of a scene in the cells of a sweep."""
 
     distance: Floats  # (r, c): meters; NaN without a hit
-    slope: Floats  # (r, c): growth of the range with the direction, meters in a radian
+    slope: Floats  # (r, c): growth of the range with the direction, meters per radian
     path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, meters
     scaled_normal: Floats  # (r, c, 3): normal n, as n / (n · d) for the direction d
     smooth: Bools  # (r, c): whether the neighbors lie in one plane with the cell
@@ -301,7 +303,7 @@ class _SceneSurfaces(NamedTuple):
         """
         ranges = np.linalg.norm(points, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            directions = _turned(rotations, points / ranges[..., None])
+            directions = _rotate_vectors(rotations, points / ranges[..., None])
             offset = (self.path * self.scaled_normal).sum(axis=-1)
             return np.asarray(ranges - offset / (directions * self.scaled_normal).sum(axis=-1))
 
@@ -310,7 +312,7 @@ def _pulses_of_sweep(
     stack: SweepStack, sweep: int, caster: _CellCaster, fired: Sweep
 ) -> SweepPulses:
     """Compare the pulses of one sweep with the smooth surfaces of a scene."""
-    returns = _CellReturns.of_sweep(stack, sweep, fired)
+    returns = _CellReturns.from_sweep(stack, sweep, fired)
     surfaces = caster.surfaces(returns.positions, returns.rotations)
     residual = np.where(
         returns.own, surfaces.range_errors(returns.points, returns.rotations), np.nan
@@ -330,7 +332,7 @@ def _pulses_of_sweep(
     difference[:, 1::2] = np.nan  # so that each return contributes to only one difference
     intensity = _means_beside(np.where(is_near, stack.intensities[sweep], np.nan))
     cell = np.nonzero(usable & among_smooth(surfaces.smooth))
-    pulses = Pulses(
+    pulses = ScenePulses(
         row=cell[0],
         column=cell[1],
         expected=surfaces.distance[cell],
@@ -354,7 +356,7 @@ def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
     return poses.position + poses.offsets[:, index].T, rotations
 
 
-def _turned(rotations: Floats, vectors: Floats) -> Floats:
+def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
     """Rotate vectors of shape (r, c, 3) by rotations of shape (r c, 3, 3)."""
     turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
     return np.asarray(turned.reshape(vectors.shape))

@@ -144,7 +144,7 @@ class _VarianceSamples(NamedTuple):
     variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance
     growth: Floats  # a quantity that noise of ranges grows with, such as the range
-    slope: Floats  # meters in a radian
+    slope: Floats  # meters per radian
     distance: Floats  # meters
     patch: Ints  # number of the patch of neighboring rays, whose errors may be alike
 
@@ -163,7 +163,7 @@ class _VarianceModel:
     fitted: Bools  # (3,): which parameters are fitted
     variance_scale: float  # usual variance v, square meters
     growth_scale: float  # usual growth, in its unit
-    slope_scale: float  # usual slope, meters in a radian
+    slope_scale: float  # usual slope, meters per radian
 
     def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
         """Return the range variance of each ray in square meters."""

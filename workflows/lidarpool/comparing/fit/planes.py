@@ -16,9 +16,9 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
 
 from .estimates import MIN_RAYS, sandwich
-from .sight import Evidence, RigidMotion, count_objects
-from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfaces
+from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, SmoothSurfaces, find_surfaces
 from .stack import SweepStack, finite_median
+from .visibility import Evidence, RigidMotion, count_objects
 
 SWEEP_PAIRS = 8  # number of pairs of sweeps to compare
 ARM_M = 10.0  # distance at which rotations are expressed in meters
@@ -51,7 +51,7 @@ _OFFSET = 6  # column of the offset of all ranges
 class RangeChanges:
     """Changes of the ranges of smooth surfaces between two sweeps."""
 
-    surfaces: Surfaces  # surfaces of the first sweep
+    surfaces: SmoothSurfaces  # surfaces of the first sweep
     # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
     chosen: Bools
     change: Floats  # (r, c): meters, second less first, without the change by shifted azimuths
@@ -232,7 +232,7 @@ def fit_creep(stack: SweepStack) -> Creep:
     Similarly, an offset that grows in all ranges is not a motion; it occurs, for example, while a
     sensor warms up.
     """
-    rays = _CreepRays.of_stack(stack)
+    rays = _CreepRays.from_stack(stack)
     if len(rays.design) < MIN_RAYS:
         return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0)
     time = rays.numbers - rays.numbers.mean()
@@ -273,7 +273,7 @@ class _CreepRays:
     sector: Ints  # (k,)
 
     @classmethod
-    def of_stack(cls, stack: SweepStack) -> _CreepRays:
+    def from_stack(cls, stack: SweepStack) -> _CreepRays:
         """Select rays and sweeps at even intervals."""
         numbers = even_indices(stack.sweep_count, _CREEP_SWEEPS)
         median = finite_median(stack.ranges, 0)

@@ -10,8 +10,8 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 
 from .planes import ARM_M, RangeChanges
-from .sight import RigidMotion, Sight, SightPair
 from .stack import SweepStack
+from .visibility import RigidMotion, VisibilityImage, VisibilityPair
 
 MIN_SHIFT_M = 0.02  # a sensor that shifts by less stands
 MIN_YAW_RAD = 0.003  # a sensor that turns by less stands
@@ -45,17 +45,19 @@ def motion_between(
     `period_ns` is the time between consecutive sweeps, or None if it is unknown.
     """
     changes = RangeChanges.between(stack, first, second)
-    pair = SightPair.of_sweeps(Sight.of_sweep(stack, first), Sight.of_sweep(stack, second))
+    pair = VisibilityPair.from_images(
+        VisibilityImage.from_sweep(stack, first), VisibilityImage.from_sweep(stack, second)
+    )
     max_shift_m = _MAX_SHIFT_M
     if period_ns:
         max_shift_m = min(max_shift_m, _MAX_SPEED_M_S * period_ns / 1e9 * (second - first))
     by_planes = changes.motion()
     if by_planes is not None and not _is_shown(by_planes, pair, changes):
         by_planes = None
-    by_sight = _shown_by_sight(pair, changes, max_shift_m)
+    by_sight = _search_by_visibility(pair, changes, max_shift_m)
     if by_sight is None:
         return by_planes
-    by_sight = _centered(pair, by_sight)
+    by_sight = _center_motion(pair, by_sight)
     if by_planes is None:
         return by_sight
     # Planes are more exact, unless the rays have left them.
@@ -64,7 +66,7 @@ def motion_between(
     return by_planes if planes_score > _SIMILAR_SHARE * sight_score else by_sight
 
 
-def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bool:
+def _is_shown(motion: RigidMotion, pair: VisibilityPair, changes: RangeChanges) -> bool:
     """Return True if more objects support a motion than contradict it."""
     if np.linalg.norm(motion.shift) < MIN_SHIFT_M and abs(motion.yaw_rad) < MIN_YAW_RAD:
         return False
@@ -75,8 +77,8 @@ def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bo
     return bool(is_clear and moved > against)
 
 
-def _shown_by_sight(
-    pair: SightPair, changes: RangeChanges, max_shift_m: float
+def _search_by_visibility(
+    pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 ) -> RigidMotion | None:
     """Search for a motion that is supported by objects, until few changed objects remain.
 
@@ -94,18 +96,18 @@ def _shown_by_sight(
     return None
 
 
-def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
+def _best_motion(pair: VisibilityPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
     """Find the motion that aligns most points of two sweeps."""
     motions = _coarse_motions(_free_axes(changes), max_shift_m)
     sample = pair.sample(_COARSE_POINTS)
     scores = np.concatenate([pair.score(batch, *sample) for batch in _batches(motions)])
-    candidates = _chosen(motions, np.argsort(-scores, kind="stable")[:_CANDIDATES])
+    candidates = _select_motions(motions, np.argsort(-scores, kind="stable")[:_CANDIDATES])
     sample = pair.sample(_FINE_POINTS)
-    best, best_score = _highest(pair, candidates, sample)
+    best, best_score = _select_best(pair, candidates, sample)
     for step_m in _REFINEMENTS_M:
         while True:
             steps = step_m * np.concatenate([np.eye(4), -np.eye(4)])
-            refined, score = _highest(pair, _moved_by(best, steps), sample)
+            refined, score = _select_best(pair, _add_offsets(best, steps), sample)
             if score <= best_score:
                 break
             best, best_score = refined, score
@@ -138,34 +140,34 @@ def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
 
 def _batches(motions: RigidMotion) -> Iterator[RigidMotion]:
     for start in range(0, len(motions.shift), _BATCH):
-        yield _chosen(motions, slice(start, start + _BATCH))
+        yield _select_motions(motions, slice(start, start + _BATCH))
 
 
-def _chosen(motions: RigidMotion, index: Any) -> RigidMotion:
+def _select_motions(motions: RigidMotion, index: Any) -> RigidMotion:
     """Select motions by index."""
     return RigidMotion(motions.shift[index], motions.yaw_rad[index])
 
 
-def _highest(
-    pair: SightPair, motions: RigidMotion, sample: tuple[Floats, Floats]
+def _select_best(
+    pair: VisibilityPair, motions: RigidMotion, sample: tuple[Floats, Floats]
 ) -> tuple[RigidMotion, int]:
     """Return the motion with the highest score, and its score. The first motion wins ties."""
     scores = pair.score(motions, *sample)
-    return _chosen(motions, scores.argmax()), int(scores.max())
+    return _select_motions(motions, scores.argmax()), int(scores.max())
 
 
-def _moved_by(motion: RigidMotion, offsets: Floats) -> RigidMotion:
+def _add_offsets(motion: RigidMotion, offsets: Floats) -> RigidMotion:
     """Add offsets of shape (…, 4) to a motion: shifts, and yaw at `ARM_M`, in meters."""
     return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
 
 
-def _centered(pair: SightPair, motion: RigidMotion) -> RigidMotion:
+def _center_motion(pair: VisibilityPair, motion: RigidMotion) -> RigidMotion:
     """Return the center of the motions that explain two sweeps nearly as well as `motion`."""
     sample = pair.sample(_FINE_POINTS)
     steps_m = np.arange(-_CENTER_STEPS, _CENTER_STEPS + 1) * _REFINEMENTS_M[-1]
     for axis in np.eye(4):
         offsets = steps_m[:, None] * axis
-        scores = pair.score(_moved_by(motion, offsets), *sample)
+        scores = pair.score(_add_offsets(motion, offsets), *sample)
         similar = scores > scores.max() - _SIMILAR_POINTS
-        motion = _moved_by(motion, offsets[similar].mean(axis=0))
+        motion = _add_offsets(motion, offsets[similar].mean(axis=0))
     return motion

@@ -25,16 +25,16 @@ MAX_SIGMAS = 6.0  # returns beyond this limit belong to moving objects
 MIN_RETURN_SHARE = 0.8  # minimum fraction of a ray's returns that belong to the same surface
 
 
-class Surfaces(NamedTuple):
+class SmoothSurfaces(NamedTuple):
     """Local surfaces in the cells of a range image. Arrays have shape (r, c)."""
 
-    azimuth_slope: Floats  # growth of the range with the azimuth, meters in a radian
-    slope: Floats  # growth of the range with the direction of steepest growth, meters in a radian
+    azimuth_slope: Floats  # growth of the range with the azimuth, meters per radian
+    slope: Floats  # growth of the range with the direction of steepest growth, meters per radian
     smooth: Bools  # whether the neighbors lie in one plane with the cell
     scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
-class Neighbors(NamedTuple):
+class CellNeighbors(NamedTuple):
     """Points in the cells beside each cell of a range image, in meters. Shape (r, c, 3) each."""
 
     next_1: Floats
@@ -45,7 +45,7 @@ class Neighbors(NamedTuple):
     below: Floats
 
     @classmethod
-    def from_points(cls, points: Floats) -> Neighbors:
+    def from_points(cls, points: Floats) -> CellNeighbors:
         """Find the neighbors of each point.
 
         Columns wrap around, because they cover a full revolution.
@@ -76,14 +76,14 @@ class Neighbors(NamedTuple):
         return coplanar
 
 
-def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
+def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> SmoothSurfaces:
     """Find slopes and edges in a range image. `error_m` is the error of each range in meters."""
     points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _beam_origins(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
         directions = beams / length
-        neighbors = Neighbors.from_points(points)
+        neighbors = CellNeighbors.from_points(points)
         normal = neighbors.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * directions).sum(axis=-1, keepdims=True)
@@ -93,7 +93,7 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfa
         smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
         smooth &= neighbors.are_coplanar(points, normal, tolerance_m)
     azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
-    return Surfaces(azimuth_slope, slope, smooth, normal)
+    return SmoothSurfaces(azimuth_slope, slope, smooth, normal)
 
 
 def _beam_origins(points: Floats) -> Floats:
@@ -119,11 +119,11 @@ class SmoothRays(NamedTuple):
     row: Ints
     column: Ints
     distance: Floats  # mean of the ranges, meters
-    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, meters in a radian
+    slope: Floats  # meters per radian, see `SmoothSurfaces.slope`
     intensity: Floats  # mean; NaN if unknown
     return_counts: Ints  # number of sweeps with a return
-    trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
-    variance: Floats  # variance of the range over the sweeps, square meters
+    trials: Ints  # number of sweeps that cover the ray, see `SweepStack`
+    variance: Floats  # variance of the range over all sweeps, in square meters
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
@@ -199,7 +199,7 @@ def _ray_statistics(
     """Compute the statistics of returns within `limit_m` of the median range of their ray.
 
     `cell` contains the row and column indices of the rays. Ranges are corrected for the azimuths of
-    their pulses by `azimuth_slope` (see `Surfaces`). All distances are in meters.
+    their pulses by `azimuth_slope` (see `SmoothSurfaces`). All distances are in meters.
     """
     row, column = cell
     ranges = stack.ranges[:, row, column].astype(np.float64)

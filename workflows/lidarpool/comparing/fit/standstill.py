@@ -14,8 +14,8 @@ from lidarsim.base.words import rounded
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
 from .search import MIN_SHIFT_M, MIN_YAW_RAD, motion_between
-from .sight import RigidMotion
 from .stack import SweepStack, finite_median
+from .visibility import RigidMotion
 
 _NEXT_PAIRS = 5  # pairs of a sweep and the next that are compared
 _MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static scene

@@ -54,14 +54,16 @@ class RigidMotion(NamedTuple):
 
     def to_first(self, points: Floats) -> Floats:
         """Convert points of the second sweep to the frame of the first: (n, 3) to (…, n, 3)."""
-        return np.asarray(_rotated(points, self.yaw_rad[..., None]) + self.shift[..., None, :])
+        return np.asarray(
+            _rotate_about_z(points, self.yaw_rad[..., None]) + self.shift[..., None, :]
+        )
 
     def to_second(self, points: Floats) -> Floats:
         """Convert points of the first sweep to the frame of the second: (n, 3) to (…, n, 3)."""
-        return _rotated(points - self.shift[..., None, :], -self.yaw_rad[..., None])
+        return _rotate_about_z(points - self.shift[..., None, :], -self.yaw_rad[..., None])
 
 
-def _rotated(points: Floats, yaw_rad: Floats) -> Floats:
+def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
     """Rotate points of shape (…, 3) about the z axis by angles of shape (…)."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = np.cos(yaw_rad)
@@ -70,7 +72,7 @@ def _rotated(points: Floats, yaw_rad: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class VisibilityImage:
     """Closest and farthest surfaces of a sweep around each direction."""
 
     elevation_rad: Floats  # (r,): of the rows, descending
@@ -85,7 +87,7 @@ class Sight:
     tolerance_m: float
 
     @classmethod
-    def of_sweep(cls, stack: SweepStack, number: int) -> Sight:
+    def from_sweep(cls, stack: SweepStack, number: int) -> VisibilityImage:
         """Determine what one sweep of a stack sees."""
         ranges = stack.ranges[number].astype(np.float64)
         returned = np.isfinite(ranges)
@@ -93,11 +95,11 @@ class Sight:
         step_rad = 2 * np.pi / columns
         azimuth = np.arctan2(stack.directions[..., 1], stack.directions[..., 0])
         phase = (azimuth / step_rad - np.arange(columns) + columns / 2) % columns - columns / 2
-        nearest = _pairs_of_rows(
-            _beside(np.where(returned, ranges, np.inf), np.minimum), np.minimum
+        nearest = _reduce_row_pairs(
+            _reduce_neighbors(np.where(returned, ranges, np.inf), np.minimum), np.minimum
         )
-        farthest = _pairs_of_rows(
-            _beside(np.where(returned, ranges, -np.inf), np.maximum), np.maximum
+        farthest = _reduce_row_pairs(
+            _reduce_neighbors(np.where(returned, ranges, -np.inf), np.maximum), np.maximum
         )
         is_unknown = ~np.isfinite(nearest) & ~_empty_around(returned | ~stack.covered[number])
         noise_m = float(np.quantile(stack.rough_sigma, 0.25))
@@ -115,7 +117,7 @@ class Sight:
             tolerance_m=tolerance_m,
         )
 
-    def look_up(self, points: Floats) -> Ints:
+    def classify_points(self, points: Floats) -> Ints:
         """Classify points in the sensor frame as `_SURFACE`, `_UNKNOWN` or `_EMPTY`."""
         x, y, z = np.moveaxis(points, -1, 0)
         across = np.hypot(x, y)
@@ -141,14 +143,14 @@ class Sight:
         return np.where(in_view & passed, _EMPTY, np.where(in_view & met, _SURFACE, _UNKNOWN))
 
 
-def _beside(values: Floats, reduce: np.ufunc) -> Floats:
+def _reduce_neighbors(values: Floats, reduce: np.ufunc) -> Floats:
     """Reduce values over each column and its two neighbors."""
     return np.asarray(
         reduce(reduce(values, np.roll(values, 1, axis=1)), np.roll(values, -1, axis=1))
     )
 
 
-def _pairs_of_rows(values: Floats, reduce: np.ufunc) -> Floats:
+def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
     """Reduce values of shape (r, c) over adjacent rows, to shape (r - 1, c).
 
     A single row is returned as it is.
@@ -186,18 +188,23 @@ class Evidence(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SightPair:
+class VisibilityPair:
     """Two sweeps, and how each classifies the points of the other if the sensor is stationary."""
 
-    first: Sight
-    second: Sight
+    first: VisibilityImage
+    second: VisibilityImage
     seen_first: Ints  # (n,): classes of the first sweep's points in the second sweep
     seen_second: Ints  # (m,): classes of the second sweep's points in the first sweep
 
     @classmethod
-    def of_sweeps(cls, first: Sight, second: Sight) -> SightPair:
+    def from_images(cls, first: VisibilityImage, second: VisibilityImage) -> VisibilityPair:
         """Classify the points of each sweep by the other sweep."""
-        return cls(first, second, second.look_up(first.points), first.look_up(second.points))
+        return cls(
+            first,
+            second,
+            second.classify_points(first.points),
+            first.classify_points(second.points),
+        )
 
     def sample(self, count: int) -> tuple[Floats, Floats]:
         """Sample points of both sweeps, in their sensor frames and in meters.
@@ -227,14 +234,16 @@ class SightPair:
         The score is the number of points on surfaces of the other sweep, minus the number in empty
         space.
         """
-        seen_first = self.second.look_up(motions.to_second(first)).sum(axis=-1)
-        return np.asarray(seen_first + self.first.look_up(motions.to_first(second)).sum(axis=-1))
+        seen_first = self.second.classify_points(motions.to_second(first)).sum(axis=-1)
+        return np.asarray(
+            seen_first + self.first.classify_points(motions.to_first(second)).sum(axis=-1)
+        )
 
     def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
         """Return how each sweep classifies the other's points if the sensor moves."""
         in_second = motion.to_second(self.first.points)
         in_first = motion.to_first(self.second.points)
-        return self.second.look_up(in_second), self.first.look_up(in_first)
+        return self.second.classify_points(in_second), self.first.classify_points(in_first)
 
     def evidence(self, motion: RigidMotion | None) -> Evidence:
         """Count the objects for and against a motion.
@@ -255,7 +264,7 @@ class SightPair:
         ]
         return count_objects(points, kinds, _LONGEST_VEHICLE_M)
 
-    def without_explained(self, motion: RigidMotion) -> SightPair:
+    def without_explained(self, motion: RigidMotion) -> VisibilityPair:
         """Return the pair without the changed points that a motion explains."""
         seen_first, seen_second = (
             np.where((at_rest == _EMPTY) & (in_motion == _SURFACE), _UNKNOWN, at_rest)
