@@ -40,7 +40,7 @@ _SPHERE_RAYS = 128  # number of rays in all directions from each candidate
 _SECTORS = 36  # azimuth sectors, all of which contain rays if the sensor scans the full circle
 
 
-class Sight:
+class StationVisibility:
     """Visibility of surfaces from a station.
 
     A surface is visible if it is within the sensor's range and field of view, and not occluded. The
@@ -59,7 +59,7 @@ class Sight:
         self._lowest = lowest - 1e-9
         self._highest = highest + 1e-9
 
-    def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
+    def visible_sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
         """Return which side of the surface at each point is visible from a station.
 
         `station` has shape (3,), `points` and the unit vectors `normals` have shape (n, 3).
@@ -125,7 +125,7 @@ class StationPlan:
     reachable_m2: Floats  # (objects,) area of targets that candidates see
     covered_m2: Floats  # (objects,) area of targets that the stations see
     scene: Scene  # the planned scene: all triangles, without instances and actors
-    sight: Sight
+    sight: StationVisibility
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def plan_stations(
         raise LidarError("`count` and `coverage` cannot be combined.")
     is_target = _target_mask(scene.names, targets)  # first, to report wrong names immediately
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
-    sight = Sight(scene, sensor, slant_deg)
+    sight = StationVisibility(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
     positions = candidates(scene, sight.caster, height_m, spacing_m)
@@ -279,7 +279,7 @@ def survey_coverage(
     """
     is_target = _target_mask(scene.names, targets)
     scene = SimplifiedScene.from_scene(scene).scene
-    sight = Sight(scene, sensor, slant_deg)
+    sight = StationVisibility(scene, sensor, slant_deg)
     samples = _sample_surfaces(scene, is_target)
     has_point = np.zeros(len(samples.points), np.bool_)
     for points in clouds:
@@ -288,7 +288,7 @@ def survey_coverage(
             distance_m, _ = nearest(samples.points[missing], points - scene.origin)
             has_point[missing] = distance_m <= within_m
     sides = np.stack(
-        [sight.sides(p, samples.points, samples.normals) for p in positions - scene.origin]
+        [sight.visible_sides(p, samples.points, samples.normals) for p in positions - scene.origin]
     )
     reachable_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
     objects = len(scene.names)
@@ -321,9 +321,11 @@ class _Visibility(NamedTuple):
     area_m2: Floats  # (n,), area that a side stands for
 
 
-def _visibility(samples: _SurfaceSamples, sight: Sight, positions: Floats) -> _Visibility:
+def _visibility(
+    samples: _SurfaceSamples, sight: StationVisibility, positions: Floats
+) -> _Visibility:
     """Return the sides of the surface samples that candidates at local `positions` see."""
-    sides = np.stack([sight.sides(p, samples.points, samples.normals) for p in positions])
+    sides = np.stack([sight.visible_sides(p, samples.points, samples.normals) for p in positions])
     # Each side of a surface counts separately, because a thin wall has a side in each room.
     visible = np.concatenate([sides > 0, sides < 0], axis=1)
     columns = np.flatnonzero(visible.any(axis=0))

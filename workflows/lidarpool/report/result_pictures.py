@@ -33,7 +33,7 @@ from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_sc
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
 from lidarview.render.surface import unit
 
-from ..plan.stations import Sight, StationPlan
+from ..plan.stations import StationPlan, StationVisibility
 from .page.rendering import put_picture
 
 # small letters are illegible; a pixel takes 0.4 kB of memory
@@ -390,7 +390,7 @@ def _painted(samples: Samples, kinds: Ints) -> Samples:
 class _PixelVisibility:
     """Visibility of the surfaces in pixels of a shot, by the same rules as in the plan's table."""
 
-    sight: Sight
+    sight: StationVisibility
     eye: Floats  # (3,)
     face_normals: Floats  # (f, 3), of unit length
 
@@ -400,7 +400,7 @@ class _PixelVisibility:
         # The shot has moved the objects a little, so its rays must meet the moved triangles. The
         # normals of small triangles would turn: the plan's scene has them as they are. The normals
         # of samples do not serve, because they are smoothed for shading.
-        sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
+        sight = StationVisibility(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
         a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
         return cls(sight, shot.camera.eye, unit(np.cross(b - a, c - a)))
 
@@ -412,6 +412,6 @@ class _PixelVisibility:
         normals = np.where(facing_away[:, None], -normals, normals)
         hidden = np.arange(len(indices))
         for position in positions:
-            sides = self.sight.sides(position, points[hidden], normals[hidden])
+            sides = self.sight.visible_sides(position, points[hidden], normals[hidden])
             hidden = hidden[sides <= 0]
         return ~np.isin(np.arange(len(indices)), hidden)
