@@ -210,12 +210,12 @@ class StoredCloud(CloudDisplay):
     origin: Floats  # world position of the scene's local origin, (3,), meters
     keeper: Any = None  # object that deletes the parts when it is garbage-collected
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
-    tell: Callable[[int], object] = _ignore_progress  # called with the number of points read
+    report: Callable[[int], object] = _ignore_progress  # called with the number of points read
 
     def __getstate__(self) -> dict[str, Any]:
         # The keeper and the sweeps refer to the scene, which is too large to pickle. Progress is
         # not reported across processes.
-        return self.__dict__ | {"keeper": None, "sweeps": None, "tell": _ignore_progress}
+        return self.__dict__ | {"keeper": None, "sweeps": None, "report": _ignore_progress}
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
         return self.load().__array__(dtype)
@@ -263,7 +263,7 @@ class StoredCloud(CloudDisplay):
                 continue
             cloud = self.cloud_of(read_part(self.storage, name), slice(first, None))
             first = 0
-            self.tell(len(cloud))
+            self.report(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud[:cut]])
