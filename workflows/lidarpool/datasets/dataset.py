@@ -297,7 +297,7 @@ class DataSet:
         """Yield the manifests of finished jobs, and add the jobs to the index."""
         comma = ""
         named = dict[int, dict[str, None]]()  # {class number: distinct names in the jobs}
-        for job, (manifest, damage) in self.look(jobs):
+        for job, (manifest, damage) in self.check_jobs(jobs):
             if damage:
                 message = f"Job {job.name} of {self.storage} is incomplete, because {damage}."
                 raise LidarError(f"{message} Run the campaign again with `--resume`.")
@@ -313,7 +313,7 @@ class DataSet:
         classes_field = f', "classes": {json.dumps(classes)}' if classes else ""
         index.write(f"\n]{classes_field}")
 
-    def look(
+    def check_jobs(
         self, jobs: Iterable[JobRow], *, contents: bool = False
     ) -> Iterator[tuple[JobRow, tuple[dict[str, Any], str]]]:
         """Yield each finished job with its manifest and a description of damage to its files.
@@ -323,14 +323,14 @@ class DataSet:
         with `contents`, the checksums are compared, too. Raises OSError if the storage cannot be
         read.
         """
-        look_at = self._job_checker(contents)
-        yield from read_ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+        check_job = self._job_checker(contents)
+        yield from read_ahead(lambda job: check_job(job.name), (job for job in jobs if job.done))
 
     def _job_checker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
-        """Return a function that checks a job by its name, as described in `look`."""
+        """Return a function that checks a job by its name, as described in `check_jobs`."""
         sizes = lru_cache(_MAX_LISTED_FOLDERS)(lambda folder: self.storage.below(folder).sizes())
 
-        def look_at(job: str) -> tuple[dict[str, Any], str]:
+        def check_job(job: str) -> tuple[dict[str, Any], str]:
             manifest = self._manifest(job)
             if not manifest or "sensors" not in manifest:  # a failed job has no sensors
                 return {}, f"{manifest_file(job)} is missing or damaged"
@@ -341,9 +341,9 @@ class DataSet:
                     return manifest, f"{name} is missing or damaged"
             return manifest, ""
 
-        return look_at
+        return check_job
 
-    def take(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
+    def copy_jobs(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
         """Copy the files of jobs from `source`, which contains a data set of the same format.
 
         Files that already exist in this data set are not copied again. A job that failed in the
@@ -354,16 +354,16 @@ class DataSet:
         different `identity`, or an empty string if there is none. The row is None if the manifest
         itself is unusable. Raises OSError if a storage cannot be read or written.
         """
-        look_at = self._job_checker()
+        check_job = self._job_checker()
         other_set = replace(self, storage=source)
 
-        def take(name: str) -> tuple[JobRow | None, str]:
+        def copy_job(name: str) -> tuple[JobRow | None, str]:
             manifest = other_set._manifest(name)
             manifest_name = manifest_file(name)
             if not manifest or manifest["made_with"].get("identity") != identity:
                 return None, source.path(manifest_name)
             row = JobRow.from_json(manifest["row"])
-            if look_at(name) == (manifest, "") or (not row.done and self._manifest(name)):
+            if check_job(name) == (manifest, "") or (not row.done and self._manifest(name)):
                 return row, ""
             for file, checksum in (manifest["files"] | {manifest_name: None}).items():
                 # A manifest that lists files outside the data set is foreign or was edited.
@@ -378,7 +378,7 @@ class DataSet:
                 return row, source.path(file)
             return row, ""
 
-        for name, (row, damaged_file) in read_ahead(take, iter(other_set.manifests())):
+        for name, (row, damaged_file) in read_ahead(copy_job, iter(other_set.manifests())):
             yield name, row, damaged_file
 
     def _manifest(self, name: str) -> dict[str, Any]:

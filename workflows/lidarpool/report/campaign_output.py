@@ -403,7 +403,7 @@ def _check_jobs(
         tuple[str, str], list[str]
     ] = {}  # {name and hash of a file: jobs made of it}
     with explained(f"{dataset.storage} cannot be read"):
-        for row, (manifest, difference) in dataset.look(rows, contents=contents):
+        for row, (manifest, difference) in dataset.check_jobs(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
                 share = (
                     ""

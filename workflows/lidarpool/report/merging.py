@@ -475,7 +475,7 @@ def _take_jobs(
 
     Yields their rows, and adds files to `damaged`.
     """
-    for _, row, wrong in dataset.take(
+    for _, row, wrong in dataset.copy_jobs(
         shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
     ):
         damaged += [wrong] if wrong else []
