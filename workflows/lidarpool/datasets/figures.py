@@ -45,7 +45,7 @@ def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Varied:
+class VariedQuantity:
     """Values of a varied quantity in all jobs.
 
     The values are numbers, or labels if the quantity is not a number in some job.
@@ -64,7 +64,7 @@ class Varied:
         """Return the number of jobs with each label."""
         return np.bincount(self.known_values.astype(np.intp), minlength=len(self.labels))
 
-    def folded(self) -> Varied:
+    def merge_rare_labels(self) -> VariedQuantity:
         """Combine the rarest labels into one, so that there are at most `MAX_LABELS` labels."""
         labels = self.labels
         if len(labels) <= MAX_LABELS:
@@ -74,7 +74,7 @@ class Varied:
         new_indices[frequent] = np.arange(len(frequent))
         values = new_indices[np.nan_to_num(self.values, nan=-1).astype(np.intp)]
         remainder = f"{len(labels) - len(frequent)} others"
-        return Varied(self.name, values, (*(labels[k] for k in frequent), remainder))
+        return VariedQuantity(self.name, values, (*(labels[k] for k in frequent), remainder))
 
     @cached_property
     def edges(self) -> Floats:
@@ -108,13 +108,13 @@ class Varied:
         """Labels without their common prefix, truncated to 15 characters."""
         return [shortened(label, 15) for label in without_common_prefix(self.labels)]
 
-    def slanted(self, width: float) -> bool:
+    def needs_slanted_labels(self, width: float) -> bool:
         """Return True if the labels are too long to be horizontal on an axis of `width` pixels."""
         longest = max(map(len, self.short_labels), default=0)
         return longest * _LETTER > width / max(1, len(self.labels))
 
 
-class Figures:
+class DataSetStatistics:
     """Totals over all jobs, and a few values for each job.
 
     The memory use is 40 bytes per job, and 9 bytes per job for each varied quantity.
@@ -194,17 +194,17 @@ class Figures:
         return self._digest.hexdigest()
 
     @property
-    def varied(self) -> list[Varied]:
+    def varied(self) -> list[VariedQuantity]:
         """Values of each varied quantity in all jobs."""
         return [self._varied(name) for name in self._values]
 
-    def _varied(self, name: str) -> Varied:
+    def _varied(self, name: str) -> VariedQuantity:
         values = np.array(self._values[name])
         labels = dict(self._labels[name])
         has_value = np.isfinite(values)
         values[~has_value] = np.nan
         if not labels:
-            return Varied(name, values)
+            return VariedQuantity(name, values)
         numbers = has_value & (np.array(self._labeled[name]) == 0)
         codes = values.copy()
         # If a quantity has both labels and numbers, such as "auto" and 2, numbers become labels.
@@ -214,7 +214,7 @@ class Figures:
         codes[has_value] = np.argsort([labels[text] for text in order])[
             codes[has_value].astype(np.intp)
         ]
-        return Varied(name, codes, tuple(order))
+        return VariedQuantity(name, codes, tuple(order))
 
     def per_job(self, name: str) -> Floats:
         """Return the points, rays, hits or seconds of each job.
@@ -228,7 +228,7 @@ class Figures:
         """Boolean mask of failed jobs, with shape (jobs,)."""
         return np.array(self._per_job["failed"]) > 0
 
-    def spread(self, name: str) -> dict[str, float] | None:
+    def percentiles(self, name: str) -> dict[str, float] | None:
         """Return the minimum, 10th, 50th and 90th percentile, and maximum over finished jobs.
 
         Return None if no finished job has a known value.
@@ -240,7 +240,7 @@ class Figures:
         names = ("lowest", "tenth", "median", "ninetieth", "highest")
         return dict(zip(names, np.percentile(values, (0, 10, 50, 90, 100)).tolist(), strict=True))
 
-    def described(self) -> Iterator[dict[str, Any]]:
+    def summaries(self) -> Iterator[dict[str, Any]]:
         """Yield the statistics of each varied quantity as a dictionary for JSON."""
         is_done = ~self.failures
         points = self.per_job("points")
