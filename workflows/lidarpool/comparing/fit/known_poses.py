@@ -24,13 +24,13 @@ from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, with_compared_columns
 from .standstill import Speed, sweep_period_ns
 
-_MAX_SWEEPS = 64  # whose poses are read
-# Poses of a sensor that stands differ by less: exact poses, and poses of a localization.
+_MAX_SWEEPS = 64  # maximum number of sweeps whose poses are read
+# Poses of a stationary sensor differ by less. Limits for exact poses and for localization.
 _MIN_SHIFT_M = 0.001
 _MIN_TURN_DEG = 0.01
 _LOCALIZED_SHIFT_M = 0.05
 _LOCALIZED_TURN_DEG = 0.5
-_MIN_SPEED_DEG = 0.005  # a smaller turn from sweep to sweep is not named
+_MIN_SPEED_DEG = 0.005  # smaller rotations between sweeps are not reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class KnownPoses:
     numbers: Ints  # (n,): numbers of the sweeps
     matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
     are_given: bool  # whether the user gave the poses
-    origin: Floats  # (3,): of the scene in the world, meters
+    origin: Floats  # (3,): origin of the scene in world coordinates, meters
 
     @classmethod
     def from_recording(

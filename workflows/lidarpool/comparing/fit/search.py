@@ -13,28 +13,28 @@ from .planes import ARM_M, RangeChanges
 from .stack import SweepStack
 from .visibility import RigidMotion, VisibilityImage, VisibilityPair
 
-MIN_SHIFT_M = 0.02  # a sensor that shifts by less stands
-MIN_YAW_RAD = 0.003  # a sensor that turns by less stands
-_MIN_OBJECTS = 3  # objects that show a motion; two without a contradiction
-_SIMILAR_SHARE = 0.95  # ratio of the scores of similar motions, at least
+MIN_SHIFT_M = 0.02  # smaller shifts count as stationary
+MIN_YAW_RAD = 0.003  # smaller rotations count as stationary
+_MIN_OBJECTS = 3  # minimum number of supporting objects, or two without a contradiction
+_SIMILAR_SHARE = 0.95  # minimum ratio of the scores of similar motions
 
-# Motions that are tried: of cars, and of turns on the spot.
+# Candidate motions: those of cars, and rotations in place.
 _MAX_SPEED_M_S = 70.0
 _MAX_SHIFT_M = 12.0
 _FIRST_SHIFT_M = 0.05
 _SHIFT_STEP = 0.05  # relative
-_DIRECTIONS = 36  # directions that are tried in a plane of free directions
-_FREE_SHARE = 0.02  # share of an axis of `RangeChanges.axes` along which a shift is free
+_DIRECTIONS = 36  # number of candidate directions in a plane of two free axes
+_FREE_SHARE = 0.02  # maximum fraction of a free axis (see `RangeChanges.axes`)
 _MAX_YAW_DEG = 45.0
 _YAW_STEP_DEG = 0.25
 _COARSE_POINTS = 120
 _CANDIDATES = 20
-_BATCH = 2000  # motions that are tried at once
+_BATCH = 2000  # number of motions that are scored at once
 _REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, meters at a distance of `ARM_M`
 _FINE_POINTS = 600
-_CENTER_STEPS = 15  # steps of the last size, to a side
-_SIMILAR_POINTS = 10  # difference of scores around the middle of a motion, at most
-_THINGS = 3  # things that are tried, the largest first
+_CENTER_STEPS = 15  # number of steps of the smallest size to either side
+_SIMILAR_POINTS = 10  # maximum difference between the scores of similar motions
+_THINGS = 3  # maximum number of moving objects to try, the largest first
 
 
 def motion_between(
@@ -60,7 +60,7 @@ def motion_between(
     by_sight = _center_motion(pair, by_sight)
     if by_planes is None:
         return by_sight
-    # Planes are more exact, unless the rays have left them.
+    # Planes are more accurate, unless the rays no longer hit the same planes.
     sample = pair.sample(_FINE_POINTS)
     planes_score, sight_score = (pair.score(motion, *sample) for motion in (by_planes, by_sight))
     return by_planes if planes_score > _SIMILAR_SHARE * sight_score else by_sight

@@ -40,13 +40,13 @@ class SweepStack:
 
     numbers: Ints  # (s,): numbers of the sweeps in the recording
     rings: Ints  # (r,): numbers of the rings
-    elevation_deg: Floats  # (r,): of the rings
+    elevation_deg: Floats  # (r,): elevations of the rings
     directions: Floats  # (r, c, 3): mean unit directions of the cells
     ranges: Floats32  # (s, r, c): meters
     intensities: Floats32  # (s, r, c)
-    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less `directions`, radians
+    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses minus `directions`, radians
     rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, meters
-    covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, returned or lost
+    covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, even if it was lost
     notes: tuple[str, ...]
 
     @property

@@ -17,13 +17,13 @@ from .search import MIN_SHIFT_M, MIN_YAW_RAD, motion_between
 from .stack import SweepStack, finite_median
 from .visibility import RigidMotion
 
-_NEXT_PAIRS = 5  # pairs of a sweep and the next that are compared
-_MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static scene
-# ranges drift if changes over many sweeps grow by this factor
+_NEXT_PAIRS = 5  # number of pairs of consecutive sweeps to compare
+_MAX_CHANGE_M = 0.1  # maximum median range change between consecutive sweeps of a static scene
+# Ranges drift if their changes over many sweeps are larger by this factor.
 _DRIFT_FACTOR = 1.5
 _DRIFT_M = 0.002
-_MIN_CREEP_M = 0.0015  # standard deviation of ranges by creep
-_MIN_CREEP_EFFECT = 0.15  # the same, over that by noise: noise would be 1 % too large
+_MIN_CREEP_M = 0.0015  # minimum standard deviation of ranges due to creep
+_MIN_CREEP_EFFECT = 0.15  # minimum ratio to the noise, which would be overestimated by 1 %
 
 
 class Speed(NamedTuple):
