@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
-from lidarpool.datasets.figures import Figures
+from lidarpool.datasets.figures import DataSetStatistics
 from lidarpool.datasets.job_seconds import read_seconds
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_report import write_card
@@ -253,7 +253,7 @@ def test_splits_are_names_of_files(tmp_path, split):
 def test_memory_is_bounded():
     """A job takes some numbers."""
     tracemalloc.start()
-    figures = Figures(NAMES, (row(k % 30) for k in range(20_000)))
+    figures = DataSetStatistics(NAMES, (row(k % 30) for k in range(20_000)))
     taken = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert figures.jobs == 20_000 and taken < 20_000 * 100

@@ -248,7 +248,7 @@ def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
         again = found[2 + 2 * TURNS]
         assert again.job == "01"
         assert np.array_equal(again.classes, np.where(np.isin(kept, [3, 8]), kept, 0))
-        assert [damage for _, (_, damage) in data.look(rows, contents=True)] == ["", ""]
+        assert [damage for _, (_, damage) in data.check_jobs(rows, contents=True)] == ["", ""]
         files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
         data.finish(rows)
         assert files == {path: path.read_bytes() for path in files}

@@ -220,11 +220,11 @@ def test_a_manifest_lists_the_files_of_a_job(written, format):  # noqa: A002
         n for n in files_of(place) if n not in of_all and n[:4] not in ("v1.0", "maps")
     }
     rows = [JobRow(4, "004")]
-    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == [""]
+    assert [wrong for _, (_, wrong) in data.check_jobs(rows, contents=True)] == [""]
     harmed = place / max(listed)
     harmed.write_bytes(bytes(harmed.stat().st_size))
-    assert [wrong for _, (_, wrong) in data.look(rows)] == [""]
-    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == [
+    assert [wrong for _, (_, wrong) in data.check_jobs(rows)] == [""]
+    assert [wrong for _, (_, wrong) in data.check_jobs(rows, contents=True)] == [
         f"{max(listed)} is missing or damaged"
     ]
 

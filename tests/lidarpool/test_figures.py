@@ -7,21 +7,21 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from lidarpool.datasets.figures import Figures, Varied, rank_correlation
+from lidarpool.datasets.figures import DataSetStatistics, VariedQuantity, rank_correlation
 from lidarpool.datasets.job_table import JobRow
 
 
-def varied(values: list[object]) -> Varied:
+def varied(values: list[object]) -> VariedQuantity:
     """Return the values of a quantity in jobs; None for a job without the quantity."""
     jobs = (
         JobRow(n, f"{n}", "train", {} if value is None else {"it": value})
         for n, value in enumerate(values)
     )
-    (found,) = Figures(["it"], jobs).varied
+    (found,) = DataSetStatistics(["it"], jobs).varied
     return found
 
 
-def names_of(labeled: Varied) -> list[str | None]:
+def names_of(labeled: VariedQuantity) -> list[str | None]:
     """Return the label of each job, or None."""
     return [None if np.isnan(value) else labeled.labels[int(value)] for value in labeled.values]
 
@@ -31,7 +31,7 @@ def test_only_the_rarest_of_more_than_twelve_labels_share_one(count):
     """Label k has 30 - k jobs, except that the first label is the rarest."""
     labels = [f"label {k:02}" for k in range(count)]
     jobs = [name for k, name in enumerate(labels) for _ in range(30 - k if k else 2)] + [None]
-    folded = varied(jobs).folded()
+    folded = varied(jobs).merge_rare_labels()
     if count <= 12:
         assert folded.labels == tuple(labels) and names_of(folded) == jobs
         return
@@ -85,8 +85,10 @@ def test_a_logarithmic_distribution_has_its_median_below_the_mean_of_both_means(
 
 def test_long_labels_are_slanted():
     labels = varied(["short", "much longer"])
-    assert labels.slanted(100) and not labels.slanted(1000)
-    assert varied(["a"] * 20).slanted(10) and not varied([1, 2]).slanted(10)
+    assert labels.needs_slanted_labels(100) and not labels.needs_slanted_labels(1000)
+    assert varied(["a"] * 20).needs_slanted_labels(10) and not varied([1, 2]).needs_slanted_labels(
+        10
+    )
 
 
 def test_ranks_of_ties_are_their_mean():
@@ -110,7 +112,7 @@ def test_totals_and_spreads_are_of_finished_jobs():
         )
         for n in range(30)
     ]  # fmt: skip
-    figures = Figures(["rain"], rows)
+    figures = DataSetStatistics(["rain"], rows)
     done = np.array([n % 7 != 3 for n in range(30)])
     assert (figures.jobs, figures.done, len(figures.failed)) == (30, done.sum(), (~done).sum())
     assert figures.totals == dict(zip(names, numbers[done].sum(axis=0).tolist(), strict=True))
@@ -121,17 +123,17 @@ def test_totals_and_spreads_are_of_finished_jobs():
         points = numbers[rows_of_class, 4].sum()
         assert figures.classes[number] == {"points": points, "jobs": len(rows_of_class)}
     points = np.sort(numbers[done, 4])
-    spread = figures.spread("points")
+    spread = figures.percentiles("points")
     assert (spread["lowest"], spread["highest"]) == (points[0], points[-1])
     for share, name in ((0.1, "tenth"), (0.5, "median"), (0.9, "ninetieth")):
         assert spread[name] == pytest.approx(np.quantile(points, share))
     slowest = sorted(np.flatnonzero(done).tolist(), key=lambda n: (-(n % 5), n))[:10]
     assert [row.number for row in figures.slowest] == slowest
-    (described,) = figures.described()
+    (described,) = figures.summaries()
     assert described["rank_correlation_with_points"] == pytest.approx(
         rank_correlation(np.flatnonzero(done), numbers[done, 4]), abs=1e-6
     )
     assert (described["lowest"], described["median"], described["highest"]) == (0, 14.5, 29)
-    assert Figures(["rain"]).spread("points") is None
+    assert DataSetStatistics(["rain"]).percentiles("points") is None
     failed = [JobRow(n, f"{n}", "train", {}, "failed") for n in range(203)]
-    assert [row.number for row in Figures([], failed).failed] == [*range(200)]
+    assert [row.number for row in DataSetStatistics([], failed).failed] == [*range(200)]

@@ -1,1 +1,1 @@
-"""The points of a cloud and their columns."""
+"""Storage of points: parts, and clouds that are read from parts."""

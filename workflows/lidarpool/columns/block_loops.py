@@ -1,4 +1,4 @@
-"""The loop that writes the scans of the rows of a block."""
+"""A compiled loop that fills in the scan number of each row in a block."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -15,9 +15,11 @@ def _fill(values, value):
 
 @compiled()
 def write_scans(row_ends, first_scan, first_row, scan_of_row):
-    """Write the scans of rows, (n,) int32, the first of which is row `first_row` of the part.
+    """Write the scan number of each row in a block to `scan_of_row`.
 
-    `row_ends` (scans,) are the numbers of rows up to the end of each scan, from `first_scan` on.
+    The block starts at row `first_row` of its part. `row_ends` contains, for each scan of the part
+    starting with `first_scan`, the number of rows up to and including that scan. Shape (scans,).
+    `scan_of_row` is an int32 array with shape (n,).
     """
     start = 0
     for k in range(len(row_ends)):

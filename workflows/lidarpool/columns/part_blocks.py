@@ -1,9 +1,10 @@
-"""Blocks of rows of parts, read into memory that is used again.
+"""Read parts in blocks of rows, into memory that is reused.
 
-The columns of a part are as far apart in its file as they are long. A whole part in memory is
-written there, and read again for its checksums, for the cloud and for counting, past the caches;
-and memory of that size is taken from the system and given back for each part. A block of all
-columns stays in the cache of a core.
+Each column of a part is stored contiguously, so the columns of one row are far apart in the file.
+If a whole part were read at once, its data would not fit in the CPU caches: it would be written to
+main memory and then read again for the checksums, the cloud and the statistics. The operating
+system would also have to allocate and free a large buffer for each part. A block with a limited
+number of rows stays in the cache of one core.
 """
 
 from __future__ import annotations
@@ -27,25 +28,25 @@ from lidarsim.columns.table import SCAN, Column
 from .block_loops import write_scans
 from .parts import reading_part
 
-_ALIGNMENT = 64  # bytes: a line of the cache
+_ALIGNMENT = 64  # bytes, the size of a cache line
 
 
 class BlockMemory:
-    """Memory for the columns of a block of rows.
+    """Reusable memory for the columns of a block of rows.
 
     Parameters
     ----------
     columns
-        Columns of a part, and `scan` if its values are asked for.
+        Columns of a part, and `scan` if scan numbers are required.
     max_rows
-        Rows of the largest block.
+        Maximum number of rows in a block.
 
     Attributes
     ----------
     data
-        All columns, (bytes,); a column is contiguous.
+        Bytes of all columns. Each column is contiguous. Shape (bytes,).
     starts
-        {name: offset of a column in `data`, bytes}, multiples of 64.
+        {column name: byte offset in `data`}. Offsets are multiples of 64.
     """
 
     data: Bytes
@@ -67,22 +68,26 @@ class BlockMemory:
         }
 
     def columns(self, rows: int) -> dict[str, AnyArray]:
-        """Return the first rows of all columns, {name: (rows,)}: views, until the next block."""
+        """Return views of the first `rows` rows of all columns, as {name: array of shape (rows,)}.
+
+        The views are overwritten when the next block is read.
+        """
         return {name: values[:rows] for name, values in self._columns.items()}
 
 
 def read_blocks(
     storage: Storage, name: str, row_count: int, memory: BlockMemory
 ) -> Iterator[dict[str, AnyArray]]:
-    """Read the columns of a part block by block into `memory`, and yield the columns of each block.
+    """Read a part block by block into `memory`, and yield the columns of each block.
 
-    The checksums of these columns are compared after the last block: what is made of the blocks
-    counts only once the iterator has ended.
+    Checksums are compared after the last block. Discard any results computed from the blocks unless
+    the iterator finishes without an error.
 
     Raises
     ------
     LidarError
-        If the part is missing, unreadable, damaged, or has other columns or not `row_count` rows.
+        If the part is missing, unreadable or damaged, if its columns do not match those of
+        `memory`, or if it does not have `row_count` rows.
     """
     with ExitStack() as stack:
         with reading_part(storage, name):
@@ -98,21 +103,22 @@ def read_blocks(
 
 
 def _open(storage: Storage, name: str) -> BufferedReader | io.BytesIO:
-    """Open a part: a file, or its bytes in memory if the storage is not a folder."""
+    """Open a part from a local folder, or load it into memory from a remote storage."""
     return open_input(storage.local(name)) if storage.is_local else io.BytesIO(storage.read(name))
 
 
 class _Scans(NamedTuple):
-    """Scans of a part."""
+    """Range of scans in a part."""
 
     first: int  # number of the first scan
-    row_ends: Ints  # (scans,): number of rows up to the end of each scan
+    row_ends: Ints  # (scans,): number of rows up to and including each scan
 
 
 class _OpenPart:
     """A part that is being read.
 
-    The constructor and the methods raise LidarError for a damaged part; the message is a clause.
+    The constructor and the methods raise LidarError if the part is damaged. The message is a
+    clause, which `reading_part` completes to a sentence.
     """
 
     def __init__(
@@ -123,7 +129,7 @@ class _OpenPart:
         try:
             arrays = stored_arrays(file)
             self._arrays = {name: arrays[name] for name in memory.starts if name != SCAN.name}
-        except Exception as error:  # zipfile and NumPy raise errors of many kinds
+        except Exception as error:  # zipfile and NumPy raise many types of errors
             raise LidarError(f"it is damaged ({error})") from error
         self._crcs = {name: array.head_crc for name, array in self._arrays.items()}
         columns = memory.columns(0)
@@ -137,7 +143,6 @@ class _OpenPart:
             self._scans = self._read_scans(arrays, row_count)
 
     def _read_scans(self, arrays: Mapping[str, StoredArray], row_count: int) -> _Scans:
-        """Read the scans of the rows."""
         try:
             first, stop = self._read_small(arrays[".scans"]).tolist()
             counts = self._read_small(arrays[".counts"])
@@ -149,7 +154,7 @@ class _OpenPart:
         return _Scans(first, row_ends)
 
     def _read_small(self, array: StoredArray) -> AnyArray:
-        """Read a whole array, and compare its checksum."""
+        """Read a whole array and verify its checksum."""
         values = np.zeros(array.shape, array.dtype)
         data = values.reshape(-1).view(np.uint8).data
         self._fill(data, array.offset)
@@ -158,7 +163,7 @@ class _OpenPart:
         return values
 
     def read(self, first: int, stop: int) -> dict[str, AnyArray]:
-        """Read rows into the memory, and return their columns."""
+        """Read the rows from `first` to `stop` into the memory, and return their columns."""
         columns = self._memory.columns(stop - first)
         for name, array in self._arrays.items():
             data = columns[name].view(np.uint8).data
@@ -169,15 +174,15 @@ class _OpenPart:
         return columns
 
     def check(self) -> None:
-        """Compare the checksums of all columns after the last block."""
+        """Verify the checksums of all columns after the last block has been read."""
         for name, array in self._arrays.items():
             if self._crcs[name] != array.crc:
                 raise LidarError(f"it is damaged (the checksum of {name}.npy is wrong)")
 
     def _fill(self, data: memoryview, offset: int) -> None:
-        """Read the bytes from an offset on."""
+        """Fill `data` with the bytes of the file that start at `offset`."""
         self._file.seek(offset)
-        # Mapped into memory, a part takes as long, and an error of the disk ends the process.
+        # Memory mapping would not be faster, and a disk error would kill the process.
         while data and (count := self._file.readinto(data)):
             data = data[count:]
         if data:

@@ -1,11 +1,17 @@
-"""Parts: the columns of consecutive scans as a file.
+"""Parts: files that store the columns of consecutive scans.
 
-A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
-rows in (scan, ray) order, and further arrays: `.scans`, first scan and one past the last; for each
-scan `.counts`, its rows, `.scan_hits`, its hits including thinned out hits, and `.samples`, ends of
-sample rays; and the hit counters that are not 0 (`Scene.counters`), `.triangles`, with their hits,
-`.hits`. `x`, `y` and `z` are whole multiples of the precision from the scene's local origin, so
-that they are rounded only once.
+A part is an uncompressed NumPy archive, which ``numpy.load`` can open. It contains one array per
+column, with rows ordered by scan and ray, and these additional arrays:
+
+- `.scans`: the first scan, and the last scan plus one
+- `.counts`: number of rows of each scan
+- `.scan_hits`: number of hits of each scan, including hits that were removed by thinning
+- `.samples`: end points of sample rays
+- `.triangles`: hit counters (see `Scene.counters`) that are not zero
+- `.hits`: number of hits of each of these counters
+
+`x`, `y` and `z` are integer multiples of the precision, relative to the scene's local origin, so
+coordinates are rounded only once.
 """
 
 from __future__ import annotations
@@ -32,26 +38,29 @@ from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
 
-# Files of a run in the folder of its parts: the mark of the run, then the kind of the file.
+# Names of a run's files in the folder of parts. Each name starts with the mark of the run.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
 _OTHER = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8})", re.ASCII)
 _AGAIN = "Resume the run with `--resume` (`resume=True` in Python) to cast its scans again."
 
 
-# A run deletes only files that it wrote: their names begin with its mark, 16 random digits, and a
-# file in the folder of the parts names the mark of the folder.
+# A run deletes only files that it wrote. The names of these files start with the mark of the run
+# (16 random hexadecimal digits), and a mark file in the folder of parts records this mark.
 
 
 def part_name(mark: str, job: int, first: int, stop: int) -> str:
-    """Return the name of the part of scans.
+    """Return the file name of the part that contains the scans from `first` to `stop` of a job.
 
-    Repeated work writes the same bytes to the part.
+    If a task is repeated, it overwrites its part with the same bytes.
     """
     return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
 
 
 def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
-    """Return job, first scan and end from the name of a run's part, or None for foreign names."""
+    """Return the job, the first scan and the stop scan from the file name of a part.
+
+    Return None if the file does not belong to the run with this mark.
+    """
     match = _PART.fullmatch(name)
     if match is None or match[1] != mark:
         return None
@@ -59,21 +68,22 @@ def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
 
 
 def probe_name(mark: str, driver: str) -> str:
-    """Return the name of the file that shows workers of a driver whether they see the folder."""
+    """Return the name of the file with which a driver tests its workers' access to the folder."""
     return f"{mark}-probe-{driver}"
 
 
 def mark_name(mark: str) -> str:
-    """Return the name of the file with the mark of the run whose parts are in a folder."""
+    """Return the name of the file that records which run owns the folder of parts."""
     return f"{mark}-mark"
 
 
 def deletable_files(storage: Storage, mark: str | None) -> list[str]:
-    """Return the names of the files that a run may delete, including files of killed writers.
+    """Return the names of the files that a run may delete, including files left by killed writers.
 
-    `mark` is the mark of the run; None for each mark that the folder has. Without the mark in the
-    folder there are none. Mark files come last, so that the files of an interrupted removal stay
-    known.
+    Only files whose name starts with the mark of the run are returned, and only if the folder
+    contains the mark file. If `mark` is None, the files of all marks in the folder are returned.
+    Mark files come last, so that the remaining files can still be identified if the removal is
+    interrupted.
     """
     names = [*storage.sizes()]
     marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
@@ -83,15 +93,15 @@ def deletable_files(storage: Storage, mark: str | None) -> list[str]:
 
 
 def _mark_of(name: str) -> str:
-    """Return the mark in the name of a file of a run, or no text for foreign names."""
+    """Return the mark in a file name, or an empty string if the file does not belong to a run."""
     match = _PART.fullmatch(name) or _OTHER.fullmatch(name)
     return match[1] if match else ""
 
 
 def pack(part: PartColumns) -> list[Piece]:
-    """Encode a part, in pieces for `Storage.write`: the same content gives the same bytes.
+    """Encode a part as pieces for `Storage.write`.
 
-    Columns are not copied; the pieces are views of the columns.
+    Encoding is deterministic. The pieces are views of the columns, which are not copied.
     """
     return stored_pieces(
         {
@@ -107,9 +117,10 @@ def pack(part: PartColumns) -> list[Piece]:
 
 
 def unpack(data: bytes) -> PartColumns:
-    """Decode the bytes of a part, and compare the checksum of every array.
+    """Decode a part and verify the checksum of each array.
 
-    LidarError if the data is not a part, or damaged; the message is a clause.
+    Raises LidarError if the data is not a part or is damaged. The message is a clause, which
+    `reading_part` completes to a sentence.
     """
     try:
         arrays = read_arrays(data)
@@ -127,13 +138,13 @@ def unpack(data: bytes) -> PartColumns:
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
             raise ValueError("its arrays do not have matching shapes")
-    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds of errors
+    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen types of errors
         raise LidarError(f"it is damaged ({error})") from error
     return part
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part.
+    """Read a part and verify its checksums.
 
     Raises LidarError if the part is missing, unreadable or damaged.
     """
@@ -143,9 +154,9 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 @contextmanager
 def reading_part(storage: Storage, name: str) -> Iterator[None]:
-    """Say in errors of the body which part cannot be read or used, and what to do, as LidarError.
+    """Convert errors in the body to a LidarError that names the part and suggests a remedy.
 
-    A LidarError of the body is a clause.
+    The message of a LidarError that the body raises must be a clause.
     """
     try:
         yield
@@ -160,9 +171,10 @@ def reading_part(storage: Storage, name: str) -> Iterator[None]:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
-    """Read only the hits of a part: hit counters that are not 0, and their hits, (k,) each.
+    """Read only the hit counts of a part, without its columns.
 
-    Raises the errors of `read_part`.
+    Returns the hit counters that are not zero, and the number of hits of each. Both arrays have
+    shape (k,). Raises the same errors as `read_part`.
     """
     if not storage.is_local:
         part = read_part(storage, name)
@@ -171,15 +183,22 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
             counters = read_npy(archive.read(".triangles.npy"), "triangles")
             return counters, read_npy(archive.read(".hits.npy"), "hits")
-    except Exception as error:  # `unpack` raises errors of many kinds
+    except Exception as error:  # zipfile and NumPy raise many types of errors
         raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
 
 
+def _ignore_progress(points: int) -> None:
+    """Do nothing. This is the default progress callback."""
+
+
 @dataclass(eq=False, repr=False)
 class StoredCloud(CloudDisplay):
-    """Stored points of a run in (scan, ray) order, which are read in chunks."""
+    """A cloud whose points are stored in the parts of a run and read in chunks.
+
+    Points are ordered by scan and ray.
+    """
 
     storage: Storage  # storage of the parts
     names: Sequence[str]  # names of the parts, in scan order
@@ -189,13 +208,14 @@ class StoredCloud(CloudDisplay):
     cells: Ints | None  # lowest and highest cell, (2, 3); None without points
     precision_m: float  # size of the cells that positions were rounded to
     origin: Floats  # world position of the scene's local origin, (3,), meters
-    keeper: Any = None  # object that the parts are deleted with
+    keeper: Any = None  # object that deletes the parts when it is garbage-collected
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
-    tell: Callable[[int], object] = abs  # is called with the number of points that were read
+    report: Callable[[int], object] = _ignore_progress  # called with the number of points read
 
     def __getstate__(self) -> dict[str, Any]:
-        # Keeper and sweeps hold the scene, and progress is not reported across processes.
-        return self.__dict__ | {"keeper": None, "sweeps": None, "tell": abs}
+        # The keeper and the sweeps refer to the scene, which is too large to pickle. Progress is
+        # not reported across processes.
+        return self.__dict__ | {"keeper": None, "sweeps": None, "report": _ignore_progress}
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
         return self.load().__array__(dtype)
@@ -222,18 +242,18 @@ class StoredCloud(CloudDisplay):
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
-        """Return all points of a part, or only the selected rows."""
+        """Return the points of a part as a cloud, optionally only the selected rows."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the name of each axis and the coordinates of a part along it, in meters."""
+        """Yield the name of each axis with the world coordinates along it, in meters."""
         for i, axis in enumerate(AXES):
             yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order from row `first`, in chunks of `points` points.
+        """Yield the points in order, starting at row `first`, in chunks of `points` points.
 
-        Raises LidarError if a part cannot be read.
+        The last chunk may be smaller. Raises LidarError if a part cannot be read.
         """
         held: list[Cloud] = []
         count = 0
@@ -243,7 +263,7 @@ class StoredCloud(CloudDisplay):
                 continue
             cloud = self.cloud_of(read_part(self.storage, name), slice(first, None))
             first = 0
-            self.tell(len(cloud))
+            self.report(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud[:cut]])

@@ -1,1 +1,1 @@
-"""Comparison of two clouds or recordings of one place, and its page."""
+"""Comparison of two clouds or recordings of the same place, and its report."""

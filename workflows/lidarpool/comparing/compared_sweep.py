@@ -1,4 +1,4 @@
-"""Sweeps of a recording with only the columns that are compared or fitted."""
+"""Read the sweeps of a recording with only the columns that are compared or fitted."""
 
 from __future__ import annotations
 

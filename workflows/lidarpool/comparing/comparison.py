@@ -1,4 +1,4 @@
-"""Compares two clouds or recordings of one place: ranges by cell, lost returns, distances."""
+"""The result of comparing two clouds or recordings, and its charts and report."""
 
 from __future__ import annotations
 
@@ -25,39 +25,40 @@ from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
 _PICTURES = ("ranges", "rings", "distances", "above")
-CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
+# States of a cell. The first three name the clouds in which the cell has no return.
+CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
 
-WIDTH = 1600  # width of charts, pixels
-# of charts, as shares of the width
+WIDTH = 1600  # width of the pages, in pixels
+# Left and right edge of the charts, as fractions of the width.
 LEFT = 0.075
 RIGHT = 0.845
 MAX_DOTS = 120_000
-# colors of A and B
+# Colors of A and B.
 A_COLOR = "#4477aa"
 B_COLOR = "#ee7733"
-# no colors of residuals
+# Colors of cells without a return. They do not occur in the color map of residuals.
 ONLY_A = theme.rgb("#2ca25f")
 ONLY_B = theme.rgb("#101418")
-NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colors
+NO_RETURN = theme.rgb("#c8cbd0")  # independent of the page's color theme
 GAP_LABELS = ("return in A only", "return in B only", "no return")
-# color maps
+# Color maps.
 RESIDUAL_COLORS = "RdBu_r"
 DISTANCE_COLORS = "plasma"
-RESIDUAL_SCALE = 6.0  # end of the scale, in median absolute deviations: about four sigma
-MIN_DISTANCE_M = 0.001  # end of the scale of distances
+RESIDUAL_SCALE = 6.0  # end of the scale in median absolute deviations, about four sigma
+MIN_DISTANCE_M = 0.001  # lower end of the distance scale
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Result of `compare`, which is printed as a table."""
 
-    figures: dict[str, Any]  # content of compare.json; lengths in meters, None for unknown
-    images: RangeImages | None  # images of the first pair of sweeps that has any
-    residuals: Floats  # (k,): of all cells with a return in both, or of a choice, meters
+    figures: dict[str, Any]  # content of compare.json; lengths are in meters, None is unknown
+    images: RangeImages | None  # range images of the first pair of sweeps that has them
+    residuals: Floats  # (k,), meters: A - B in cells with returns in both, possibly sampled
     distances: tuple[Floats, Floats]  # distances from A's points to B, and from B's to A, meters
-    intensities: tuple[Floats, Floats]  # intensities in A and B that are compared
-    # Points of A and of B, of the first pair of sweeps that has any, or of whole clouds, meters.
-    # Their distances are the first in `distances`.
+    intensities: tuple[Floats, Floats]  # paired intensities in A and in B
+    # Points of A and of B in meters, from the first pair of sweeps that has points in both, or from
+    # whole clouds. The first entries of `distances` belong to these points.
     points: Sequence[Floats]
 
     def __repr__(self) -> str:
@@ -96,7 +97,7 @@ class Comparison:
 
 
 class _ImageLayout(NamedTuple):
-    """Heights, in pixels, of a page with three range images in a column."""
+    """Heights in pixels of the elements on a page with three range images, one below the other."""
 
     image_height: int
     page_height: int
@@ -106,20 +107,20 @@ class _ImageLayout(NamedTuple):
 
     @classmethod
     def for_rows(cls, row_count: int) -> _ImageLayout:
-        """Lay out images of a number of rings."""
+        """Return the layout for images with `row_count` rings."""
         image_height = int(np.clip(2.2 * row_count, 90, 300))
         defaults = cls._field_defaults
         gaps = defaults["top"] + 2 * defaults["gap"] + defaults["bottom"]
         return cls(image_height, 3 * image_height + gaps)
 
     def image_bottom(self, number: int) -> float:
-        """Return the lower edge of an image, from 0, as a share of the page."""
+        """Return the lower edge of image `number` (from 0) as a fraction of the page height."""
         pixels = self.page_height - self.top - (number + 1) * self.image_height - number * self.gap
         return pixels / self.page_height
 
 
 def draw_ranges(comparison: Comparison) -> Page:
-    """Draw the range images of A and B, and their residuals, in a column."""
+    """Draw the range images of A and B, and their residuals, one below the other."""
     images = comparison.images
     assert images is not None
     row_count, column_count = images.ranges[0].shape
@@ -151,14 +152,14 @@ def draw_ranges(comparison: Comparison) -> Page:
 
 
 def _range_scale(images: RangeImages) -> LogNorm:
-    """Return the scale of colors of ranges, meters."""
+    """Return the color scale of ranges, in meters."""
     ranges = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
     min_m, max_m = np.quantile(ranges, (0.01, 0.98)) if len(ranges) else (0.0, 1.0)
     return LogNorm(max(float(min_m), 0.01), max(float(max_m), float(min_m) * 1.01, 0.02))
 
 
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
-    """Return the colors (r, c, …) of the ranges of A (0) or B (1)."""
+    """Return the colors of the range image of A (`index` 0) or B (`index` 1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
     colors[~images.returned[index]] = NO_RETURN
@@ -166,7 +167,7 @@ def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
 
 
 def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
-    """Return the colors (r, c, …) of the residuals, and of cells without a return."""
+    """Return the colors of the residual image, which also mark cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
     in_a, in_b = images.returned
     colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
@@ -177,14 +178,14 @@ def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
 
 
 def _draw_gap_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend of the colors of cells without a return."""
+    """Draw a legend for the colors of cells without a return."""
     for text, color in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
         axes.plot([], [], "s", color=color, ms=4, label=text)
     _draw_legend(page, axes)
 
 
 def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
-    """Show colors (r, c, …) as the sensor sees the cells: its left is on the left."""
+    """Show an image of shape (r, c, …) as seen from the sensor, so that its left is on the left."""
     row_count, column_count = colors.shape[:2]
     start_deg = images.start_deg - images.step_deg / 2
     stop_deg = start_deg + column_count * images.step_deg
@@ -196,7 +197,7 @@ def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
 
 
 def draw_rings(comparison: Comparison) -> Page:
-    """Draw residuals and lost returns of each ring, and a histogram of all residuals."""
+    """Draw the residuals and lost returns of each ring, and a histogram of all residuals."""
     image = comparison.figures["ranges"]
     rings = [ring for ring in image["rings"] if ring["cells"]]
     page = Page((WIDTH, 760))
@@ -222,7 +223,7 @@ def draw_rings(comparison: Comparison) -> Page:
 
 
 def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> None:
-    """Draw the histogram of residuals (k,) in meters, up to a limit in millimeters."""
+    """Draw a histogram of residuals in meters. The axis ends at `limit`, in millimeters."""
     bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimeters
     outer = np.floor(limit / bin_mm) + 0.5
     edges = np.arange(-outer, outer + 1) * bin_mm
@@ -232,14 +233,17 @@ def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> Non
 
 
 def _marker_size(page: Page, rings: Sequence[Any]) -> float:
-    """Return the size of the markers of rings, points."""
+    """Return the marker size for rings, in points."""
     return 3.4 * page.unit if len(rings) < 40 else 2 * page.unit
 
 
 def _draw_ring_residuals(
     page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]], limit: float
 ) -> None:
-    """Draw the spread, median and mean of the residuals of each ring, up to a limit in mm."""
+    """Draw the spread, median and mean of each ring's residuals.
+
+    The axis ends at `limit`, in millimeters.
+    """
     elevation = np.array([ring["elevation_deg"] for ring in rings])
     p05, median, p95, mean = (
         1000 * np.array([ring[name] for ring in rings])
@@ -257,7 +261,7 @@ def _draw_ring_residuals(
 
 
 def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the share of cells without a return of each ring, in A and in B."""
+    """Draw the percentage of cells without a return in A and in B for each ring."""
     elevation = np.array([ring["elevation_deg"] for ring in rings])
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
     style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
@@ -269,7 +273,7 @@ def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) 
 
 
 def draw_distances(comparison: Comparison) -> Page:
-    """Draw cumulative distances in both directions, and intensities of A and B if known."""
+    """Draw the distribution of distances in both directions, and intensities if they are known."""
     page = Page((WIDTH, 760))
     distances = comparison.figures["distances"]
     page.title(
@@ -303,7 +307,7 @@ def draw_distances(comparison: Comparison) -> Page:
 
 
 def _draw_intensities(page: Page, comparison: Comparison) -> None:
-    """Draw the histogram of pairs of intensities, on the right."""
+    """Draw a 2D histogram of the paired intensities on the right half of the page."""
     figures = comparison.figures["intensity"]
     frame = (LEFT + 0.5, 0.13, 0.4, 0.64)
     name_a, name_b = figures["columns"]["a"], figures["columns"]["b"]
@@ -324,7 +328,7 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
 
 
 def draw_above(comparison: Comparison) -> Page:
-    """Draw both clouds from above, colored by the distance between the clouds."""
+    """Draw a top view of both clouds, colored by the distance to the other cloud."""
     height = 830
     page = Page((WIDTH, height))
     pictured = comparison.figures["pictured"]
@@ -356,7 +360,7 @@ def draw_above(comparison: Comparison) -> Page:
 
 
 def _distance_scale(distances: Floats) -> LogNorm:
-    """Return the scale of colors of distances (n,), meters."""
+    """Return the color scale of distances, in meters."""
     max_m = max(float(np.quantile(distances, 0.99)), 10 * MIN_DISTANCE_M)
     min_m = max(MIN_DISTANCE_M, min(float(np.quantile(distances, 0.05)), max_m / 10))
     return LogNorm(min_m, max_m)
@@ -365,7 +369,7 @@ def _distance_scale(distances: Floats) -> LogNorm:
 def _scatter_points(
     page: Page, axes: Axes, points: Floats, distances: Floats, scale: LogNorm
 ) -> None:
-    """Draw points (n, 3) from above, colored by distances (n,), the most distant on top."""
+    """Draw a top view of points colored by their distances, with the largest distances on top."""
     rows = even_indices(len(points), MAX_DOTS)
     rows = rows[np.argsort(distances[rows])]
     axes.scatter(
@@ -381,7 +385,7 @@ def _scatter_points(
 
 
 def _residual_limit(comparison: Comparison) -> float:
-    """Return the end of the scale of residuals, millimeters."""
+    """Return the upper end of the residual scale, in millimeters."""
     residual = comparison.figures["ranges"]["residual"]
     if not residual["cells"]:
         return 1
@@ -389,7 +393,7 @@ def _residual_limit(comparison: Comparison) -> float:
 
 
 def _intensity_bins(values: AnyArray) -> AnyArray:
-    """Return the edges of bins of intensities (n,), between whole numbers if all are whole."""
+    """Return histogram bin edges for intensities. Integers are at the centers of their bins."""
     upper = max(float(np.quantile(values, 0.995)), 1e-12)
     if upper <= 300 and (values == np.round(values)).all():
         return np.arange(-0.5, upper + 1)
@@ -397,7 +401,7 @@ def _intensity_bins(values: AnyArray) -> AnyArray:
 
 
 def _draw_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend of all labels above axes, at their right end."""
+    """Draw a legend of all labels above the axes, aligned to the right."""
     handles, _ = axes.get_legend_handles_labels()
     style = {"ncols": len(handles), "columnspacing": 1.2, "borderaxespad": 0.3}
     page.key(handles, 6.8, axes, loc="lower right", bbox_to_anchor=(1, 1), **style)

@@ -1,9 +1,9 @@
-"""Range images of two sweeps of one sensor on common cells: rings and steps of azimuth.
+"""Range images of two sweeps of one sensor, on common cells of rings and azimuth steps.
 
-Recorded pulses have jitter, a step that does not divide the revolution, and a seam, so a fixed grid
-would have cells with two pulses or none: the phase of each ring's pulses is found every 10°. Two
-programs may number rings in opposite directions: rings are matched by the elevation of their
-points.
+A fixed grid would have cells with two pulses or none, because recorded pulses have jitter, the
+azimuth step does not divide the revolution, and there is a seam. Therefore the phase of each ring's
+pulses is determined every 10°. Since two programs may number the rings in opposite directions,
+rings are matched by the elevation of their points.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from lidarsim.columns.sweep import Sweep
 
 from .compared_sweep import RAY_KEY
 
-_TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings close to each other
-_STEP_TOLERANCE = 0.15  # relative difference of single steps from their mean, at most
-_MEAN_STEP_TOLERANCE = 0.01  # relative difference of mean steps of two sweeps in one mode
+_TILT_DEG = 1.0  # maximum interquartile range of the elevations in a ring, for dense rings
+_STEP_TOLERANCE = 0.15  # maximum relative difference between single steps and their mean
+_MEAN_STEP_TOLERANCE = 0.01  # maximum relative difference of mean steps in the same sensor mode
 _SECTOR_DEG = 90.0  # a gap as wide as this in all rings is outside the field of view
-_BLOCKS = 36  # blocks of a revolution; the pulses of a ring are evenly spaced in a block
-_MIN_SHARE = 0.7  # share of rings whose numbers must fit one rule for it to number all rings
-_FINEST_DEG = 1e-3  # points closer in azimuth are of one pulse
-_MAX_RANGE_M = 20_000.0  # no lidar with rings measures as far; zero is not the sensor then
+_BLOCKS = 36  # number of azimuth blocks, in which the pulses of a ring are evenly spaced
+_MIN_SHARE = 0.7  # minimum fraction of rings whose numbers must follow a common rule
+_FINEST_DEG = 1e-3  # points closer in azimuth belong to the same pulse
+_MAX_RANGE_M = 20_000.0  # beyond the range of any lidar with rings, so not in the sensor frame
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImages:
-    """Ranges of two sweeps in the same cells, (rings, columns)."""
+    """Range images of two sweeps on the same cells. Rows are rings, columns are azimuth steps."""
 
-    rings: Ints  # (r,): as B numbers them, the highest first
-    elevation_deg: Floats  # (r,): medians of the points
+    rings: Ints  # (r,): ring numbers of B, by descending elevation
+    elevation_deg: Floats  # (r,): median elevation of the points
     step_deg: float  # width of a column
     start_deg: float  # azimuth of the first column
-    # (2, 4, r, c): range, intensity, azimuth and elevation in degrees, in A and in B, NaN if
-    # unknown; of paired rays (2, 2, r, c): range and intensity
+    # (2, 4, r, c): range, intensity, and azimuth and elevation in degrees, in A and in B, NaN if
+    # unknown. Images of paired rays contain only range and intensity: (2, 2, r, c).
     images: Floats
-    hidden_shares: tuple[float, float]  # shares of points behind others in their cells
+    hidden_shares: tuple[float, float]  # fractions of points that share a cell with a used point
     notes: tuple[str, ...]
-    cell_rows: Ints  # (k,): of all cells, or of all rays that have a return
+    cell_rows: Ints  # (k,): row of each cell, or of each ray that has a return
     compared: (
         Floats  # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown
     )
@@ -53,17 +53,17 @@ class RangeImages:
 
     @property
     def ranges(self) -> Floats:
-        """Ranges of A and B, (2, r, c), meters, NaN without a return."""
+        """Ranges of A and B in meters, NaN without a return. Shape (2, r, c)."""
         return self.images[:, 0]
 
     @property
     def returned(self) -> tuple[Bools, Bools]:
-        """Masks (r, c) of the cells where A and B have returns."""
+        """Masks of the cells with a return in A and in B. Shape (r, c) each."""
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
 
 class _Cells(NamedTuple):
-    """Cells of a range image for sweeps of a sensor."""
+    """Cells of a range image."""
 
     shape: tuple[int, int]  # rows, columns
     step_deg: float
@@ -71,7 +71,7 @@ class _Cells(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _PolarSweep:
-    """A sweep in polar coordinates."""
+    """A sweep in polar coordinates, with its rings."""
 
     azimuth: Floats  # (n,): degrees, 0 to 360
     elevation: Floats  # (n,): degrees
@@ -83,10 +83,10 @@ class _PolarSweep:
 
     @classmethod
     def from_points(cls, sweep: Sweep, name: str) -> _PolarSweep:
-        """Convert a sweep into a range image.
+        """Convert the points of a sweep to polar coordinates.
 
-        LidarError if the sweep has no rings, or zero is not the sensor: the rings are not cones
-        around zero, or the points are too far away.
+        Raises LidarError if the sweep has no rings, or if its origin is not the sensor. In the
+        latter case, the rings are not cones around the origin, or the points are too far away.
         """
         has_column = "channel" in sweep.columns
         if not has_column and find_spec("scipy") is None:
@@ -133,7 +133,7 @@ class _PolarSweep:
         )
 
     def step(self) -> float:
-        """Return the typical step from a pulse to the next pulse of its ring, degrees."""
+        """Return the typical azimuth step between consecutive pulses of a ring, in degrees."""
         order = np.lexsort((self.azimuth, self.ring_index))
         steps = np.diff(self.azimuth[order])[np.diff(self.ring_index[order]) == 0]
         steps = steps[steps > _FINEST_DEG]
@@ -145,18 +145,20 @@ class _PolarSweep:
         def similar_steps(step: float) -> Floats:
             return steps[np.abs(steps / step - 1) < _STEP_TOLERANCE]
 
-        for divisor in (4, 3, 2):  # where most returns are lost, double steps may be the commonest
+        # If most returns are lost, a multiple of the step may be the most frequent difference.
+        for divisor in (4, 3, 2):
             if len(similar_steps(step / divisor)) > len(similar_steps(step)) / 4:
                 step /= divisor
                 break
-        for _ in range(10):  # the mean of similar steps is more exact than the bin
+        for _ in range(10):  # the mean of similar steps is more accurate than the histogram bin
             step = similar_steps(step).mean()
         return float(step)
 
     def phases(self, ring_rows: Ints, cells: _Cells) -> Floats:
-        """Return where pulses are within a step, in steps: (rows, blocks), NaN without pulses.
+        """Return the mean phase of the pulses in each row and block, in azimuth steps.
 
-        `ring_rows` (r,) are the rows of the sweep's rings in the cells.
+        The result has shape (rows, blocks) and is NaN where there are no pulses. `ring_rows`
+        contains the row of each ring of the sweep.
         """
         row_count, _ = cells.shape
         bins = ring_rows[self.ring_index] * _BLOCKS + self._block
@@ -170,15 +172,15 @@ class _PolarSweep:
 
     @property
     def _block(self) -> Ints:
-        """Index (n,) of the block of each point."""
+        """Index of the block that contains each point. Shape (n,)."""
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
     def image(self, ring_rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
-        """Return `RangeImages.images` of a sweep, and the share of points hidden in cells.
+        """Return the range image of a sweep, and the fraction of points that it does not show.
 
-        `ring_rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`.
-        Of several points in a cell, the point closest to the middle is taken, and of several
-        returns of a pulse the nearest.
+        `ring_rows` contains the row of each ring of the sweep, and `phases` is the result of the
+        method `phases`. If several points fall into a cell, the point closest to the center of the
+        cell is used. Of several returns of the same pulse, the closest to the sensor is used.
         """
         row_count, column_count = cells.shape
         position = self.azimuth / cells.step_deg - phases[ring_rows[self.ring_index], self._block]
@@ -198,13 +200,15 @@ class _PolarSweep:
 def range_images(
     a: Sweep, b: Sweep, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
-    """Put two sweeps of a sensor into the same cells.
+    """Return the range images of two sweeps of one sensor on the same cells.
 
-    A column is as wide as the step of azimuth from pulse to pulse, the coarser of the two. Each
-    ring's cells have their middles where its pulses are, in every 10 degrees, so that no pulse
-    falls between two cells although heads turn unevenly; a pulse of A is in the cell of the nearest
-    pulse of B. LidarError, without a full stop, if a sweep has no rings, is not in the sensor
-    frame, or the sweeps are not of sensors with the same rings.
+    The width of a column is the azimuth step between pulses, or the larger of the two steps. The
+    cells of each ring are centered on its pulses in every 10° block, so that no pulse falls on the
+    boundary between two cells even if the head rotates unevenly. Each pulse of A is assigned to the
+    cell of the nearest pulse of B.
+
+    Raises LidarError if a sweep has no rings or is not in the sensor frame, or if the sweeps come
+    from sensors with different rings. The message is a clause without a period.
     """
     sweep_a = _PolarSweep.from_points(a, names[0])
     sweep_b = _PolarSweep.from_points(b, names[1])
@@ -233,7 +237,7 @@ def range_images(
 
 
 class _CommonPhases(NamedTuple):
-    """Step of the columns of common cells, and the phases of the pulses of two sweeps."""
+    """Column width of the common cells, and the phases of the pulses in both sweeps."""
 
     step_deg: float
     phases_a: Floats  # (rows, blocks), in steps
@@ -241,14 +245,17 @@ class _CommonPhases(NamedTuple):
 
     @property
     def seam(self) -> float:
-        """Median change of phase over a revolution, in steps."""
+        """Median change of the phase over a revolution, in steps."""
         return float(np.median(self.phases_b[:, -1] - self.phases_b[:, 0]))
 
 
 def _common_phases(
     a: _PolarSweep, b: _PolarSweep, common: _CommonRings, azimuth_deg: float | None
 ) -> _CommonPhases:
-    """Choose the step of azimuth, `azimuth_deg` if not None, and find phases without gaps."""
+    """Choose the azimuth step, and compute the phases of both sweeps without gaps.
+
+    If `azimuth_deg` is not None, it is used as the step.
+    """
     steps = [a.step(), b.step()]
     same_mode = abs(steps[0] / steps[1] - 1) < _MEAN_STEP_TOLERANCE
     step = azimuth_deg or (steps[1] if same_mode else max(steps))
@@ -269,16 +276,16 @@ def _common_phases(
         if len(finite):
             row[finite] = np.unwrap(row[finite], period=1)
             row -= np.round(np.median(row[finite]))
-    # Several pulses in a cell do not have one phase.
+    # If a cell contains several pulses, A and B have no meaningful phase difference.
     if same_mode and abs(step / steps[1] - 1) < _STEP_TOLERANCE:
         return _CommonPhases(step, middle + difference, middle)
     return _CommonPhases(step, middle, middle)
 
 
 class RayPairs(NamedTuple):
-    """Returns of two sweeps with the same rays, paired ray by ray.
+    """Returns of two sweeps with the same rays, paired by ray.
 
-    Where the sensor moves, pulses in the same cell of two range images are often different rays.
+    If the sensor moves, pulses in the same cell of two range images often belong to different rays.
     """
 
     values: Floats  # (2, 2, k): range and intensity in A and in B, NaN without a return
@@ -301,9 +308,10 @@ def pair_rays(a: Sweep, b: Sweep) -> RayPairs:
 def images_of_rays(
     pairs: RayPairs, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
-    """Put paired rays into cells, as `range_images` does with sweeps.
+    """Return range images of paired rays, like `range_images` for sweeps.
 
-    Each cell shows one of its rays. Raises the same errors as `range_images`.
+    If several rays fall into a cell, one of them is shown. Raises the same errors as
+    `range_images`.
     """
     ray_index = np.arange(len(pairs.rings), dtype=np.float64)
     all_rays = Sweep(pairs.points, {"channel": pairs.rings, "intensity": ray_index})
@@ -320,15 +328,15 @@ def images_of_rays(
 
 
 def _spacing(elevation: Floats) -> float:
-    """Return the typical distance between rings (r,), degrees."""
+    """Return the typical spacing between rings in degrees."""
     gaps = np.diff(np.sort(elevation))
     return float(np.median(gaps)) if len(gaps) else 1.0
 
 
 class _CommonRings(NamedTuple):
-    """Rows of the rings of two sweeps, the highest first."""
+    """Rings of two sweeps and their rows, sorted by descending elevation."""
 
-    rings: Ints  # (r,): as B numbers them
+    rings: Ints  # (r,): ring numbers of B
     elevation: Floats  # (r,): degrees
     rows_a: Ints  # row of each ring of A
     rows_b: Ints  # row of each ring of B
@@ -336,11 +344,11 @@ class _CommonRings(NamedTuple):
 
 
 def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _CommonRings:
-    """Match rings of A and B that look at the same elevation.
+    """Match the rings of A and B that have the same elevation.
 
-    Some programs count from below, others from above or from 1: if the numbers of A follow from
-    B's numbers, a ring with returns in only A or only B has a row, too. Raises LidarError if the
-    rings look at other elevations.
+    Some programs number rings from the bottom, others from the top, and some start at 1. If the
+    numbers of A can be converted to those of B, a ring with returns in only one sweep also gets a
+    row. Raises LidarError if the elevations of the rings differ.
     """
     numbers, notes = _ring_numbers(a, b)
     if (unmatched := len(np.setxor1d(numbers, b.rings))) > 0:
@@ -363,15 +371,15 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
 
 
 def _ring_tolerance(b: _PolarSweep) -> float:
-    """Return the tolerated difference of a ring's elevations in A and in B, degrees."""
+    """Return the tolerance for the elevation of a ring in A and in B, in degrees."""
     return max(_spacing(b.ring_elevation) / 2, 0.05)
 
 
 def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
-    """Return the numbers of A's rings in the numbering of B, and notes.
+    """Return the numbers of A's rings in the numbering of B, and notes on the conversion.
 
-    Numbers are shifted or reversed; if neither rule fits, rings are matched by elevation, and rings
-    without a match have negative numbers.
+    The numbers are shifted or reversed. If neither is possible, rings are matched by elevation, and
+    unmatched rings get negative numbers.
     """
     difference = np.abs(a.ring_elevation[:, None] - b.ring_elevation)
     index_a = difference.argmin(axis=0)
@@ -399,7 +407,7 @@ def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
 def _check_elevations(
     a: _PolarSweep, b: _PolarSweep, numbers: Ints, names: tuple[str, str]
 ) -> None:
-    """Raise LidarError if rings of A, with the numbers of B, are not at the elevations of B."""
+    """Raise LidarError if the rings of A and B with the same numbers have different elevations."""
     shared, in_a, in_b = np.intersect1d(numbers, b.rings, return_indices=True)
     offset = np.abs(a.ring_elevation[in_a] - b.ring_elevation[in_b])
     too_few = len(shared) < min(len(a.rings), len(b.rings)) / 2
@@ -413,13 +421,15 @@ def _check_elevations(
 
 
 def _field_of_view(occupied: Indices, column_count: int, step_deg: float) -> tuple[Ints, float]:
-    """Return the columns of the field of view, and the azimuth of the first, -180 to 180 degrees.
+    """Return the columns in the field of view, and the azimuth of the first column.
 
-    `occupied` are the columns with a return.
+    `occupied` contains the indices of the columns with a return. The azimuth is between -180 and
+    180 degrees.
     """
     gaps = np.diff(occupied, append=occupied[:1] + column_count)
     widest = int(gaps.argmax())
-    if gaps[widest] * step_deg < _SECTOR_DEG:  # all around, from straight behind
+    # A full circle starts behind the sensor.
+    if gaps[widest] * step_deg < _SECTOR_DEG:
         first = round(180 / step_deg)
         count = column_count
     else:

@@ -1,4 +1,4 @@
-"""Compares two clouds or recordings of one place: pairs of sweeps, cells and nearest points."""
+"""Compare two clouds or recordings of the same place: pairs of sweeps, cells and nearest points."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from .compared_sweep import compared_in_world, compared_sweep, rings_note
 from .comparison import CELLS, RESIDUALS, Comparison
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 
-MAX_POINTS = 10_000_000  # points of each cloud in memory
+MAX_POINTS = 10_000_000  # maximum number of points of each cloud in memory
 
-MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken
+MAX_VALUES = 4_000_000  # maximum number of cells and points in all sweeps that are compared
 
 
 def compare(
@@ -155,7 +155,7 @@ def compare(
 
 @contextmanager
 def _sensor_chosen_by(option: str) -> Iterator[None]:
-    """Name the option that chooses one of several sensors of A or B in the error for these."""
+    """Add the command-line option that selects a sensor to the error for several sensors."""
     try:
         yield
     except SeveralSensorsError as error:
@@ -163,7 +163,7 @@ def _sensor_chosen_by(option: str) -> Iterator[None]:
 
 
 def _motion_note(compensated: Recording, fired: Recording) -> str:
-    """Return a note on sweeps of which only the first are compensated for motion."""
+    """Return a note that only the first of two recordings is compensated for motion."""
     return (
         f"{compensated.name} is compensated for the motion of the sensor during each sweep, but "
         f"{fired.name} contains points as fired, so the differences include this motion. Export "
@@ -173,9 +173,9 @@ def _motion_note(compensated: Recording, fired: Recording) -> str:
 
 
 def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the pairs at indices `sweeps`, in order.
+    """Return the pairs with the given indices in ascending order.
 
-    LidarError for an index out of range.
+    Raises LidarError if an index is out of range.
     """
     for number in sweeps:
         if not 0 <= number < len(pairs):
@@ -187,9 +187,9 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
 
 
 def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]]:
-    """Return the numbers of sweeps of A and B that belong together.
+    """Return the indices of matching sweeps in A and B.
 
-    LidarError if no sweeps belong together.
+    Raises LidarError if no sweeps match.
     """
     pairs = [(number, number) for number in range(min(a.count, b.count))]
     if match == "time":
@@ -212,9 +212,9 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
 
 
 def _sweep_times(recording: Recording) -> Floats:
-    """Return the start of each sweep, ns.
+    """Return the start time of each sweep in nanoseconds.
 
-    LidarError if the recording has no times.
+    Raises LidarError if the recording has no times.
     """
     if recording.stamps_ns is None:
         raise LidarError(f"{recording.name} has no sweep times. Omit `--match time`.")
@@ -222,7 +222,7 @@ def _sweep_times(recording: Recording) -> Floats:
 
 
 class _CellPairs(NamedTuple):
-    """Cells with a return in both sweeps, (k,) each."""
+    """Cells or rays with a return in both sweeps. All arrays have shape (k,)."""
 
     residual: Floats  # meters
     ring: Ints
@@ -231,7 +231,10 @@ class _CellPairs(NamedTuple):
 
 
 class _NearestPairs(NamedTuple):
-    """Points of a cloud, each with its nearest neighbor in the compared cloud, (n,) each."""
+    """Points of one cloud with their nearest neighbors in the other cloud.
+
+    All arrays have shape (n,).
+    """
 
     distance: Floats  # meters
     intensity: Floats  # intensity of the point
@@ -240,7 +243,7 @@ class _NearestPairs(NamedTuple):
 
 @dataclass(eq=False)
 class _Comparing:
-    """Running totals of a comparison, pair of sweeps by pair of sweeps."""
+    """A comparison in progress, to which pairs of sweeps are added one by one."""
 
     recordings: tuple[Recording, Recording]
     distances_m: tuple[float, ...]
@@ -248,29 +251,30 @@ class _Comparing:
 
     def __post_init__(self) -> None:
         self.notes = [note for recording in self.recordings for note in recording.notes]
-        self.pairs: list[tuple[int, int]] = []  # numbers of sweeps; empty for whole clouds
+        self.pairs: list[tuple[int, int]] = []  # indices of sweeps; empty for whole clouds
         self.point_counts = np.zeros(2, np.int64)
-        self.images: RangeImages | None = None  # of the first pair that has any
-        self.pictured: tuple[int, int] | None = None  # pair of sweeps of `points`
-        self.empty_pairs = 0  # number of pairs of which a sweep has no points
-        # {why pairs of sweeps have no range images: number of these pairs}
+        self.images: RangeImages | None = None  # images of the first pair that has them
+        self.pictured: tuple[int, int] | None = None  # pair of sweeps that `points` belongs to
+        self.empty_pairs = 0  # number of pairs in which a sweep has no points
+        # {reason why pairs of sweeps have no range images: number of these pairs}
         self.without_images: Counter[str] = Counter()
-        self.points: list[Floats] = []  # of A and of B, of the first pair that has any
+        self.points: list[Floats] = []  # points of A and B in the first pair that has both
         self.cells: list[_CellPairs] = []
-        # pairs from A, and from B
+        # Pairs for the points of A, and for the points of B.
         self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])
-        # {ring: its elevation, and the number of its cells in each state of `CELLS`}
+        # {ring: (elevation, number of cells in each state of `CELLS`)}
         self.rings: dict[int, tuple[float, Ints]] = {}
-        # rays without range images in each state of `CELLS`; the first is unknown, and 0
+        # Number of rays without range images in each state of `CELLS`. The first state cannot be
+        # observed, so its count is 0.
         self.ray_counts = np.zeros(4, np.int64)
 
     def note(self, text: str) -> None:
-        """Add a note, unless the same note was added before."""
+        """Add a note unless it was added before."""
         if text not in self.notes:
             self.notes.append(text)
 
     def read_cloud(self, recording: Recording, max_points: int) -> Sweep:
-        """Read points in the world frame: all, or about `max_points`, chosen evenly."""
+        """Read a cloud in world coordinates, evenly subsampled to about `max_points` points."""
         count = recording.point_count
         share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
@@ -288,7 +292,10 @@ class _Comparing:
         return Sweep.joined(parts)
 
     def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
+        """Compare two sweeps in the sensor frame.
+
+        At most `budget` cells and points of each sweep are compared.
+        """
         if max(len(a), len(b)) > budget:
             self.note(
                 f"at most {budget:,} points and cells of each sweep are compared, sampled evenly"
@@ -301,7 +308,10 @@ class _Comparing:
         self.add_points(a, b, budget)
 
     def add_points(self, a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare distances and intensities of two sweeps or clouds, at most `budget` of each."""
+        """Compare distances and intensities of two sweeps or clouds.
+
+        At most `budget` points of each are compared.
+        """
         self.point_counts += len(a), len(b)
         if not len(a) or not len(b):
             return
@@ -323,9 +333,10 @@ class _Comparing:
         return bool(first.firing_key) and first.firing_key == second.firing_key
 
     def _add_ranges(self, a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare the ranges of two sweeps, ray by ray if they have the same rays, else by cell.
+        """Compare the ranges of two sweeps by ray if they have the same rays, otherwise by cell.
 
-        Sweeps of the same rays need no range images. Without either, a note is added.
+        Sweeps with the same rays are compared even if there are no range images. Otherwise, the
+        reason why there are none is recorded for a note.
         """
         first, second = self.recordings
         names = first.name, second.name
@@ -346,30 +357,34 @@ class _Comparing:
             self._add_rays(rays, budget)
 
     def _add_image_cells(self, images: RangeImages, budget: int) -> None:
-        """Compare the cells, or the rays, of the range images of two sweeps."""
+        """Compare the cells or rays in the range images of two sweeps."""
         self.images = self.images or images
         in_a, in_b = np.isfinite(images.compared[:, 0])
         self._count_cells(images, in_a, in_b)
         self._add_residuals(images.compared, images.rings[images.cell_rows], budget)
 
     def _add_rays(self, rays: RayPairs, budget: int) -> None:
-        """Compare the rays of two sweeps that have no range images."""
+        """Compare the rays of two sweeps without range images."""
         in_a, in_b = np.isfinite(rays.values[:, 0])
         states = in_b & ~in_a, in_a & ~in_b, in_a & in_b
         self.ray_counts[1:] += [np.count_nonzero(state) for state in states]
         self._add_residuals(rays.values, rays.rings, budget)
 
     def _add_residuals(self, compared: Floats, rings: Ints, budget: int) -> None:
-        """Add `compared` (2, 2, k) ranges and intensities of rings (k,) where both have returns."""
+        """Add the residuals where both sweeps have returns.
+
+        `compared` contains the range and intensity in A and in B, with shape (2, 2, k), and `rings`
+        contains the ring numbers, with shape (k,).
+        """
         in_both = np.flatnonzero(np.isfinite(compared[:, 0]).all(axis=0))
         in_both = in_both[even_indices(len(in_both), budget)]
         (range_a, intensity_a), (range_b, intensity_b) = compared[..., in_both]
         self.cells.append(_CellPairs(range_a - range_b, rings[in_both], intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
-        """Add the cells of each ring to its states.
+        """Count the cells of each ring by their state (`CELLS`).
 
-        `in_a` and `in_b` (k,) mark returns.
+        The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
         rows = images.cell_rows
         returned_a, returned_b = images.returned
@@ -390,7 +405,7 @@ class _Comparing:
             self.rings[ring] = elevation, total + count
 
     def result(self) -> Comparison:
-        """Return all figures."""
+        """Compute all statistics of the comparison."""
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
@@ -435,7 +450,7 @@ class _Comparing:
         return Comparison(figures, self._images(), residuals, distances, intensities, self.points)
 
     def _source_figures(self) -> dict[str, Any]:
-        """Return the name and the sizes of A and B, and the sweeps that were compared."""
+        """Return the names and sizes of A and B, and the sweeps that were compared."""
         counts = self.point_counts.tolist()
         return {
             key: {
@@ -450,12 +465,12 @@ class _Comparing:
         }
 
     def _compared_sweeps(self, number: int) -> list[int] | None:
-        """Return the indices of the sweeps of A (0) or B (1) that were compared, None for all."""
+        """Return the indices of the compared sweeps of A (0) or B (1), or None for all sweeps."""
         indices = sorted({pair[number] for pair in self.pairs})
         return None if len(indices) == self.recordings[number].count else indices
 
     def _intensity_figures(self, a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
-        """Return figures of pairs of intensities (n,), or None without a rank correlation."""
+        """Return the statistics of paired intensities, or None if they have no rank correlation."""
         correlation = rank_correlation(a, b)
         if correlation is None:
             return None
@@ -469,7 +484,7 @@ class _Comparing:
         }
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
-        """Return figures of the distances of A's points to B, and of B's to A, meters."""
+        """Return the statistics of the distances from A to B and from B to A, in meters."""
         f_scores: list[dict[str, float | None]] = []
         for distance in self.distances_m:
             scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
@@ -482,14 +497,14 @@ class _Comparing:
         }
 
     def _empty_notes(self) -> list[str]:
-        """Return a note on pairs of sweeps that were skipped because a sweep is empty."""
+        """Return a note on pairs that were skipped because a sweep is empty."""
         if not self.empty_pairs:
             return []
         total = plural(len(self.pairs), "pair")
         return [f"{self.empty_pairs:,} of {total} of sweeps have an empty sweep and are skipped"]
 
     def _image_notes(self) -> list[str]:
-        """Return notes on pairs of sweeps without range images, and on what is compared then."""
+        """Return notes on pairs without range images, and on how they are compared instead."""
         instead = "Their ranges are compared ray by ray"
         first, second = self.recordings
         if not self.has_same_rays:
@@ -505,11 +520,11 @@ class _Comparing:
         ]
 
     def _images(self) -> RangeImages | None:
-        """Return the range images to show; None if any pair of sweeps is compared without them."""
+        """Return the range images to show, or None if any pair of sweeps has none."""
         return None if self.ray_counts.any() else self.images
 
     def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
-        """Return figures of all ranges, and of each ring of range images, the highest first."""
+        """Return the statistics of all ranges and of each ring, by descending elevation."""
         images = self._images()
         has_gaps = not any(recording.thinned for recording in self.recordings)
         rings = sorted(self.rings.items(), key=lambda item: -item[1][0]) if images else []
@@ -539,10 +554,7 @@ class _Comparing:
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:
-    """Return figures of residuals A - B (n,), meters.
-
-    Without residuals, each figure is None.
-    """
+    """Return the statistics of the residuals A - B in meters, which are None without residuals."""
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
     p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
@@ -553,9 +565,9 @@ def _residual_figures(values: Floats) -> dict[str, Any]:
 
 
 def _no_return_figures(counts: Any) -> dict[str, Any]:
-    """Return figures of cells without a return in A, with cells of B as the truth.
+    """Return how well A predicts the cells of B that have no return.
 
-    `counts` (4,) are the cells of each state of `CELLS`.
+    `counts` contains the number of cells in each state of `CELLS`.
     """
     in_both, in_a_only, in_b_only, _ = counts.tolist()
     precision = in_both / (in_both + in_a_only) if in_both + in_a_only else None
@@ -564,7 +576,7 @@ def _no_return_figures(counts: Any) -> dict[str, Any]:
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
-    """Return precision, recall and their harmonic mean, None where undefined."""
+    """Return precision, recall and their harmonic mean. Undefined values are None."""
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
@@ -572,7 +584,7 @@ def _scores(precision: float | None, recall: float | None) -> dict[str, float | 
 
 
 def _distance_quantiles(values: Floats) -> dict[str, Any]:
-    """Return the mean and quantiles of distances (n,), meters."""
+    """Return the mean and the quantiles of distances in meters."""
     shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
     quantiles = np.quantile(values, list(shares.values())).tolist()
     return {

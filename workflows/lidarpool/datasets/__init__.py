@@ -1,1 +1,1 @@
-"""Data sets of many jobs: writing, their table of jobs, and reading them again."""
+"""Data sets of many jobs: writing them, their job tables, and reading them for training."""

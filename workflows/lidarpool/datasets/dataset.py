@@ -1,4 +1,7 @@
-"""Data sets of many jobs: each job writes its own files, `finish` the files that all jobs share."""
+"""Write data sets of many jobs.
+
+Each job writes its own files, and `DataSet.finish` writes the files that all jobs share.
+"""
 
 from __future__ import annotations
 
@@ -44,19 +47,19 @@ BOXES_FILE = "boxes.npz"
 _MANIFESTS = ".jobs"
 VERSION = 2  # version of INDEX_FILE
 _REQUESTS = 8  # simultaneous requests to an object store
-_AHEAD = 16  # jobs that are checked ahead
-_MAX_LISTED_FOLDERS = 32  # folders whose listings are cached; all jobs share some folders
+_AHEAD = 16  # number of jobs that are read in advance
+_MAX_LISTED_FOLDERS = 32  # cached folder listings; many jobs share the same folders
 
 
 def _name_pattern(cloud_format: type[CloudFormat]) -> str:
-    """Return a pattern of the names of files of jobs in a format."""
+    """Return a regular expression for the names of the files that jobs write in a format."""
     folder = re.escape(cloud_format.job_path)
     folder = folder.replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
     files = cloud_format.file_pattern
     return "/".join(filter(None, (folder, files and f"({files})")))
 
 
-# Names of files of jobs, in all formats.
+# Names of the files that jobs write, in all formats.
 JOB_FILES = re.compile(
     r"\.jobs/[^/]+\.json|jobs/[^/]+/(sweeps|boxes)\.npz|(sweeps|boxes)/[^/]+\.npz|"
     + "|".join(_name_pattern(load_format(name)) for name in DATA_SETS.values())
@@ -71,7 +74,7 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
     >>> job_file("kitti", "0417", "sweeps.npz"), job_file("folder", "0417", "sweeps.npz")
     ('sweeps/0417.npz', 'jobs/0417/sweeps.npz')
     """
-    if format == "folder":  # `read_cloud` reads them from this folder
+    if format == "folder":  # `read_cloud` expects these files beside the cloud
         return f"jobs/{name}/{file}"
     stem, _, ending = file.partition(".")
     return f"{stem}/{name}.{ending}"
@@ -79,40 +82,46 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 
 @dataclass(frozen=True)
 class DataSet:
-    """The files of many jobs in a folder or storage.
+    """A data set of many jobs in a folder or object store.
 
-    The object is small when pickled. Any process writes jobs.
+    The object is small when pickled, so that any process can write jobs. The files depend on the
+    format:
 
-    - kitti: `sequences/07` of job 7, of further sensors `sequences/07_NAME`
+    - kitti: `sequences/07` for job 7, and `sequences/07_NAME` for its further sensors
     - nuscenes: a scene for each job; `finish` writes the tables
-    - webdataset: `shards/SPLIT/NAME-000000.tar`, and `offsets/NAME.npz` for single sweeps
+    - webdataset: `shards/SPLIT/NAME-000000.tar`, and `offsets/NAME.npz` to read single sweeps
     - mcap: `bags/NAME.mcap`
-    - parquet: `points/job=7`, one table of Hive's partitions
+    - parquet: `points/job=7`, a table with Hive partitions
     - images: `images/NAME/SENSOR/000000.npz`
     - folder: `jobs/NAME/cloud.ply`
 
-    In addition there are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors,
-    `boxes/NAME.npz`, which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`.
-    `.jobs/NAME.json`, the job's manifest, is the last file that a job writes: it lists the job's
-    files with bytes and CRC, and the input files of the job, and has the job's row and data for
-    `finish`. The manifest of a job that has failed lists no files. Each manifest ends with its own
-    CRC; the table of jobs follows from the manifests.
+    In addition, each job has a `sweeps/NAME.npz` file (`Sweeps`) and, if there are actors, a
+    `boxes/NAME.npz` file. `lidarpool.sweeps` reads both. In the folder format, they are in
+    `jobs/NAME`.
+
+    The last file that a job writes is its manifest, `.jobs/NAME.json`. The manifest lists the job's
+    files with their sizes and CRCs, and the input files of the job. It also contains the job's
+    table row and the data that `finish` requires. The manifest of a failed job lists no files. Each
+    manifest ends with its own CRC. The job table can be rebuilt from the manifests.
 
     Parameters
     ----------
     storage
-        A folder or URL. Without `durable` a power failure may lose jobs that were written.
+        A folder or URL. Unless the storage is `durable`, a power failure may lose jobs that were
+        written.
     format
         kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
-        Layout of points in mcap (`lidarpool.save_cloud`).
+        Layout of points in mcap files (see `lidarpool.save_cloud`).
     compensated
-        Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
-        their firing. `lidarpool.sweeps` gives both at the start of the sweep.
+        Whether points in mcap files are in the sensor frame at the start of the sweep, without
+        times. Otherwise, each point is in the sensor frame at its firing. `lidarpool.sweeps`
+        returns points in the frame at the start of the sweep in both cases.
     compensated_actors, pose_rate_hz
-        As of `lidarpool.save_cloud`.
+        See `lidarpool.save_cloud`.
     made_with
-        Identity and software that determine the bytes of all jobs, for JSON; part of each manifest.
+        Identity and software versions that determine the bytes of all jobs, as JSON values. They
+        are stored in each manifest.
     """
 
     storage: Storage
@@ -130,7 +139,7 @@ class DataSet:
 
     @property
     def spec(self) -> ExportSpec:
-        """Format of the files of a job, with its options."""
+        """File format of a job, with its options."""
         return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
@@ -141,11 +150,11 @@ class DataSet:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that clouds of jobs must have."""
+        """Names of the columns that the clouds of jobs must have."""
         return self.spec.needs
 
     def check_installed(self) -> None:
-        """Raise LidarError if a package that writes the format is missing in this environment."""
+        """Raise LidarError if a package that the format requires is not installed."""
         self.spec.check_installed()
 
     def write_job(
@@ -157,19 +166,29 @@ class DataSet:
         *,
         listing: Listing | None = None,
     ) -> JobRow:
-        """Write the files of a job, always the same bytes.
+        """Write the files of a job, and return its table row with point counts.
 
-        Returns its row with counts of points.
+        The same job always writes the same bytes. Points are read in order, one sweep at a time, or
+        a million at a time for Parquet. Each file is written atomically.
 
-        Points are read in order, a sweep at a time or, for Parquet, a million. Every file appears
-        completely or not at all. `made_of` has names and hashes of the input files of the job;
-        `listing` gets the written files, also after an error.
+        Parameters
+        ----------
+        row
+            Table row of the job, without point counts.
+        cloud
+            Points of all sweeps of the job.
+        sweeps
+            Sweeps of the job.
+        made_of
+            Names and hashes of the job's input files.
+        listing
+            Storage that records the written files, even if an error occurs.
 
         Raises
         ------
         LidarError
-            If a package or column is missing, the cloud is not of these sweeps, or the storage
-            cannot be written to.
+            If a package or column is missing, if the cloud does not belong to these sweeps, or if
+            the storage is not writable.
         """
         name = row.name
         spec = self.spec
@@ -214,9 +233,9 @@ class DataSet:
         return row
 
     def write_failed(self, rows: Iterable[JobRow]) -> None:
-        """Write the manifests of jobs that have failed.
+        """Write the manifests of failed jobs, ignoring other jobs.
 
-        Raises LidarError on failure.
+        Raises LidarError if the storage is not writable.
         """
         with explained(f"{self.storage} cannot be written"):
             storage = Listing.from_storage(self.storage)
@@ -226,22 +245,23 @@ class DataSet:
             )
 
     def _write_manifest(self, storage: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
-        """Write the manifest of a job, with the part of its row that is the same in every run."""
+        """Write the manifest of a job, without the casting time, which varies between runs."""
         row_of_all_runs = asdict(replace(row, seconds=None))
         manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
         manifest["crc"] = _crc(manifest)
         storage.write(manifest_file(row.name), json.dumps(manifest).encode())
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
-        """Write the shared files from the finished jobs, in their order.
+        """Write the files that all jobs share, from the manifests of the finished jobs.
 
-        A single job's manifest is in memory at a time. No job may be written meanwhile.
-        `dataset.json` is removed first and written last: it marks a finished data set.
+        Jobs are processed in the given order, and only one manifest is in memory at a time. No jobs
+        may be written in the meantime. `dataset.json` marks a finished data set, so it is removed
+        first and written last.
 
         Raises
         ------
         LidarError
-            If a job's files differ from its manifest, or the storage cannot be written to.
+            If a job's files differ from its manifest, or if the storage is not writable.
         """
         with explained(f"{self.storage} cannot be written"):
             self.storage.remove([INDEX_FILE])
@@ -261,9 +281,9 @@ class DataSet:
                 index.seal()
 
     def _renumber(self, job: str, classes: Sequence[int]) -> None:
-        """Write the labels of a job again, so that they number other classes.
+        """Rewrite the labels of a job with the class numbers of the merged data set.
 
-        The manifest is removed first: if this is interrupted, the job is made again.
+        The manifest is removed first, so that the job is repeated if this is interrupted.
         """
         manifest = self._manifest(job)
         self.storage.remove([manifest_file(job)])
@@ -279,10 +299,10 @@ class DataSet:
         self.storage.write(manifest_file(job), json.dumps(manifest).encode())
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
-        """Yield the manifests of finished jobs, and write their names and sensors to the index."""
+        """Yield the manifests of finished jobs, and add the jobs to the index."""
         comma = ""
-        named = dict[int, dict[str, None]]()  # {class: its names in the jobs, in order}
-        for job, (manifest, damage) in self.look(jobs):
+        named = dict[int, dict[str, None]]()  # {class number: distinct names in the jobs}
+        for job, (manifest, damage) in self.check_jobs(jobs):
             if damage:
                 message = f"Job {job.name} of {self.storage} is incomplete, because {damage}."
                 raise LidarError(f"{message} Run the campaign again with `--resume`.")
@@ -298,22 +318,24 @@ class DataSet:
         classes_field = f', "classes": {json.dumps(classes)}' if classes else ""
         index.write(f"\n]{classes_field}")
 
-    def look(
+    def check_jobs(
         self, jobs: Iterable[JobRow], *, contents: bool = False
     ) -> Iterator[tuple[JobRow, tuple[dict[str, Any], str]]]:
-        """Yield the finished jobs with their manifests and a description of damage to their files.
+        """Yield each finished job with its manifest and a description of damage to its files.
 
-        The description is a clause, or empty without damage; the manifest may be empty, too. Sizes
-        are compared, and with `contents` every byte is read. OSError if the storage cannot be read.
+        The description is a clause, which is empty if the files are intact. If the manifest itself
+        is missing or damaged, it is an empty dictionary. By default, only file sizes are compared;
+        with `contents`, the checksums are compared, too. Raises OSError if the storage cannot be
+        read.
         """
-        look_at = self._job_checker(contents)
-        yield from read_ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
+        check_job = self._job_checker(contents)
+        yield from read_ahead(lambda job: check_job(job.name), (job for job in jobs if job.done))
 
     def _job_checker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
-        """Return a function that checks a job by its name (`look`)."""
+        """Return a function that checks a job by its name, as described in `check_jobs`."""
         sizes = lru_cache(_MAX_LISTED_FOLDERS)(lambda folder: self.storage.below(folder).sizes())
 
-        def look_at(job: str) -> tuple[dict[str, Any], str]:
+        def check_job(job: str) -> tuple[dict[str, Any], str]:
             manifest = self._manifest(job)
             if not manifest or "sensors" not in manifest:  # a failed job has no sensors
                 return {}, f"{manifest_file(job)} is missing or damaged"
@@ -324,29 +346,32 @@ class DataSet:
                     return manifest, f"{name} is missing or damaged"
             return manifest, ""
 
-        return look_at
+        return check_job
 
-    def take(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
-        """Copy the files of jobs from another data set of this format, in `source`.
+    def copy_jobs(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
+        """Copy the files of jobs from `source`, which contains a data set of the same format.
 
-        Files that exist in this data set are not read again. A job that has failed in the source
-        stays as it is in this data set. Yields the name of each job with a manifest, the row of the
-        manifest, and the first file in the source that is missing, damaged or of jobs of another
-        `identity`, else "". OSError if a storage cannot be read or written to.
+        Files that already exist in this data set are not copied again. A job that failed in the
+        source does not replace the job in this data set.
+
+        For each job with a manifest in the source, yields the job's name, its table row, and a
+        path. The path is the first source file that is missing, damaged, or belongs to a job with a
+        different `identity`, or an empty string if there is none. The row is None if the manifest
+        itself is unusable. Raises OSError if a storage cannot be read or written.
         """
-        look_at = self._job_checker()
+        check_job = self._job_checker()
         other_set = replace(self, storage=source)
 
-        def take(name: str) -> tuple[JobRow | None, str]:
+        def copy_job(name: str) -> tuple[JobRow | None, str]:
             manifest = other_set._manifest(name)
             manifest_name = manifest_file(name)
             if not manifest or manifest["made_with"].get("identity") != identity:
                 return None, source.path(manifest_name)
             row = JobRow.from_json(manifest["row"])
-            if look_at(name) == (manifest, "") or (not row.done and self._manifest(name)):
+            if check_job(name) == (manifest, "") or (not row.done and self._manifest(name)):
                 return row, ""
             for file, checksum in (manifest["files"] | {manifest_name: None}).items():
-                # No file of a data set: the manifest is foreign or edited.
+                # A manifest that lists files outside the data set is foreign or was edited.
                 if leads_outside(file):
                     return row, source.path(manifest_name)
                 with suppress(FileNotFoundError):
@@ -358,13 +383,14 @@ class DataSet:
                 return row, source.path(file)
             return row, ""
 
-        for name, (row, damaged_file) in read_ahead(take, iter(other_set.manifests())):
+        for name, (row, damaged_file) in read_ahead(copy_job, iter(other_set.manifests())):
             yield name, row, damaged_file
 
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job.
 
-        The manifest is empty if missing, damaged or of another job.
+        Return an empty dictionary if the manifest is missing, damaged, or belongs to a different
+        job.
         """
         try:
             manifest: dict[str, Any] = json.loads(self.storage.read(manifest_file(name)))
@@ -377,16 +403,19 @@ class DataSet:
         return manifest if valid else {}
 
     def manifests(self) -> list[str]:
-        """Return the names of the jobs that have a manifest, by length and letters."""
+        """Return the names of the jobs that have a manifest.
+
+        Names are sorted by length, then alphabetically.
+        """
         files = self.storage.below(_MANIFESTS).sizes()
         names = [file.removesuffix(".json") for file in files if file.endswith(".json")]
         return sorted(names, key=lambda name: (len(name), name))
 
     def rows(self, known_names: Collection[str] = ()) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
-        """Yield the rows of jobs from their manifests, and the identity and software of the jobs.
+        """Yield each job's table row with the identity and software that produced the job.
 
-        Jobs in `known_names` and damaged manifests are left out. OSError if the storage cannot be
-        read.
+        Rows are read from the manifests. Jobs in `known_names` and jobs with a damaged manifest are
+        skipped. Raises OSError if the storage cannot be read.
         """
         unknown = (name for name in self.manifests() if name not in known_names)
         for _, manifest in read_ahead(self._manifest, unknown):
@@ -396,13 +425,13 @@ class DataSet:
 
 @dataclass(frozen=True)
 class Listing(Storage):
-    """A storage that lists the written files, {name: [bytes, CRC-32]}."""
+    """A storage that records the size and CRC-32 of each file written to it."""
 
-    files: dict[str, list[int]] = field(default_factory=dict)
+    files: dict[str, list[int]] = field(default_factory=dict)  # {name: [bytes, CRC-32]}
 
     @classmethod
     def from_storage(cls, storage: Storage) -> Listing:
-        """Return a storage that lists the files written from now on."""
+        """Return a storage that records all files written from now on."""
         return cls(storage.url, storage.durable, storage.named)
 
     def write(self, name: str, data: Any) -> None:  # noqa: D102 - as in Storage
@@ -412,14 +441,14 @@ class Listing(Storage):
 
 
 def read_ahead(read: Callable[[T], R], items: Iterator[T]) -> Iterator[tuple[T, R]]:
-    """Yield items with the results of `read`, which runs ahead in threads."""
+    """Yield each item with the result of `read`, which runs ahead in background threads."""
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
         while group := [*islice(items, _AHEAD)]:
             yield from zip(group, pool.map(read, group), strict=True)
 
 
 def manifest_file(name: str) -> str:
-    """Return the name of the manifest of a job in a data set."""
+    """Return the name of a job's manifest in a data set."""
     return f"{_MANIFESTS}/{name}.json"
 
 
@@ -428,8 +457,8 @@ def _crc(manifest: Mapping[str, Any]) -> int:
 
 
 def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
-    """Write all pieces of a job, and return their details."""
-    # In an object store each file takes a request.
+    """Write all pieces of a job in parallel, and return the details that the format reports."""
+    # In an object store, each file requires a request, so files are written in parallel.
     spans = [(0, len(output))] if storage.is_local else output.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:
         written = pool.map(lambda span: output.write_range(storage, *span), spans)
@@ -437,8 +466,8 @@ def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
 
 
 def _packed(boxes: Sequence[Boxes]) -> bytes:
-    """Return boxes of all sweeps as a NumPy archive: float64 (n, a, 3), ... by names of fields."""
-    # The sizes are in the sweeps.
+    """Encode the boxes of all sweeps as a NumPy archive with one array per field."""
+    # The sizes of the boxes are stored with the sweeps.
     return packed(
         {
             "centers": np.stack([boxes_of_sweep.centers for boxes_of_sweep in boxes]),

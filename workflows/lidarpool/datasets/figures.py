@@ -1,4 +1,4 @@
-"""Figures of a data set: totals, and a few numbers of each job."""
+"""Statistics of a data set: totals, and a few values for each job."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lidarsim.base.words import shortened, without_common_prefix
 
 from .job_table import JobRow
 
-# Rows that are kept in full.
+# Maximum numbers of rows that are kept in full.
 MAX_FAILED = 200
 MAX_SLOWEST = 10
 _COUNTS = ("scans", "sweeps", "rays", "hits", "points")
-MAX_LABELS = 12  # bars; the rarest labels share the last bar
+MAX_LABELS = 12  # maximum number of bars; the rarest labels share the last bar
 _MAX_BINS = 24
-_LETTER = 11.5  # width of a letter of a label, pixels
+_LETTER = 11.5  # average width of a letter in a label, in pixels
 
 
 def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
@@ -45,8 +45,11 @@ def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Varied:
-    """Values of a varied quantity in all jobs: numbers, or labels if any job has no number."""
+class VariedQuantity:
+    """Values of a varied quantity in all jobs.
+
+    The values are numbers, or labels if the quantity is not a number in some job.
+    """
 
     name: str
     values: Floats  # (n,): numbers, or indices into `labels`; NaN in jobs without the quantity
@@ -61,8 +64,8 @@ class Varied:
         """Return the number of jobs with each label."""
         return np.bincount(self.known_values.astype(np.intp), minlength=len(self.labels))
 
-    def folded(self) -> Varied:
-        """Return at most `MAX_LABELS` labels, the last shared by the rarest labels."""
+    def merge_rare_labels(self) -> VariedQuantity:
+        """Combine the rarest labels into one, so that there are at most `MAX_LABELS` labels."""
         labels = self.labels
         if len(labels) <= MAX_LABELS:
             return self
@@ -71,11 +74,15 @@ class Varied:
         new_indices[frequent] = np.arange(len(frequent))
         values = new_indices[np.nan_to_num(self.values, nan=-1).astype(np.intp)]
         remainder = f"{len(labels) - len(frequent)} others"
-        return Varied(self.name, values, (*(labels[k] for k in frequent), remainder))
+        return VariedQuantity(self.name, values, (*(labels[k] for k in frequent), remainder))
 
     @cached_property
     def edges(self) -> Floats:
-        """Edges of bins (bins + 1,): a bin for each label or small whole number, or equal bins."""
+        """Histogram bin edges, with shape (bins + 1,).
+
+        Each label or small integer has its own bin. Otherwise, bins have equal widths, or equal
+        ratios if the values have a logarithmic distribution.
+        """
         values = self.known_values
         lower, upper = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
         if upper - lower <= 30 and (values == np.round(values)).all():
@@ -84,7 +91,7 @@ class Varied:
             lower = lower - 0.5
             upper = upper + 0.5
         bins = int(np.clip(2 * np.sqrt(len(values)), 6, _MAX_BINS))
-        # Half of a logarithmic distribution lies below the geometric mean of its limits.
+        # The median of a logarithmic distribution is close to the geometric mean of its limits.
         middle = (np.sqrt(max(lower, 0.0) * upper) * (lower + upper) / 2) ** 0.5
         if lower > 0 and upper > 20 * lower and np.median(values) < middle:
             return np.geomspace(lower, upper, bins + 1)
@@ -92,30 +99,32 @@ class Varied:
 
     @property
     def is_log(self) -> bool:
-        """True if the axis of the quantity is logarithmic, as its bins are."""
+        """Whether the bins, and therefore the axis of a chart, are logarithmic."""
         widths = np.diff(self.edges)
         return bool(widths[-1] > 1.01 * widths[0])
 
     @cached_property
     def short_labels(self) -> list[str]:
-        """Labels without their common prefix, shortened."""
+        """Labels without their common prefix, truncated to 15 characters."""
         return [shortened(label, 15) for label in without_common_prefix(self.labels)]
 
-    def slanted(self, width: float) -> bool:
-        """Return True if labels are too long to stand side by side in a `width` in pixels."""
+    def needs_slanted_labels(self, width: float) -> bool:
+        """Return True if the labels are too long to be horizontal on an axis of `width` pixels."""
         longest = max(map(len, self.short_labels), default=0)
         return longest * _LETTER > width / max(1, len(self.labels))
 
 
-class Figures:
-    """Totals, and a few numbers of each job: 40 bytes, and 9 for each varied quantity.
+class DataSetStatistics:
+    """Totals over all jobs, and a few values for each job.
+
+    The memory use is 40 bytes per job, and 9 bytes per job for each varied quantity.
 
     Parameters
     ----------
     names
         Names of the varied quantities.
     jobs
-        Rows of the table, which are read once; `add` takes more.
+        Table rows, which are read once. Use `add` to add further rows.
     """
 
     def __init__(self, names: Sequence[str], jobs: Iterable[JobRow] = ()) -> None:
@@ -123,11 +132,11 @@ class Figures:
         self.splits: dict[str, Counter[str]] = {}  # {split: finished jobs, and their counts}
         self.classes: dict[int, Counter[str]] = {}  # {class: points, and jobs that have the class}
         self.failed: list[JobRow] = []  # the first failed jobs
-        self.slowest: list[JobRow] = []  # jobs with the longest casting times, in falling order
+        self.slowest: list[JobRow] = []  # jobs with the longest casting times, slowest first
         self._per_job = {
             name: array("d") for name in ("points", "rays", "hits", "seconds", "failed")
         }
-        # Numbers, or indices into the labels; `_labeled` tells which.
+        # Numbers, or indices into the labels where `_labeled` is 1.
         self._values = {name: array("d") for name in names}
         self._labeled = {name: array("b") for name in names}
         self._labels: dict[str, dict[str, int]] = {name: {} for name in names}
@@ -137,10 +146,10 @@ class Figures:
             self.add(row)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_digest": None}  # a copy, as for charts, has no digest
+        return self.__dict__ | {"_digest": None}  # hash objects cannot be pickled
 
     def add(self, row: JobRow) -> None:
-        """Count a job."""
+        """Add the row of a job to the statistics."""
         self.jobs += 1
         for name, column in self._per_job.items():
             value = not row.done if name == "failed" else getattr(row, name)
@@ -175,48 +184,55 @@ class Figures:
 
     @property
     def totals(self) -> dict[str, int]:
-        """Scans, sweeps, rays, hits and points of all finished jobs."""
+        """Total numbers of scans, sweeps, rays, hits and points of all finished jobs."""
         counts_of_splits = self.splits.values()
         return {name: sum(counts[name] for counts in counts_of_splits) for name in _COUNTS}
 
     @property
     def sha256(self) -> str:
-        """Digest of the names and points of all finished jobs, in the order of their rows."""
+        """Hash of the names and points of all finished jobs, in row order."""
         return self._digest.hexdigest()
 
     @property
-    def varied(self) -> list[Varied]:
+    def varied(self) -> list[VariedQuantity]:
         """Values of each varied quantity in all jobs."""
         return [self._varied(name) for name in self._values]
 
-    def _varied(self, name: str) -> Varied:
+    def _varied(self, name: str) -> VariedQuantity:
         values = np.array(self._values[name])
         labels = dict(self._labels[name])
         has_value = np.isfinite(values)
         values[~has_value] = np.nan
         if not labels:
-            return Varied(name, values)
+            return VariedQuantity(name, values)
         numbers = has_value & (np.array(self._labeled[name]) == 0)
         codes = values.copy()
-        for value in np.unique(values[numbers]).tolist():  # words too: «auto» beside 1 and 2
+        # If a quantity has both labels and numbers, such as "auto" and 2, numbers become labels.
+        for value in np.unique(values[numbers]).tolist():
             codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))
         order = sorted(labels)
         codes[has_value] = np.argsort([labels[text] for text in order])[
             codes[has_value].astype(np.intp)
         ]
-        return Varied(name, codes, tuple(order))
+        return VariedQuantity(name, codes, tuple(order))
 
     def per_job(self, name: str) -> Floats:
-        """Return points, rays, hits or seconds of each job (n,); NaN if they are unknown."""
+        """Return the points, rays, hits or seconds of each job.
+
+        The result has shape (jobs,). Unknown values are NaN.
+        """
         return np.array(self._per_job[name])
 
     @property
     def failures(self) -> Bools:
-        """True for each failed job (n,)."""
+        """Boolean mask of failed jobs, with shape (jobs,)."""
         return np.array(self._per_job["failed"]) > 0
 
-    def spread(self, name: str) -> dict[str, float] | None:
-        """Return minimum, 10th, 50th and 90th percentile and maximum of finished jobs, or None."""
+    def percentiles(self, name: str) -> dict[str, float] | None:
+        """Return the minimum, 10th, 50th and 90th percentile, and maximum over finished jobs.
+
+        Return None if no finished job has a known value.
+        """
         values = self.per_job(name)[~self.failures]
         values = values[np.isfinite(values)]
         if not len(values):
@@ -224,8 +240,8 @@ class Figures:
         names = ("lowest", "tenth", "median", "ninetieth", "highest")
         return dict(zip(names, np.percentile(values, (0, 10, 50, 90, 100)).tolist(), strict=True))
 
-    def described(self) -> Iterator[dict[str, Any]]:
-        """Yield the figures of each varied quantity."""
+    def summaries(self) -> Iterator[dict[str, Any]]:
+        """Yield the statistics of each varied quantity as a dictionary for JSON."""
         is_done = ~self.failures
         points = self.per_job("points")
         for varied in self.varied:

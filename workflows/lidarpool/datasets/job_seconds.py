@@ -1,7 +1,7 @@
-"""Casting times of the jobs of a data set, in a file of its report.
+"""Casting times of the jobs of a data set, which are stored in a file next to its report.
 
-Times differ from run to run. The table of jobs has no times, since its bytes are the same in any
-run.
+Casting times vary between runs. The job table does not contain them, because its bytes must be the
+same in every run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _HEADER = ["number", "seconds"]
 
 
 def writing_seconds(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
-    """Yield the rows of jobs, and write their casting times into SECONDS_FILE.
+    """Yield the rows of jobs unchanged, while writing their casting times to SECONDS_FILE.
 
     The file appears after the last row.
     """
@@ -33,7 +33,7 @@ def writing_seconds(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow
 
 
 def read_seconds(storage: Storage) -> Mapping[int, float]:
-    """Return the known casting times of jobs, {number: seconds}.
+    """Return the known casting times of jobs as {job number: seconds}.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
 
 
 def known_seconds(storage: Storage) -> Mapping[int, float]:
-    """Return the casting times of jobs as `read_seconds`, or {} if the file is unusable."""
+    """Return the known casting times, or an empty dictionary if the file is unusable."""
     try:
         return read_seconds(storage)
     except LidarError:

@@ -1,10 +1,11 @@
-"""The table of the jobs of a data set, and the tally of a job's points.
+"""The job table of a data set, and the point statistics of a job.
 
-`jobs.csv` has a row for each job: number, name, split, then varied values, then results, then the
-points of each class. A varied value is written as JSON writes it, so that it is read with its type:
-``12``, ``0.5``, ``true``; text is written as it is unless it looks like such a value, as ``"12"``
-does. The cell is empty where a job has no such value. Text that a spreadsheet would run as a
-formula has a leading apostrophe, as OWASP advises against CSV injection.
+`jobs.csv` contains one row per job. The columns are number, name and split, then the varied values,
+then the results, then the number of points of each class. Varied values are written as in JSON,
+such as ``12``, ``0.5`` or ``true``, so that they keep their type. A string is written without
+quotes unless it could be mistaken for such a value, as in ``"12"``. The cell is empty if the job
+has no such value. Text that a spreadsheet would interpret as a formula is prefixed with an
+apostrophe, as OWASP recommends against CSV injection.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ Value = bool | int | float | str
 TABLE_FILE = "jobs.csv"
 PARQUET_FILE = "jobs.parquet"
 WRITE_AGAIN = "run the campaign again with `--resume` to rewrite the table"
-ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
-MAX_JOBS = 100_000_000  # limit for a campaign: a larger number is not a job's
-MAX_ERROR_LETTERS = 4_000  # limit for an error in the table: csv.reader refuses cells of 131,072
+ROW_GROUP = 2_000  # number of rows of jobs.parquet in memory at a time
+MAX_JOBS = 100_000_000  # maximum number of jobs in a campaign
+MAX_ERROR_LETTERS = 4_000  # longer errors are truncated; csv.reader rejects cells above 131,072
 
 _HEAD = {"number": int, "name": str, "split": str}
 _TAIL = {
@@ -55,40 +56,41 @@ _TAIL = {
 }
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
 _UTF8 = codecs.getwriter("utf-8")
-_ESCAPED = "backslashreplace"  # keeps parts of names that are not UTF-8
-# Text with such a start is a formula for spreadsheets. Leading apostrophes count as well: without
-# that, a cell that begins with an apostrophe would be read back without it.
+_ESCAPED = "backslashreplace"  # preserves parts of names that are not valid UTF-8
+# Spreadsheets interpret text that starts with one of these characters as a formula. Leading
+# apostrophes are included, because such text could otherwise not be read back unchanged.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
-# Before the name of a varied value that would look like another column.
+# Prefix for the name of a varied value that could be mistaken for another column.
 _VARIED = "varied."
 
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job of a campaign.
+    """Table row of a job in a campaign.
 
     Parameters
     ----------
     number
-        From 0.
+        Job number, from 0.
     name
-        Its name in files.
+        Name of the job in file names.
     split
-        Its split, such as "train"; "" without splits.
+        Split that the job belongs to, such as "train", or "" without splits.
     values
-        {path: varied value}; for a sample of objects, their number. None if the job has no value.
+        {path: varied value}. For a sample of objects, the value is the number of objects. A value
+        of None means that the job does not have it.
     error
-        Why it failed; "" for a job that is done.
+        Error message if the job failed, otherwise "".
     scans, sweeps, rays, hits, points
         Numbers of scans, sweeps, rays, hits and points.
     seconds
-        Casting time of all its tasks; None if it is unknown, as for a failed job. The only entry
-        that differs between runs: the table has no such column (`job_seconds`).
+        Total casting time of all tasks, or None if it is unknown, for example because the job
+        failed. This is the only field that varies between runs, so it is not part of the table (see
+        `job_seconds`).
     sha256
-        Hash of its points (`Tally`): the same on any cluster.
+        Hash of the points (see `Tally`), which is the same on any cluster.
     classes
-        {class: points}; empty if the points have no column ``class``.
-
+        {class: number of points}. Empty if the points have no ``class`` column.
     """
 
     number: int
@@ -107,15 +109,15 @@ class JobRow:
 
     @property
     def done(self) -> bool:
-        """True if the points of the job are in the data set."""
+        """Whether the job succeeded, so that the data set contains its points."""
         return not self.error
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> JobRow:
-        """Return a row from its JSON object.
+        """Create a row from its JSON object.
 
-        ValueError if an entry is missing, unknown or of another type, or if its name or split is
-        not a plain file name.
+        Raises ValueError if a field is missing, unknown or has the wrong type, or if the name or
+        the split is not a plain file name.
         """
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
             raise ValueError(
@@ -130,7 +132,7 @@ class JobRow:
 
 
 class Tally:
-    """Counts and hash of the points of a job, added in chunks and in order.
+    """Point counts and hash of a job, computed from chunks of points that are added in order.
 
     Examples
     --------
@@ -148,7 +150,7 @@ class Tally:
     def __init__(self) -> None:
         self.points = 0
         self._classes: Counter[int] = Counter()
-        self._columns: dict[str, Any] = {}  # {name and type: hash of the values}
+        self._columns: dict[str, Any] = {}  # {column name and type: hash of the values}
 
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> Tally:
@@ -159,13 +161,13 @@ class Tally:
         return tally
 
     def add(self, chunk: Cloud) -> None:
-        """Count the next points.
+        """Add the next chunk of points.
 
-        LidarError if their columns differ from the columns of earlier points.
+        Raises LidarError if its columns differ from those of earlier chunks.
         """
         if not len(chunk):
             return
-        # Points of a file and of a run are of different types.
+        # Points read from a file and points of a run may have different data types.
         arrays = {"positions <f8": chunk.positions.astype("<f8", copy=False)}
         for column in chunk.table:
             values = chunk.columns[column.name]
@@ -187,18 +189,19 @@ class Tally:
 
     @property
     def classes(self) -> dict[int, int]:
-        """Points of each class that has any, {class: points}.
+        """Number of points of each class that occurs, as {class: points}.
 
-        The result is empty without a column ``class``.
+        The dictionary is empty if the points have no ``class`` column.
         """
         return dict(sorted(self._classes.items()))
 
     @property
     def sha256(self) -> str:
-        """Hash of positions and columns, 64 hexadecimal digits.
+        """Hash of positions and columns, as 64 hexadecimal digits.
 
-        It is the hash of the columns' names, types and hashes, a line each, positions first: the
-        same for float32 and float64 positions of equal value, and for any division into chunks.
+        Each column contributes a line with its name, type and hash, starting with the positions;
+        the result is the hash of these lines. It does not depend on the division into chunks, nor
+        on whether positions are float32 or float64 if their values are equal.
         """
         lines = (f"{name} {digest.hexdigest()}\n" for name, digest in self._columns.items())
         return hashlib.sha256("".join(lines).encode()).hexdigest()
@@ -207,23 +210,24 @@ class Tally:
 def write_table(
     storage: Storage, names: Sequence[str], jobs: Callable[[], Iterable[JobRow]]
 ) -> None:
-    """Write the table of jobs: jobs.csv, and jobs.parquet if pyarrow is installed.
+    """Write the job table to jobs.csv, and to jobs.parquet if pyarrow is installed.
 
-    Rows are not held in memory: they are read once for the columns, and again for each file.
+    Rows are not kept in memory. They are read once to determine the columns, and once more for each
+    file.
 
     Parameters
     ----------
     storage
         Folder of the data set, which must exist.
     names
-        Names of the varied values, in the order of their columns.
+        Names of the varied values, in column order.
     jobs
-        Gives the rows in order, the same each time.
+        Function that returns the rows in order. Every call must return the same rows.
 
     Raises
     ------
     LidarError
-        If a row has a value that is not in `names`, or the table cannot be written.
+        If a row has a value that is not listed in `names`, or if the table cannot be written.
     """
     with explained(
         f"The job table cannot be written to {storage}",
@@ -244,13 +248,18 @@ def write_table(
 def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Iterator[JobRow]:
     """Yield the rows of jobs.csv in order.
 
-    `checksum` has the bytes and the CRC-32 that the file must have.
+    Parameters
+    ----------
+    storage
+        Folder or URL of the data set.
+    checksum
+        Expected size in bytes and CRC-32 of the file. By default, they are not checked.
 
     Raises
     ------
     LidarError
-        If the table is missing or damaged: another checksum, numbers that do not increase,
-        or a row that does not fit the table.
+        If the table is missing or damaged. A table is damaged if its checksum is wrong, if job
+        numbers do not increase, or if a row does not match the header.
     """
     with ExitStack() as stack:
         with explained(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
@@ -297,7 +306,7 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
 
 
 def _column_of(name: str) -> str:
-    """Return the name of the column of a varied value."""
+    """Return the column name of a varied value."""
     ambiguous = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
     return f"{_VARIED}{name}" if ambiguous else name
 
@@ -305,7 +314,7 @@ def _column_of(name: str) -> str:
 def _columns(
     names: Sequence[str], jobs: Iterable[JobRow]
 ) -> tuple[list[int], dict[str, set[type]]]:
-    """Return the classes in the rows, and the types of each varied value."""
+    """Return all classes that occur in the rows, and the types of each varied value."""
     classes: set[int] = set()
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
@@ -322,7 +331,7 @@ def _columns(
 
 
 def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
-    """Yield the cells of a row of jobs.csv."""
+    """Yield the cells of a job's row in jobs.csv."""
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
@@ -338,10 +347,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
 
 
 def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
-    """Return the job of a row of jobs.csv.
-
-    Raises ValueError for an invalid row.
-    """
+    """Parse a row of jobs.csv. Raises ValueError if the row is invalid."""
     if len(cells) != len(header):
         raise ValueError(f"the row has {len(cells)} cells, but the header has {len(header)}")
     first = len(_HEAD)
@@ -364,9 +370,9 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
 
 
 def _with_plain_names(row: JobRow) -> JobRow:
-    """Return a row that was read. Its name and split are parts of names of files.
+    """Return the row if its name and split are plain file names, otherwise raise ValueError.
 
-    Raises ValueError if one of them would lead elsewhere.
+    Both are used as parts of file names, so other values could lead outside the data set.
     """
     for kind, text in (("name", row.name), ("split", row.split)):
         if text and not is_plain(text):
@@ -377,7 +383,7 @@ def _with_plain_names(row: JobRow) -> JobRow:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value of NumPy as an object of Python."""
+    """Convert a NumPy scalar to a Python object. Other values are returned unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -395,20 +401,23 @@ def _kind(value: Any) -> type:
 
 
 def _written(value: Any) -> str:
-    """Return a cell for a varied value, which is read back with its type; empty for None."""
+    """Return the cell of a varied value, from which the value can be read back with its type.
+
+    The cell is empty for None.
+    """
     if value is None:
         return ""
     plain = _plain(value)
     if not isinstance(plain, str):
         return json.dumps(plain)
-    # Quotes as well for letters that a line of a file cannot show or hold.
+    # Text with unprintable characters, such as line breaks, is also quoted.
     if plain and plain.isprintable() and _parsed(plain) == plain:
         return _shielded(plain)
     return json.dumps(plain)
 
 
 def _shielded(text: str) -> str:
-    """Return text that no spreadsheet runs as a formula.
+    """Return text that no spreadsheet interprets as a formula.
 
     Examples
     --------
@@ -419,18 +428,18 @@ def _shielded(text: str) -> str:
 
 
 def _unshielded(text: str) -> str:
-    """Return the text before `_shielded`."""
+    """Reverse `_shielded`."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
 def _read(text: str) -> Value:
-    """Return the varied value of a cell."""
+    """Return the varied value in a cell."""
     plain = _unshielded(text)
     return _parsed(text) if plain == text else plain
 
 
 def _parsed(text: str) -> Value:
-    """Return the value that a text is as JSON, else the text."""
+    """Parse a JSON scalar, or return the text unchanged if it is not a JSON scalar."""
     try:
         value = json.loads(text) if text.lstrip()[:1] not in "[{" else text
     except ValueError:
@@ -445,7 +454,10 @@ def _write_parquet(
     kinds: Mapping[str, set[type]],
     rows: Iterator[JobRow],
 ) -> None:
-    """Write jobs.parquet. A varied value that is text in any row is text in all rows."""
+    """Write jobs.parquet.
+
+    If a varied value is a string in any row, it is stored as a string in all rows.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -468,7 +480,7 @@ def _write_parquet(
         value = getattr(row, name) if name not in columns else row.values.get(columns[name])
         if value is None or types[name] != pa.string():
             plain = _plain(value)
-            # An older pyarrow refuses whole numbers beyond 2^53 as floats.
+            # Older versions of pyarrow refuse to convert integers above 2^53 to floats.
             return float(plain) if types[name] == pa.float64() and value is not None else plain
         text = value if isinstance(value, str) else json.dumps(_plain(value))
         return text.encode("utf-8", _ESCAPED).decode()

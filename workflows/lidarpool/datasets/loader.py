@@ -1,4 +1,4 @@
-"""Reads data sets of many jobs, sweep by sweep, for training."""
+"""Read data sets of many jobs, sweep by sweep, for training."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import sweep_of_job
 
-_REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
-_OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
+_REQUESTS = 8  # number of sweeps read concurrently from a URL or disk
+_OPEN_JOBS = 16  # number of jobs that each thread keeps open, with their poses, boxes and files
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Consecutive sweeps in a job's `Sweeps`, of a single sensor."""
+    """Consecutive sweeps of one sensor within a job's `Sweeps`."""
 
     job: JobRow
     first: int
@@ -52,11 +52,11 @@ class _Run:
 
 
 class SavedSweeps:
-    """A sequence of the sweeps in a data set, which `sweeps` returns.
+    """The sequence of sweeps in a data set, which `sweeps` returns.
 
-    Items are read on access. A loop reads the next items ahead in threads. Items can be accessed
-    from several threads, from forked processes, and from processes with a pickled copy. `classes`
-    contains the names of semantic classes as {number: name}.
+    Items are read when they are accessed, and iteration prefetches the next items in background
+    threads. Items can be accessed from several threads, from forked processes, and from processes
+    with a pickled copy. `classes` contains the names of semantic classes as {number: name}.
     """
 
     classes: Mapping[int, str]
@@ -86,11 +86,11 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps with these indices in order, and read the next ones in advance."""
+        """Yield the sweeps with these indices in order, and prefetch the next ones."""
         cloud_format = self._dataset.spec.cloud_format
         is_local = self._dataset.storage.is_local
         if is_local and cloud_format.raw_sweeps:
-            # Handing such a sweep from thread to thread takes as long as reading it.
+            # Passing such a sweep between threads would take as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
             for job, number in islice(upcoming, _REQUESTS):
                 job.prefetch(number)
@@ -99,7 +99,8 @@ class SavedSweeps:
                     next_job.prefetch(sweep)
                 yield job.read(number)
             return
-        # At a URL each request takes long. A job with one file for all sweeps is opened once.
+        # Requests to a URL are slow, so they run in parallel. With a single thread, a job that
+        # stores all its sweeps in one file is opened only once.
         threads = _REQUESTS if cloud_format.separate_sweeps and not is_local else 1
         coming: deque[Future[Sweep]] = deque()
         with ThreadPoolExecutor(threads, "sweeps") as pool:
@@ -113,19 +114,20 @@ class SavedSweeps:
             finally:
                 for task in coming:
                     task.cancel()
-                with suppress(RuntimeError):  # while the program ends, threads take no tasks
+                with suppress(RuntimeError):  # the pool rejects tasks at interpreter shutdown
                     pool.submit(self._close)
 
     def __getitem__(self, index: int) -> Sweep:
         """Read a sweep.
 
-        LidarError if a file is missing or damaged; IndexError for an unknown sweep.
+        Raises LidarError if a file is missing or damaged, and IndexError if the sweep does not
+        exist.
         """
         job, number = self._locate(index)
         return job.read(number)
 
     def _locate(self, index: int) -> tuple[_OpenJob, int]:
-        """Return the opened job of a sweep, and the number of the sweep in that job."""
+        """Return the open job that contains a sweep, and the index of the sweep in this job."""
         position = operator.index(index)
         position += len(self) if position < 0 else 0
         if not 0 <= position < len(self):
@@ -176,9 +178,9 @@ class SavedSweeps:
         self._local.__dict__.clear()
 
     def _opened(self, job: JobRow) -> _OpenJob:
-        """Return a job, opened in this thread."""
+        """Return a job opened in this thread, from the cache if possible."""
         local = self._local
-        if getattr(local, "process", None) != os.getpid():  # a fork shares the positions of files
+        if getattr(local, "process", None) != os.getpid():  # forked processes share file offsets
             local.process = os.getpid()
             local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
@@ -191,7 +193,7 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """Poses, boxes and reader of a job whose sweeps are read."""
+    """Poses, boxes and reader of an open job."""
 
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage
@@ -222,10 +224,9 @@ class _OpenJob:
         self.reader.prefetch(self.cloud_format.sweep_files(self.reader, sweep))
 
     def read(self, sweep: int) -> Sweep:
-        """Read a sweep."""
         try:
             points = self.cloud_format.read_sweep(self.reader, sweep)
-        except Exception as error:  # libraries of five formats raise many kinds of errors
+        except Exception as error:  # the libraries of five formats raise many types of errors
             file = self.reader.last_file or self.cloud_format.sweep_files(self.reader, sweep)[0]
             file = self.storage.path(file)
             raise _unreadable(file, error) from error
@@ -303,9 +304,9 @@ def sweeps(
 
 
 def read_index(storage: Storage) -> dict[str, Any]:
-    """Read the index of a data set, with jobs by number.
+    """Read the index of a data set. Its field `jobs` maps job numbers to sweep counts by sensor.
 
-    Raises LidarError if the set is unfinished.
+    Raises LidarError if the data set is missing, unfinished or damaged.
     """
     check_exists(storage, "specify the output folder of a campaign")
     try:
@@ -345,7 +346,7 @@ def _chosen(
     jobs: Sequence[int | str] | None,
     storage: Storage,
 ) -> list[JobRow]:
-    """Return the jobs of these splits, and with these numbers or names."""
+    """Return the rows of the jobs that belong to one of the splits and are among `jobs`."""
     if split is not None:
         splits = [split] if isinstance(split, str) else list(split)
         _check_known("split", splits, dict.fromkeys(row.split for row in rows), storage)
@@ -382,10 +383,11 @@ def _check_known(label: str, requested: Sequence[str], available: Any, storage: 
 
 
 def _unreadable(file: str, error: Exception) -> LidarError:
-    """Return the error for a file that is missing or damaged, in a line."""
+    """Return the one-line error for a file that is missing or damaged."""
     if isinstance(error, LidarError):
         return error
-    if isinstance(error, OSError) and (error.strerror or error.__cause__):  # the latter of a URL
+    # Errors of remote storages have a cause instead of `strerror`.
+    if isinstance(error, OSError) and (error.strerror or error.__cause__):
         return LidarError(f"{file} cannot be read: {error.strerror or error}.")
     reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")[:120]
     return LidarError(

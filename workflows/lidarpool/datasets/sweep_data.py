@@ -1,4 +1,4 @@
-"""Sweeps of jobs, made of the points that are read from a data set or received from a stream."""
+"""Create the sweeps of a job from points that were read from a file or received from a stream."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ def sweep_of_job(
     boxes: Boxes | None,
     index: int | EllipsisType = ...,
 ) -> Sweep:
-    """Return the sweep of a number in `sweeps` with its points, in the frame at its start.
+    """Return one sweep of a job with its points, in the sensor frame at the start of the sweep.
 
-    `boxes` are of the sweep, or of several sweeps with the `index` of the sweep.
+    `number` is the index of the sweep in `sweeps`. `boxes` contains either the boxes of this sweep
+    only, or the boxes of several sweeps. In the latter case, `index` is the index of this sweep in
+    `boxes`.
     """
     positions, columns = points
     return Sweep(

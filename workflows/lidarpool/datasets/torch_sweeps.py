@@ -1,6 +1,7 @@
-"""Sweeps for PyTorch.
+"""PyTorch data sets of sweeps.
 
-Imported by `torch()` of sweeps alone, since torch may not be installed.
+This module is imported only when a `torch` method is called, because torch is an optional
+dependency.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from lidarsim.columns.sweep import Sweep
 
 
 class ReadSweeps(Protocol):
-    """Sweeps that can be read by index, such as the sweeps of a data set."""
+    """Sweeps that can be read by index, such as the sweeps in a data set."""
 
     def __len__(self) -> int: ...
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps of these indices, in this order."""
+        """Yield the sweeps with these indices in order, and prefetch the next ones."""
         ...
 
 
 class JobStream(Protocol):
-    """Sweeps of jobs of a campaign, in the order of jobs."""
+    """Sweeps of the jobs of a campaign, ordered by job."""
 
     @property
     def numbers(self) -> Sequence[int]:
@@ -44,7 +45,7 @@ class JobStream(Protocol):
 
 
 class TorchSweeps(torch.utils.data.IterableDataset):
-    """Items made of sweeps, divided between ranks, then between the workers of each."""
+    """Iterable data set of stored sweeps, divided among ranks and the workers of each rank."""
 
     def __init__(
         self, sweeps: ReadSweeps, transform: Callable[[Sweep], Any] | None, even: bool
@@ -55,11 +56,11 @@ class TorchSweeps(torch.utils.data.IterableDataset):
         self._rank: tuple[int, int] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Workers that are spawned do not know their rank; this is called as they start.
+        # Spawned workers do not know their rank, so it is stored when the object is pickled.
         return self.__dict__ | {"_rank": self._rank or _ranks()}
 
     def _share(self) -> range:
-        """Return the indices of the sweeps of this rank."""
+        """Return the indices of the sweeps that this rank reads."""
         rank, ranks = self._rank or _ranks()
         count = len(self.sweeps)
         return range(rank, count - count % ranks if self.even else count, ranks)
@@ -71,7 +72,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 
 
 class TorchStream(torch.utils.data.IterableDataset):
-    """Items made of the sweeps of a `SweepStream`, whose jobs are divided between ranks."""
+    """Iterable data set of the sweeps in a `SweepStream`, whose jobs are divided among ranks."""
 
     def __init__(self, stream: JobStream, transform: Callable[[Sweep], Any] | None) -> None:
         self.stream = stream
@@ -99,7 +100,7 @@ def _ranks() -> tuple[int, int]:
 
 
 def tensors(sweep: Sweep) -> dict[str, Any]:
-    """Return a sweep as a dict of tensors (`SavedSweeps.torch`)."""
+    """Convert a sweep to a dictionary of tensors, as described in `SavedSweeps.torch`."""
     boxes = sweep.boxes
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array

@@ -1,4 +1,4 @@
-"""Path planning: particle swarms search for a short path around discs in the plane."""
+"""Path planning: particle swarms that search for a short 2D path around discs."""
 
 from .planning import Planning
 from .tangents import shortest_path_length

@@ -1,9 +1,10 @@
-"""Cost of a path: its length, and a penalty for entering discs that exceeds any short cut.
+"""Cost of a path: its length, plus a penalty for entering discs that outweighs any shortcut.
 
-The cost is evaluated hundreds of thousands of times a second by one thread: single precision,
-particles along the last, contiguous axis, results in preallocated buffers. Only + - x / and square
-roots are used, and sums run over leading axes only, which fixes the order of additions: the same
-numbers on every machine.
+One thread evaluates the cost hundreds of thousands of times per second. Therefore values are in
+single precision, particles are along the last (contiguous) axis, and results are written to
+preallocated buffers. To obtain the same numbers on all machines, only additions, subtractions,
+multiplications, divisions and square roots are used, and sums run over leading axes only, which
+fixes the order of additions.
 """
 
 from __future__ import annotations
@@ -14,51 +15,56 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Floats32
 
-# Discs are made larger by this share of their distance and size: some 30 rounding errors of
-# single precision, so that a path which passes here also passes the exact check.
+# Discs are enlarged by this fraction of their distance and size, which is about 30 rounding errors
+# in single precision. A path that is collision-free here also passes the exact check.
 _MARGIN = 4e-6
 _SLOPE = 8.0  # penalty of a depth of 1; a waypoint 1 inside a disc shortens the path by < 2
 _TOUCH = np.float32(1e-5)  # penalty below which an entry is a rounding error, well under _MARGIN
-_TINY = np.float32(1e-15)  # added to steps, so that a step of length 0 has a direction too
-# Largest number of elements of a buffer, to limit the memory. Smaller blocks, which fit a
-# second-level cache, were slower: NumPy takes 0.7 µs to start each of some 35 operations.
+_TINY = np.float32(1e-15)  # added to segments, so that a segment of length 0 has a direction
+# Maximum number of elements in a buffer, to limit memory. Smaller blocks, which fit in the L2
+# cache, were slower, because NumPy takes 0.7 µs to start each of about 35 operations.
 _BLOCK_ELEMENTS = 160_000
-_BLOCK_DISCS = 16  # smallest number in a block; more particles make longer loops
+_BLOCK_DISCS = 16  # minimum number of discs in a block; more particles make longer loops
 
 
 class PathCost:
-    """The cost of many paths between the same two ends, in the coordinates of `PathAxes`.
+    """Cost of many paths between the same two end points, in the coordinates of `PathAxes`.
 
-    A path that enters no disc costs its length. A path that enters discs also costs more than the
-    longest detour around all discs, and `_SLOPE` to twice that for each unit of depth in each disc:
-    it never beats a free path, and its cost falls on the way out. The discs, (m, 2) and (m,), are
-    in the coordinates of `PathAxes`; each of the `particles` paths has `waypoints` corners between
-    the two ends.
+    The cost of a path that enters no disc is its length. Otherwise a penalty is added. Its fixed
+    part exceeds the length of the longest detour around all discs, so a path that enters a disc
+    never beats a collision-free path. Its variable part is between `_SLOPE` and 2 `_SLOPE` times
+    the depth in each disc, so the cost decreases toward the edge of a disc.
+
+    `centers` has shape (m, 2) and `radii` has shape (m,), both in the coordinates of `PathAxes`.
+    Each of the `particles` paths has `waypoints` corners between its end points.
     """
 
     def __init__(self, centers: Floats, radii: Floats, waypoints: int, particles: int) -> None:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
         self._points[0, 0] = -0.5
         self._points[-1, 0] = 0.5
-        # (waypoints, 2, particles), contiguous. Write to it, then call `evaluate`.
+        # Shape (waypoints, 2, particles), contiguous. Write positions here, then call `evaluate`.
         self.waypoints: Floats32 = self._points[1:-1]
-        # The fixed part of the penalty for entering discs.
-        # The boundaries of all discs together are at least as long as any path around them.
+        # Fixed part of the penalty for entering discs. The total circumference of all discs is an
+        # upper bound for the length of a detour along their boundaries.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
         self._cost = np.empty(particles, np.float32)
         pairs = min(len(radii), _BLOCK_DISCS) * (waypoints + 1) * particles
         blocks = min(particles, max(1, -(-pairs // _BLOCK_ELEMENTS)))  # rounded up
         starts = [particles * block // blocks for block in range(blocks + 1)]
         self._blocks = [slice(*span) for span in itertools.pairwise(starts)]
-        # A workspace for each width, at most two: their loops run over whole, contiguous buffers,
-        # which is twice as fast as over parts of wider buffers.
+        # Blocks have at most two different widths, and each width has its own workspace. Loops over
+        # whole, contiguous buffers are twice as fast as loops over slices of wider buffers.
         self._workspaces = {
             width: _Workspace(centers, _enlarged_radii(centers, radii), waypoints + 1, width)
             for width in {block.stop - block.start for block in self._blocks}
         }
 
     def evaluate(self) -> Floats32:
-        """Return the costs (particles,) of `waypoints`, the same buffer at every call."""
+        """Return the cost of each path in `waypoints`, with shape (particles,).
+
+        Every call returns the same buffer.
+        """
         for block in self._blocks:
             workspace = self._workspaces[block.stop - block.start]
             workspace.evaluate(self._points[..., block], self._cost[block], self.entry_price)
@@ -66,7 +72,10 @@ class PathCost:
 
 
 def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
-    """Return radii with a margin for rounding, which does not reach either end of the path."""
+    """Return radii with a margin for rounding errors.
+
+    The enlarged discs do not contain the end points of the path.
+    """
     distance = np.sqrt(centers[:, 0] ** 2 + centers[:, 1] ** 2)
     end_distances = [np.sqrt((centers[:, 0] - x) ** 2 + centers[:, 1] ** 2) for x in (-0.5, 0.5)]
     nearest = np.maximum(np.minimum(*end_distances), radii)
@@ -74,16 +83,17 @@ def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
 
 
 class _Workspace:
-    """Buffers for a block of paths and a block of discs, and the arithmetic on these buffers.
+    """Buffers for a block of paths and a block of discs, and the computations that use them.
 
-    For a segment with unit direction e, middle M and half length h, and a disc around C, let
-    u = (C - M) · e and c = (C - M) x e. The point of the segment closest to C is
-    √(c² + max(|u| - h, 0)²) away. All lengths are doubled here (2C, 2M = the sum of both ends,
-    2h = the length), which saves the halving; max(|u| - h, 0) = |u| - min(|u|, h), since NumPy
-    has a vectorized minimum of two arrays, and none of an array and a number.
+    For a segment with unit direction e, midpoint M and half length h, and a disc with center C, let
+    u = (C - M) · e and c = (C - M) x e. The distance from C to the closest point of the segment is
+    √(c² + max(|u| - h, 0)²). All lengths are doubled here to avoid halving: 2C is used for C, the
+    sum of both end points for 2M, and the segment length for 2h. The term max(|u| - h, 0) is
+    computed as |u| - min(|u|, h), because NumPy vectorizes the minimum of two arrays, but not the
+    minimum of an array and a scalar.
 
-    Axes are (disc, segment, particle): the last two of each factor are contiguous, so that a
-    product with a disc's coordinate is one long loop.
+    Axes are (disc, segment, particle). The last two axes of each operand are contiguous, so that a
+    product with a disc's coordinate runs as one long loop.
     """
 
     def __init__(self, centers: Floats, radii: Floats, segments: int, width: int) -> None:
@@ -108,13 +118,16 @@ class _Workspace:
         self._parallel, self._perpendicular, self._scratch = (
             singles(discs, segments, width) for _ in range(3)
         )
-        self._prices = singles(1 + discs, width)  # prices of all blocks before, and of each disc
+        self._prices = singles(1 + discs, width)  # sum of all earlier blocks, then each disc
         self._price = singles(width)
         self._entered = np.empty(width, np.bool_)
-        self._zeros = np.zeros(width, np.float32)  # zeros as an array (see the class)
+        self._zeros = np.zeros(width, np.float32)  # an array, for speed (see the class docstring)
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
-        """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
+        """Write the cost of each path to `cost`, with shape (width,).
+
+        `points` contains the points of the paths, including their ends. Shape (k + 2, 2, width).
+        """
         direction = self._direction
         products = self._products
         length = self._length
@@ -145,7 +158,7 @@ class _Workspace:
         np.add(cost, price, out=cost)
 
     def _add_price(self, discs: slice) -> None:
-        """Add to `_price` the penalty for entering the discs of a block."""
+        """Add the penalty for entering a block of discs to `_price`."""
         x = self._x[discs]
         y = self._y[discs]
         squared_radii = self._squared_radii[discs]
@@ -178,5 +191,6 @@ class _Workspace:
         np.subtract(squared_radii, nearest, out=nearest)
         np.multiply(nearest, self._weights[discs], out=nearest)
         np.maximum(nearest, self._zeros, out=nearest)
-        prices[0] = self._price  # added in the order of the discs, whatever the blocks
+        # The order of additions is the order of the discs, regardless of the block size.
+        prices[0] = self._price
         np.add.reduce(prices, axis=0, out=self._price)

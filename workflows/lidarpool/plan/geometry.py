@@ -1,4 +1,4 @@
-"""Segments against discs in the plane, exactly, and normalized coordinates for planning."""
+"""Exact distances between segments and discs in the plane, and normalized planning coordinates."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from lidarsim.base.arrays import Floats
 
 
 def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
-    """Return the distance of every segment to every center.
+    """Return the distance from each center to the closest point of each segment.
 
-    Segments (s, 2) and (s, 2), which may be single points, and centers (m, 2): the distance from
-    each center to the closest point of each segment is (s, m).
+    `first` and `last` contain the end points of the segments and have shape (s, 2). A segment may
+    be a single point. `centers` has shape (m, 2), and the result has shape (s, m).
     """
     direction = last - first
     squared = direction[:, 0] ** 2 + direction[:, 1] ** 2
     to_center = centers[None, :, :] - first[:, None, :]
     reach = to_center[..., 0] * direction[:, None, 0] + to_center[..., 1] * direction[:, None, 1]
-    # A segment of length 0 has reach 0: whatever the divisor, its point is closest.
+    # A segment of length 0 has a reach of 0, so any nonzero divisor selects its only point.
     share = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
     gap_x = to_center[..., 0] - share * direction[:, None, 0]
     gap_y = to_center[..., 1] - share * direction[:, None, 1]
@@ -27,17 +27,18 @@ def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
 
 
 def path_length(points: Floats) -> float:
-    """Return the length of the path through `points`, (p, 2)."""
+    """Return the length of the polyline through `points`, which have shape (p, 2)."""
     steps = np.diff(points, axis=0)
-    # Not np.sum, whose order of additions varies: the length is the same on any machine.
+    # The order of additions in np.sum varies between machines; Python's sum is reproducible.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
 def clearance(points: Floats, centers: Floats, radii: Floats) -> float:
-    """Return the smallest distance from the path through `points`, (p, 2), to the edge of a disc.
+    """Return the minimum distance from a path to the edge of a disc.
 
-    The distance is negative if the path enters a disc, by its greatest depth; 0 if the path touches
-    a disc; inf without discs. Discs are (m, 2) and (m,).
+    The path is the polyline through `points`, with shape (p, 2). Discs have `centers` of shape (m,
+    2) and `radii` of shape (m,). If the path enters a disc, the result is negative, and its
+    magnitude is the largest depth. Without discs, the result is inf.
     """
     if not len(radii):
         return float("inf")
@@ -45,11 +46,13 @@ def clearance(points: Floats, centers: Floats, radii: Floats) -> float:
 
 
 class PathAxes:
-    """Axes that let the path start at (-½, 0) and end at (½, 0), two different points.
+    """Axes in which the path starts at (-½, 0) and ends at (½, 0).
 
-    The swarm computes in single precision and with fixed distances; in these axes neither
-    georeferenced coordinates nor the size of the scene matter. Only + - x / and square roots are
-    used, whose rounding IEEE 754 defines: the same numbers on every machine.
+    The swarm computes in single precision and uses fixed distances. In these axes, its results
+    depend neither on the size of georeferenced coordinates nor on the size of the scene. Start and
+    target must differ. Only additions, subtractions, multiplications, divisions and square roots
+    are used, because IEEE 754 defines their rounding. Thus the numbers are the same on all
+    machines.
     """
 
     def __init__(self, start: tuple[float, float], target: tuple[float, float]) -> None:
@@ -60,13 +63,13 @@ class PathAxes:
         self._middle = (np.array(start) + np.array(target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points of the plane, (p, 2), to these axes."""
+        """Convert points in the plane to these axes. Both arrays have shape (p, 2)."""
         cos, sin = self._axis
         x, y = (points - self._middle).T / self.unit_m
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
-        """Convert points on these axes, (p, 2), to the plane."""
+        """Convert points in these axes to the plane. Both arrays have shape (p, 2)."""
         cos, sin = self._axis
         x, y = points.T * self.unit_m
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle

@@ -1,4 +1,4 @@
-"""A planning problem: two end points, discs, and the effort of the search."""
+"""A planning problem: two end points, the discs to avoid, and the search effort."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .geometry import segment_distances
 class Search:
     """Effort of a search by particle swarms.
 
-    With more waypoints, a path can go around more discs. The time is proportional to the number of
-    waypoints, and the swarms converge more slowly.
+    With more waypoints, a path can go around more discs. The run time is proportional to the number
+    of waypoints, and the swarms converge more slowly.
     """
 
     trials: Annotated[
@@ -110,7 +110,7 @@ class Planning(Search):
 def _checked(
     name: str, value: ArrayLike, fits: Callable[[Floats], bool], requirement: str
 ) -> Floats:
-    """Convert `value` to a new array of finite numbers, or raise LidarError."""
+    """Convert `value` to a new array, or raise LidarError unless it is finite and `fits`."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -123,7 +123,7 @@ def _checked(
 def _check_outside(
     end_points: dict[str, tuple[float, float]], centers: Floats, radii: Floats
 ) -> None:
-    """Raise LidarError if an end of the path, {name: x and y}, lies in a disc."""
+    """Raise LidarError if an end point of the path lies inside a disc."""
     for name, end in end_points.items():
         point = np.array([end])
         within = np.flatnonzero(segment_distances(point, point, centers)[0] < radii)

@@ -1,4 +1,4 @@
-"""Stations of a terrestrial scan: positions that let a sensor see most surfaces."""
+"""Plan the stations of a terrestrial scan, from which a sensor sees as much surface as possible."""
 
 from __future__ import annotations
 
@@ -25,43 +25,46 @@ from raybeam import RayCaster
 from ..base.neighbors import nearest_neighbors
 
 MAX_STATIONS = 100
-MIN_GAIN = 0.01  # share of the reachable area that each adds, if no number or coverage is given
-_CANDIDATES = 600  # about this number, in a scene without obstacles
+MIN_GAIN = 0.01  # minimum fraction of the reachable area per station by default
+_CANDIDATES = 600  # approximate number of candidates in a scene without obstacles
 _MAX_CANDIDATES = 50_000
 _MIN_SPACING_M = 0.5
-# Samples by area, and the smallest number for an object of few.
+# Number of surface samples, which are distributed by area, and minimum number for each object.
 _POINTS = 20_000
 _OBJECT_POINTS = 60
-_CLEARANCE_M = 0.3  # no surface is nearer to the instrument, nor this close above it
-_STEP_M = 0.2  # lower surfaces are stepped on
+_CLEARANCE_M = 0.3  # minimum distance of the instrument from any surface
+_STEP_M = 0.2  # maximum height of surfaces that an operator can step on
 _FOOT_M = 0.01  # a ray that starts at this height above the floor does not hit the floor
-_SPHERE_RAYS = 128  # rays in all directions from a candidate
-_SECTORS = 36  # a sensor that turns has rays in all of these
+_SPHERE_RAYS = 128  # number of rays in all directions from each candidate
+_SECTORS = 36  # azimuth sectors, all of which contain rays if the sensor scans the full circle
 
 
-class Sight:
-    """Visibility of surfaces from a station: within range and field of view, and not hidden.
+class StationVisibility:
+    """Visibility of surfaces from a station.
 
-    The sensor's lowest and highest rays limit the field of view, `slant_deg` the angle of
-    incidence, from the normal of a surface. Actors are left out. LidarError if the sensor does not
-    look all around.
+    A surface is visible if it is within the sensor's range and field of view, and not occluded. The
+    field of view extends from the lowest to the highest ray of the sensor. `slant_deg` is the
+    maximum angle of incidence, measured from the surface normal. Actors are ignored. Raises
+    LidarError if the sensor does not scan the full circle.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
         self.sensor = sensor
         self.slant_deg = slant_deg
         self.caster = RayCaster(scene.vertices, scene.faces)
-        # Single precision of ray casters, and of points in pictures.
+        # Tolerance for the single precision of the ray caster and of points in pictures.
         self._slack = max(2e-3, 2e-5 * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))))
         lowest, highest = sensor_elevations(sensor)
         self._lowest = lowest - 1e-9
         self._highest = highest + 1e-9
 
-    def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
-        """Return the visible sides of surfaces at points (n, 3) from a station (3,): int8 (n,).
+    def visible_sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
+        """Return which side of the surface at each point is visible from a station.
 
-        Positions are local, in meters. The points are on triangles of the scene, with unit normals
-        (n, 3). 1 is the side that the normal points to, -1 the opposite side, 0 a hidden point.
+        `station` has shape (3,), `points` and the unit vectors `normals` have shape (n, 3).
+        Positions are local, in meters, and points lie on triangles of the scene. The result has
+        shape (n,). It is 1 for the side that the normal points to, -1 for the opposite side, and 0
+        if the point is not visible.
         """
         offsets = points - station
         distance_m = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
@@ -90,7 +93,7 @@ def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
     """
     head = sensor.head
     revolution = math.ceil(head.firings_per_turn) if isinstance(head, Spin) else sensor.period
-    revolution = revolution or 20_000  # firings of a head that never repeats
+    revolution = revolution or 20_000  # number of firings if the scan pattern never repeats
     count = min(revolution, max(4 * _SECTORS, 20_000 // sensor.channels))
     firings = np.linspace(0, revolution, count, endpoint=False).astype(np.int64)
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
@@ -105,10 +108,11 @@ def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class StationPlan:
-    """Stations in the order of their choice, and the area that they cover.
+    """Stations in the order in which they were chosen, and the area that they cover.
 
-    Coverage is the share of the reachable area: the sides of surfaces of the targets that at least
-    one candidate sees, within the range, the field of view and the angle of incidence.
+    The reachable area consists of all sides of target surfaces that at least one candidate sees
+    within the range, the field of view and the maximum angle of incidence. Coverage is the fraction
+    of the reachable area that the stations see.
     """
 
     stations: Floats  # (s, 3) world meters
@@ -120,14 +124,14 @@ class StationPlan:
     reachable_m2: Floats  # (objects,) area of targets that candidates see
     covered_m2: Floats  # (objects,) area of targets that the stations see
     scene: Scene  # the planned scene: all triangles, without instances and actors
-    sight: Sight
+    sight: StationVisibility
 
 
 @dataclass(frozen=True, eq=False)
 class SurveyCoverage:
-    """The area that stations see, and how much of it a cloud has points on.
+    """The area that stations see, and the part of it where a cloud has points.
 
-    Areas are of the sides of surfaces of the targets; the sides of a thin wall count separately.
+    Areas count the sides of target surfaces. The two sides of a thin wall count separately.
     """
 
     targets: Bools  # (objects,) whether the area of an object counts
@@ -149,35 +153,37 @@ def plan_stations(
 ) -> StationPlan:
     """Choose stations for a terrestrial scan.
 
-    Candidates stand on a grid, on the lowest floor, where there is room for the instrument
-    (`candidates`). The candidate that adds most area comes next.
+    Candidates are positions on a horizontal grid above the lowest floor, where the instrument has
+    enough space (see `candidates`). In each step, the candidate that adds the largest visible area
+    is chosen.
 
     Parameters
     ----------
     scene
-        Scene to scan; actors are ignored.
+        Scene to scan. Actors are ignored.
     sensor
-        The instrument, upright. Its range and field of view count.
+        The instrument, in upright position. Its range and field of view are taken into account.
     targets
         Names of the objects to cover, or patterns with * and ?. Other objects only occlude. By
         default, all objects are covered.
     count
-        Number of stations; fewer if these already see everything.
+        Maximum number of stations. Fewer are chosen if they cover the entire reachable area.
     coverage
-        Instead of `count`: share of the area of targets that any candidate sees, in (0, 1]. With
-        neither, stations are chosen for as long as each adds 1 %. There are at most 100 stations.
+        Fraction of the reachable area to cover, in (0, 1]. It cannot be combined with `count`. If
+        neither is given, stations are added as long as each one adds at least 1 %. The maximum
+        number of stations is 100.
     height_m
-        Of the instrument above the floor, meters.
+        Height of the instrument above the floor in meters.
     spacing_m
-        Of the candidates, meters; by default such that there are about 600.
+        Spacing of the candidates in meters. By default, there are about 600 candidates.
     slant_deg
-        Largest angle of incidence, degrees from the normal, in (0, 90].
+        Maximum angle of incidence, in degrees from the surface normal, in (0, 90].
 
     Raises
     ------
     LidarError
-        If a value is out of range, a target fits no object, the sensor does not look all around,
-        or no candidate stands on a floor or sees a surface of a target.
+        If a value is out of range, if a target matches no object, if the sensor does not scan the
+        full circle, or if no candidate position exists or sees a target.
 
     Examples
     --------
@@ -198,9 +204,9 @@ def plan_stations(
         check_number("spacing_m", spacing_m, gt=0, le=1e6)
     check_number("height_m", height_m, gt=0, le=1e6)
     check_number("slant_deg", slant_deg, gt=0, le=90)
-    is_target = _target_mask(scene.names, targets)  # a wrong name is reported at once
+    is_target = _target_mask(scene.names, targets)  # first, to report wrong names immediately
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
-    sight = Sight(scene, sensor, slant_deg)
+    sight = StationVisibility(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
     positions = candidates(scene, sight.caster, height_m, spacing_m)
@@ -240,29 +246,31 @@ def survey_coverage(
     within_m: float = 0.1,
     slant_deg: float = 80.0,
 ) -> SurveyCoverage:
-    """Compare what stations see with the points of a cloud.
+    """Compare the area that stations see with the points of a cloud.
 
     Parameters
     ----------
     scene
-        The scene that was scanned; actors are ignored.
+        The scanned scene. Actors are ignored.
     sensor
-        The instrument, upright. Its range and field of view count.
+        The instrument, in upright position. Its range and field of view are taken into account.
     positions
-        The stations (s, 3), world meters.
+        Positions of the stations in world coordinates, in meters. Shape (s, 3).
     clouds
-        Points (n, 3) each, world meters, which are held in memory one by one.
+        Points in world coordinates, in meters. Each array has shape (n, 3), and only one is in
+        memory at a time.
     targets
-        Names of the objects whose area counts, or patterns with * and ?; by default all objects.
+        Names of the objects whose area counts, or patterns with * and ?. By default, all objects
+        count.
     within_m
-        Surface within this distance of a point is covered, meters.
+        Maximum distance in meters between a surface sample and a point that covers it.
     slant_deg
-        Largest angle of incidence that counts as seen, degrees from the normal.
+        Maximum angle of incidence at which a surface counts as visible, in degrees from its normal.
 
     Raises
     ------
     LidarError
-        If a target fits no object, or the sensor does not look all around.
+        If a target matches no object, or if the sensor does not scan the full circle.
 
     Examples
     --------
@@ -278,7 +286,7 @@ def survey_coverage(
     """
     is_target = _target_mask(scene.names, targets)
     scene = SimplifiedScene.from_scene(scene).scene
-    sight = Sight(scene, sensor, slant_deg)
+    sight = StationVisibility(scene, sensor, slant_deg)
     samples = _sample_surfaces(scene, is_target)
     has_point = np.zeros(len(samples.points), np.bool_)
     for points in clouds:
@@ -287,7 +295,7 @@ def survey_coverage(
             distance_m, _ = nearest_neighbors(samples.points[missing], points - scene.origin)
             has_point[missing] = distance_m <= within_m
     sides = np.stack(
-        [sight.sides(p, samples.points, samples.normals) for p in positions - scene.origin]
+        [sight.visible_sides(p, samples.points, samples.normals) for p in positions - scene.origin]
     )
     reachable_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
     objects = len(scene.names)
@@ -300,7 +308,7 @@ def survey_coverage(
 
 
 def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
-    """Return whether objects (n,) are targets: all without `targets`, names or patterns."""
+    """Return a mask of the objects that match a target. Without targets, all objects match."""
     mask = np.full(len(names), not targets)
     for pattern in targets:
         rows = rows_named(pattern, names)
@@ -313,17 +321,19 @@ def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
 
 
 class _Visibility(NamedTuple):
-    """Sides of surfaces at points that a candidate sees."""
+    """Surface sides that are visible from at least one candidate."""
 
     visible: Bools  # (c, n), whether a candidate sees a side
     owner: Ints  # (n,), objects of the sides
     area_m2: Floats  # (n,), area that a side stands for
 
 
-def _visibility(samples: _SurfaceSamples, sight: Sight, positions: Floats) -> _Visibility:
-    """Return the sides of surfaces that candidates at local positions (c, 3) see."""
-    sides = np.stack([sight.sides(p, samples.points, samples.normals) for p in positions])
-    # Each side of a surface counts by itself: of a thin wall, the side in each room.
+def _visibility(
+    samples: _SurfaceSamples, sight: StationVisibility, positions: Floats
+) -> _Visibility:
+    """Return the sides of the surface samples that candidates at local `positions` see."""
+    sides = np.stack([sight.visible_sides(p, samples.points, samples.normals) for p in positions])
+    # Each side of a surface counts separately, because a thin wall has a side in each room.
     visible = np.concatenate([sides > 0, sides < 0], axis=1)
     columns = np.flatnonzero(visible.any(axis=0))
     owner = np.tile(samples.owner, 2)[columns]
@@ -331,7 +341,7 @@ def _visibility(samples: _SurfaceSamples, sight: Sight, positions: Floats) -> _V
 
 
 class _Choice(NamedTuple):
-    """Chosen rows of `_Visibility`, in order."""
+    """Chosen rows of `_Visibility`, in order of choice."""
 
     row_indices: list[int]
     shares: list[float]  # shares of the area, covered after each row
@@ -341,10 +351,10 @@ class _Choice(NamedTuple):
 def _choose_rows(
     visibility: _Visibility, max_rows: int, max_share: float, min_gain: float
 ) -> _Choice:
-    """Choose candidates by the area they add, the largest gain first.
+    """Choose candidates greedily by the area that each one adds.
 
-    The choice ends with `max_rows`, when `max_share` of the area is covered, or before a candidate
-    adds less than the share `min_gain`.
+    Stops after `max_rows` candidates, when the fraction `max_share` of the area is covered, or when
+    the next candidate would add less than the fraction `min_gain`.
     """
     visible = visibility.visible
     area = visibility.area_m2 / visibility.area_m2.sum()
@@ -368,7 +378,7 @@ def _choose_rows(
 
 
 def _default_spacing_m(scene: Scene) -> float:
-    """Return a round spacing of candidates for the scene's ground, meters."""
+    """Return a round spacing of candidates in meters that suits the size of the scene."""
     width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
     spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
     power = 10.0 ** math.floor(math.log10(spacing))
@@ -376,17 +386,17 @@ def _default_spacing_m(scene: Scene) -> float:
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return local positions (c, 3), meters, where an instrument can stand, on a grid.
+    """Return grid positions where an instrument can be set up, in local meters, with shape (c, 3).
 
-    The floor is the lowest surface, or the top of a slab if that is lowest. Floors that are
-    reached only by a climb of more than 45 degrees, such as eaves without ground below, are
-    left out; so are positions with a surface within 0.3 m of the instrument, or between the
-    instrument and the floor, and positions inside objects.
+    The floor is the lowest surface. If the lowest surface is the underside of a slab, the floor is
+    the top of the slab. Excluded are floors that can be reached only by a slope of more than 45°,
+    such as eaves without ground below, positions with a surface within 0.3 m of the instrument or
+    between the instrument and the floor, and positions inside objects.
 
     Raises
     ------
     LidarError
-        If no position fits, or the grid is too fine.
+        If no position is suitable, or if the grid has too many positions.
     """
     positions, shape = _grid_positions(scene, spacing_m)
     floor = _floor_heights(scene, caster, positions)
@@ -412,7 +422,7 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
 
 
 def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, int]]:
-    """Return local positions (c, 3) on a grid over a scene, and the grid's shape along x and y."""
+    """Return local positions on a grid over the scene, and the grid's shape along x and y."""
     lower, upper = scene.bounds
     columns, rows = np.maximum((upper - lower)[:2] / spacing_m, 1).astype(int).tolist()
     if columns * rows > _MAX_CANDIDATES:
@@ -430,20 +440,20 @@ def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, 
 
 
 def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats:
-    """Return the heights (c,) of the floor at x and y of positions, infinite without a floor."""
+    """Return the height of the floor at each position, or infinity where there is no floor."""
     origins = positions.copy()
     up = np.tile([0.0, 0.0, 1.0], (len(origins), 1))
     origins[:, 2] = scene.bounds[0, 2] - 1
     lowest = caster.cast(origins, up)
     floor: Floats = origins[:, 2] + lowest.distance
     hit_rays = np.flatnonzero(lowest.hit)
-    # A surface that faces down is the underside of a slab, if a surface is close above.
+    # A surface that faces down is the underside of a slab if there is another surface just above.
     a, b, c = scene.vertices[scene.faces[lowest.triangle[hit_rays]]].swapaxes(0, 1)
     undersides = hit_rays[np.cross(b - a, c - a)[:, 2] < 0]
     origins[:, 2] = floor
     above = caster.cast(origins[undersides], up[undersides], t_min=_FOOT_M, t_max=SLAB_M).distance
     floor[undersides] += np.where(np.isfinite(above), above, 0.0)
-    # Kerbs and pavements are stepped on.
+    # Instruments can be set up on low steps such as curbs and sidewalks.
     origins[hit_rays, 2] = floor[hit_rays] + _STEP_M
     below = caster.cast(origins[hit_rays], -up[hit_rays], t_max=_STEP_M).distance
     floor[hit_rays] += np.where(np.isfinite(below), _STEP_M - below, 0.0)
@@ -451,8 +461,10 @@ def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats
 
 
 def _largest_level(floor: Floats, spacing_m: float) -> Bools:
-    """Return the largest connected part of floors (k, m) on a grid without steep climbs."""
-    # Heights are infinite without a floor.
+    """Return a mask of the largest connected floor on a grid without steep slopes.
+
+    `floor` contains the height of each grid position, which is infinite if there is no floor.
+    """
     group = np.full(floor.shape, -1)
     sizes: list[int] = []
     for first_cell in zip(*np.nonzero(np.isfinite(floor)), strict=True):
@@ -477,13 +489,15 @@ def _largest_level(floor: Floats, spacing_m: float) -> Bools:
 
 
 def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
-    """Return the indices of positions (c, 3) with room around, and not inside an object.
+    """Return the indices of positions with free space around them that are not inside an object.
 
-    Inside an object most rays above the horizon meet back faces. A hall that is modeled by its
-    outside is not such an object: most positions are inside.
+    A position is considered to be inside an object if most of its rays above the horizon hit back
+    faces of the object. This does not apply to objects that contain most positions, such as a hall
+    that is modeled by its outer surface.
     """
     n = np.arange(_SPHERE_RAYS)
-    z = 1 - (2 * n + 1) / _SPHERE_RAYS  # evenly spread over the sphere, by the golden angle
+    # Directions are evenly distributed over the sphere by the golden angle.
+    z = 1 - (2 * n + 1) / _SPHERE_RAYS
     azimuths = np.pi * (3 - 5**0.5) * n
     level = np.sqrt(1 - z * z)
     rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), z], axis=1)
@@ -504,13 +518,13 @@ def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
 
 
 def _object_areas(scene: Scene, is_target: Bools) -> Floats:
-    """Return the areas of the objects (n,), 0 for those that are no targets."""
+    """Return the area of each object, which is 0 for objects that are not targets."""
     areas = triangle_areas(scene.vertices[scene.faces])
     return np.where(is_target, np.bincount(scene.face_object, areas, len(scene.names)), 0.0)
 
 
 class _SurfaceSamples(NamedTuple):
-    """Points on the surfaces of a scene."""
+    """Sample points on the surfaces of a scene."""
 
     points: Floats  # (n, 3), local meters
     normals: Floats  # (n, 3), of length 1
@@ -519,9 +533,9 @@ class _SurfaceSamples(NamedTuple):
 
 
 def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
-    """Return points evenly spread by area within each target, the same at every call.
+    """Return sample points that are evenly distributed by area within each target.
 
-    `is_target` is a mask of the objects.
+    The samples are reproducible. `is_target` is a mask of the objects.
     """
     order = np.argsort(scene.face_object, kind="stable")
     order = order[is_target[scene.face_object[order]]]
@@ -537,7 +551,8 @@ def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
     a, b = np.sort(rng.random((2, len(triangle))), axis=0)[..., None]
     sides = corners[triangle].swapaxes(0, 1)
     points = a * sides[0] + (b - a) * sides[1] + (1 - b) * sides[2]
-    # Rounding may give a point to the last triangle of the object before, or without area.
+    # Due to rounding, a point may lie on the last triangle of the previous object, or on a triangle
+    # without area.
     owner = scene.face_object[order][triangle].astype(np.int64)
     units = normals[triangle] / np.where(doubled > 0, doubled, 1.0)[triangle, None]
     return _SurfaceSamples(points, units, owner, (areas / np.maximum(counts, 1))[owner])
@@ -546,7 +561,7 @@ def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
 def _sample_triangles(
     rng: np.random.Generator, face_areas: Floats, areas: Floats, counts: Ints
 ) -> Ints:
-    """Draw triangles (n,) by their areas, `counts` for each object, sorted by object."""
+    """Draw `counts` triangles for each object in proportion to their areas, sorted by object."""
     owner = np.repeat(np.arange(len(counts)), counts)
     nth = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     offsets = (nth + rng.random(len(owner))) / counts[owner] * areas[owner]

@@ -1,10 +1,10 @@
-"""The shortest path around discs, exactly, through the graph of their tangents.
+"""Exact length of the shortest path around discs, from the graph of their tangents.
 
-A shortest path in the plane around discs consists of straight pieces that touch discs and of arcs
-along them (a taut string). So it is a shortest path of the graph
-whose nodes are the points of contact of all common tangents, and whose edges are the tangents
-that no disc blocks and the arcs between neighboring contacts: the tangent visibility graph of
-Pocchiola and Vegter (1996), here without their sweep, every tangent against every disc.
+Like a taut string, a shortest path around discs consists of straight segments that touch discs and
+of arcs along their edges. It is therefore a shortest path in a graph. The nodes are the contact
+points of all common tangents, and the edges are the unblocked tangents and the arcs between
+adjacent contact points. This is the tangent visibility graph of Pocchiola and Vegter (1996).
+Instead of their sweep algorithm, every tangent is tested against every disc.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from lidarsim.base.arrays import Floats, Indices
 
 from .geometry import PathAxes, segment_distances
 
-# A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one
-# common tangent are usual in constructed scenes, and rounding must not close the path.
+# Tangents may enter a disc by this fraction of the scene size. Constructed scenes often contain
+# three discs with a common tangent, and rounding errors must not block such a path.
 _TOLERANCE = 1e-10
 _TANGENTS_AT_ONCE = 4096  # limit for scenes with many discs, to bound the memory of the check
 
@@ -29,9 +29,10 @@ Graph = dict[int, list[tuple[int, float]]]  # {node: [(neighbor, length of the e
 
 
 class _Tangents(NamedTuple):
-    """Common tangents.
+    """Common tangents of pairs of circles.
 
-    Tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and so on.
+    Tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and circle `circles[t, 1]` at
+    `contacts[t, 1]`.
     """
 
     circles: Indices  # (t, 2)
@@ -43,18 +44,27 @@ def shortest_path_length(
 ) -> float:
     """Return the length of the shortest path from `start` to `target` that enters no disc.
 
-    Discs may overlap, touch and contain one another; a path may touch a disc's edge.
+    Discs may overlap, touch or contain one another, and the path may touch the edge of a disc. The
+    length is inf if the discs separate the target from the start, or if a disc contains either
+    point.
 
-    Centers are (m, 2), and radii above 0 (m,); m may be 0. The length is inf if discs separate
-    target and start, or contain one of the two.
+    Parameters
+    ----------
+    start, target
+        x and y of the end points of the path.
+    centers
+        Centers of the discs. Shape (m, 2), where m may be 0.
+    radii
+        Radii of the discs, greater than 0. Shape (m,).
 
     Notes
     -----
-    A path no longer than some limit stays within an ellipse about its ends, and so meets only
-    the discs that reach into the ellipse. At first the limit is the straight line; where the path
-    around the discs in question is longer than the limit, so is the path around all, and the
-    limit is raised. With k discs in question in the end it takes some k³ distance checks. Of
-    thousands of discs these are few, unless discs bar the way and the path leads far around.
+    A path no longer than a given limit stays within an ellipse whose foci are its end points, and
+    can meet only the discs that reach into this ellipse. The initial limit is the straight-line
+    distance. If the shortest path around the selected discs is longer than the limit, so is the
+    path around all discs, and the limit is raised. With k discs selected in the end, the method
+    needs about k³ distance checks. Even with thousands of discs k is small, unless discs block the
+    way and require a long detour.
 
     Examples
     --------
@@ -69,8 +79,8 @@ def shortest_path_length(
     end_points = np.asarray([start, target], float)
     size = float(np.ptp(np.vstack([end_points, centers_]), axis=0).max() + radii_.max(initial=0.0))
     tolerance = _TOLERANCE * size
-    # A path by way of a disc is at least as long as by way of the square around the disc: by the
-    # corner or side of the square that is nearest to the straight line and its middle.
+    # A path that touches a disc is at least as long as a path to the square around the disc. The
+    # closest point of the square to the straight line and to its midpoint gives a lower bound.
     axes = PathAxes(start, target)
     beside = np.abs(axes.to_local(centers_)) * axes.unit_m - radii_[:, None]
     x, y = np.maximum(beside, 0.0).T
@@ -82,14 +92,14 @@ def shortest_path_length(
         length = _length_around(end_points, centers_[in_question], radii_[in_question], tolerance)
         if np.isinf(length) or not (bounds[~in_question] <= length + tolerance).any():
             return length
-        # At least a quarter more of them, lest a long wall be examined disc by disc.
+        # Add at least a quarter of the discs, so that a long wall is not examined disc by disc.
         next_bound = min(int(in_question.sum() * 1.25) + 1, len(bounds)) - 1
         limit = max(length, float(sorted_bounds[next_bound]))
 
 
 def _length_around(end_points: Floats, centers: Floats, radii: Floats, tolerance: float) -> float:
-    """Return the length of the shortest path between two ends (2, 2) around discs."""
-    # The two ends are circles without radius, numbers 0 and 1.
+    """Return the length of the shortest path around discs between two end points."""
+    # The end points are circles 0 and 1, with radius 0.
     circles = np.vstack([end_points, centers])
     widths = np.concatenate([[0.0, 0.0], radii])
     tangents = _free_tangents(_all_tangents(circles, widths), circles, widths, tolerance)
@@ -97,7 +107,7 @@ def _length_around(end_points: Floats, centers: Floats, radii: Floats, tolerance
 
 
 def _remove_nested(centers: Floats, radii: Floats) -> tuple[Floats, Floats]:
-    """Return the discs that lie in no larger disc."""
+    """Return the discs that are not contained in a larger disc."""
     order = np.argsort(-radii, kind="stable")
     outermost: list[int] = []
     for disc in order:
@@ -108,12 +118,12 @@ def _remove_nested(centers: Floats, radii: Floats) -> tuple[Floats, Floats]:
 
 
 def _all_tangents(centers: Floats, radii: Floats) -> _Tangents:
-    """Return the common tangents of every two circles.
+    """Return the common tangents of every pair of circles.
 
     The line {x: n·x = c} touches circle i at center_i + side_i · radius_i · n. Two circles share
-    it when n · (center_j - center_i) = side_i · radius_i - side_j · radius_j, which for given
-    sides has two solutions n, mirror images in the line of centers. Turning n and both sides
-    around gives the same line, so side_i = 1 is enough.
+    the line if n · (center_j - center_i) = side_i · radius_i - side_j · radius_j. For given sides,
+    this equation has two solutions n, which are mirror images about the line through the centers.
+    Reversing n and both sides yields the same line, so it suffices to consider side_i = 1.
     """
     i, j = np.triu_indices(len(radii), k=1)
     between = centers[j] - centers[i]
@@ -121,8 +131,8 @@ def _all_tangents(centers: Floats, radii: Floats) -> _Tangents:
     circles = []
     contacts = []
     for side in (1.0, -1.0):
-        # Equality is a point on a circle's edge, or two circles that touch; rounding may not
-        # tell them apart. Side -1 of a point is its side 1 over again.
+        # Equality means that a point lies on a circle, or that two circles touch. The tolerance
+        # includes these cases despite rounding errors. Both sides of a point are the same.
         fits = distance * (1 + _TOLERANCE) >= np.abs(radii[i] - side * radii[j])
         fits &= (distance > 0) & ((radii[j] > 0) | (side > 0))
         first = i[fits]
@@ -160,10 +170,7 @@ def _free_tangents(
 
 
 def _graph(tangents: _Tangents, centers: Floats, radii: Floats) -> Graph:
-    """Return the graph of tangents and arcs.
-
-    Nodes 0 and 1 are start and target.
-    """
+    """Return the graph of tangents and arcs. Nodes 0 and 1 are the start and the target."""
     graph: Graph = defaultdict(list)
 
     def connect(node: int, neighbor: int, length: float) -> None:
@@ -192,11 +199,12 @@ def _graph(tangents: _Tangents, centers: Floats, radii: Floats) -> Graph:
 def _open_arcs(
     angles: Floats, circle: int, centers: Floats, radii: Floats
 ) -> list[tuple[int, int, float]]:
-    """Return the arcs of `circle` between neighbors of the sorted `angles` that no disc blocks.
+    """Return the arcs of `circle` between adjacent contact points that no disc blocks.
 
-    Arcs are indices of two angles, and the angle between them. A contact lies in no other disc, so
-    a disc that overlaps the circle covers a stretch between two contacts: the arc that holds the
-    middle of the stretch is blocked.
+    `angles` contains the sorted angles of the contact points. Each arc is returned as the indices
+    of its two angles, and the angle between them. A contact point never lies inside another disc,
+    so a disc that overlaps the circle covers an interval between two contact points. The arc that
+    contains the center of this interval is blocked.
     """
     if len(angles) < 2:
         return []
@@ -206,7 +214,8 @@ def _open_arcs(
     overlaps[:2] = False
     middles = np.arctan2(gaps[overlaps, 1], gaps[overlaps, 0])
     blocked = np.zeros(len(angles), bool)
-    blocked[np.searchsorted(angles, middles) - 1] = True  # before the first: the last arc, -1
+    # The index -1 is correct: an angle before the first contact point lies on the last arc.
+    blocked[np.searchsorted(angles, middles) - 1] = True
     arc_angles = np.diff(angles, append=angles[0] + 2 * np.pi)
     return [
         (arc, (arc + 1) % len(angles), float(arc_angles[arc]))

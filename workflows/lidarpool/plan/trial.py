@@ -1,4 +1,4 @@
-"""A trial, which runs a swarm on any worker, and the plan, which is the best of the trials."""
+"""A trial runs one particle swarm on any worker, and the plan is the best of all trials."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from .tangents import shortest_path_length
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Result of a particle swarm.
+    """Result of one particle swarm.
 
-    The same `Planning` and number give the same trial, to the bit, except for `seconds`.
+    The same `Planning` and trial index produce the same trial, bit for bit, except for `seconds`.
     """
 
-    trial: int  # its number, from 0
-    seed: int  # seed of its random numbers
-    length: float  # length of the path, meters
-    waypoints: Floats  # (k, 2): corners of the path between its two ends, meters
-    collision_free: bool  # whether the path enters no disc, by the exact check
+    trial: int  # index, from 0
+    seed: int  # seed of the random numbers
+    length: float  # length of the path in meters
+    waypoints: Floats  # (k, 2): corners of the path between its end points, in meters
+    collision_free: bool  # whether the path enters no disc, according to the exact check
     seconds: float = field(compare=False)  # duration of the trial
 
 
 def run_trial(planning: Planning, trial: int) -> Trial:
-    """Search for a path with a particle swarm.
+    """Search for a path with one particle swarm.
 
-    A pure function on one thread: the result depends on `planning` and the number of the trial
-    alone, not on the worker or its other tasks.
+    The result depends only on `planning` and the trial index, and not on the worker or its other
+    tasks. The search uses one thread.
     """
     started = time.perf_counter()
-    # Independent of the seeds of all other trials.
+    # The spawn key makes the seed independent of the seeds of all other trials.
     sequence = np.random.SeedSequence(entropy=planning.seed, spawn_key=(trial,))
     seed = int(sequence.generate_state(1, np.uint64)[0])
     axes = PathAxes(planning.start, planning.target)
@@ -61,18 +61,19 @@ def run_trial(planning: Planning, trial: int) -> Trial:
 
 
 def with_ends(planning: Planning, waypoints: Floats) -> Floats:
-    """Return the whole path, (k + 2, 2): start, waypoints, target."""
+    """Return the complete path of start, waypoints and target, with shape (k + 2, 2)."""
     return np.vstack([planning.start, waypoints, planning.target])
 
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
-    """Return the swarm of `planning`, spread as widely as a path around the discs may reach."""
+    """Return the swarm for `planning`, spread as widely as a path around the discs may require."""
     centers = axes.to_local(planning.centers)
     radii = planning.radii / axes.unit_m
     cost = PathCost(centers, radii, planning.waypoints, planning.particles)
     line = np.array([[-0.5, 0.0], [0.5, 0.0]])
     edges = segment_distances(line[:1], line[1:], centers)[0] + radii
-    # No path worth having leaves the line by more than half its length.
+    # A path deviates from the line by at most half its length, and a path longer than the fixed
+    # penalty is useless.
     widest = min(float(edges.max(initial=0.0)), cost.entry_price / 2)
     return Swarm(cost, widest, Randoms(seed))
 
@@ -122,16 +123,17 @@ class Plan:
 
 
 def best(trials: Iterable[Trial], planning: Planning) -> Plan:
-    """Return the best path of `trials`: the shortest that enters no disc.
+    """Return the shortest collision-free path of all trials.
 
-    Each path is checked again, segment by segment against each disc. If no path is free of
-    collisions, the path with the smallest depth in discs is chosen, with `collision_free` False.
-    The order of `trials` does not matter; of equal paths the lowest number wins.
+    Each path is checked again, segment by segment, against every disc. If no path is
+    collision-free, the path with the smallest depth in a disc is returned, and its `collision_free`
+    is False. The order of `trials` does not matter. Ties are resolved in favor of the lowest trial
+    index.
 
     Raises
     ------
     LidarError
-        Without trials.
+        If `trials` is empty.
     """
     ranked = []
     for trial in trials:

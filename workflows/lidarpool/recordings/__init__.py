@@ -1,1 +1,1 @@
-"""Clouds and recordings of lidarpool and of other programs, read sweep by sweep."""
+"""Reading of clouds and recordings in any supported format, sweep by sweep."""

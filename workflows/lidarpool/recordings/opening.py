@@ -1,4 +1,4 @@
-"""Opens clouds and recordings of lidarpool and other programs, which are read sweep by sweep."""
+"""Open clouds and recordings in any supported format, to be read sweep by sweep."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ KINDS = (
     ".asc, .csv, .pts, .ptx, .npy, .bin (KITTI, nuScenes), .pcap, .pcapng (Velodyne, Ouster) or "
     ".osf file, a ROS 2 bag, or a folder in KITTI, nuScenes, WebDataset or range image format"
 )
-_CONVERSIONS = {  # {extension of files that are not supported: advice}
+_CONVERSIONS = {  # {extension of an unsupported format: advice}
     ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
     ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
     ".rrd": "It is a Rerun recording. Open it with the `rerun` command.",
     ".osi": "It is an OSI trace. Use it as the traffic of a scenario.",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
 }
-# Extensions of files whose unit can be chosen.
+# Extensions of files for which the user can set the unit.
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))
 
 
 class UnknownFormatError(LidarError):
     """The format of a file or folder is not supported.
 
-    `advice` is a remedy in sentences, or an empty string.
+    `advice` contains sentences that suggest a remedy. It may be empty.
     """
 
     def __init__(self, name: str, advice: str) -> None:
@@ -47,12 +47,12 @@ class UnknownFormatError(LidarError):
 
 
 def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
-    """Open the recordings of all sensors or topics, {name: recording}.
+    """Open the recordings of all sensors or topics as {name: recording}.
 
-    A single sensor has an empty name. If there are several sequences with different world frames,
-    only the first one is opened.
+    The name is empty if there is only one sensor. If the source contains several sequences, which
+    have different world frames, only the first sequence is opened.
 
-    Raises LidarError as `open_recording`.
+    Raises the same errors as `open_recording`.
     """
     opened = partial(open_recording, source, keep_noise=keep_noise)
     try:
@@ -79,24 +79,24 @@ def open_recording(
     unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a recording or cloud in any format, which is read sweep by sweep.
+    """Open a recording or cloud in any format, to be read sweep by sweep.
 
     Parameters
     ----------
     source
-        File or folder of a recording, a result or a data set, or a cloud in memory. Clouds have
-        sweeps if they belong to a result.
+        File or folder of a recording, a result or a data set, or a cloud in memory. A cloud in
+        memory has sweeps only if it belongs to a result.
     sensor
         Name of the sensor, or topic in a bag. Required if there are several.
     intensity
         Column that contains the intensities. The default is ``intensity``.
     name
-        Name for messages, if the source is a cloud in memory.
+        Name used in messages if the source is a cloud in memory.
     unit
-        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file, which overrides the
-        unit that the file states. By default, files that state no unit are in meters.
+        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file. Overrides the unit
+        stated in the file. By default, files without a unit are read as meters.
     keep_noise
-        Whether to include points that a file withholds or classifies as noise.
+        Whether to include points that the file marks as withheld or classifies as noise.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def open_recording(
     ------
     LidarError
         If the source does not exist or is not supported, if it contains several sensors and none is
-        chosen, or if its coordinate system distorts lengths.
+        selected, or if its coordinate system distorts lengths.
     """
     if unit is not None:
         check_choice("unit", unit, UNITS_M)
@@ -128,7 +128,6 @@ def open_recording(
 
 
 def _open_path(source: RecordingSource) -> Recording:
-    """Open a file or folder."""
     path = source.path
     if not path.exists():
         raise MissingFileError(f"{source.name} does not exist. Specify {KINDS}.")
@@ -143,6 +142,5 @@ def _open_path(source: RecordingSource) -> Recording:
 
 
 def _open_data_set(source: RecordingSource) -> Recording:
-    """Open the sweeps of a data set."""
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
     return source.recording(len(saved), saved.__getitem__, compensated=True, noise_classes=None)

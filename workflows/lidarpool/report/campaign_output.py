@@ -387,7 +387,7 @@ def _check_jobs(
     # {name and hash of a file: jobs made of it}
     jobs_of_file: dict[tuple[str, str], list[str]] = {}
     with explained(f"{dataset.storage} cannot be read"):
-        for row, (manifest, difference) in dataset.look(rows, contents=contents):
+        for row, (manifest, difference) in dataset.check_jobs(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
                 share = f" in total and this run is shard {campaign.shard}"
                 share *= campaign.shard != ALL

@@ -16,7 +16,7 @@ from lidarsim.base.storage import Storage
 from lidarview.render.picture_page import Page
 
 from ..clouds.folder import LAST_FILE
-from ..datasets.figures import Figures
+from ..datasets.figures import DataSetStatistics
 from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
 from ..run.run_result import CampaignRun
@@ -85,7 +85,7 @@ def write_card(
     ):
         storage.remove([LAST_FILE])
         rows = writing_seconds(storage, _with_splits(storage, jobs))
-        figures = Figures(campaign["names"], rows)
+        figures = DataSetStatistics(campaign["names"], rows)
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
         for name, drawing in drawn.items():
@@ -136,7 +136,10 @@ def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
 
 
 def campaign_report(
-    campaign: Mapping[str, Any], run: CampaignRun, versions: Mapping[str, str], figures: Figures
+    campaign: Mapping[str, Any],
+    run: CampaignRun,
+    versions: Mapping[str, str],
+    figures: DataSetStatistics,
 ) -> dict[str, Any]:
     """Return the figures of a data set, as in report.json."""
     return {
@@ -159,14 +162,16 @@ def campaign_report(
             "run": round(run.seconds, 3),
             "casting": round(float(np.nansum(figures.per_job("seconds"))), 3),
         },
-        "of_a_job": {name: figures.spread(name) for name in ("points", "rays", "hits", "seconds")},
+        "of_a_job": {
+            name: figures.percentiles(name) for name in ("points", "rays", "hits", "seconds")
+        },
         "splits": {
             name: {key: counts[key] for key in ("jobs", "sweeps", "points")}
             for name, counts in figures.splits.items()
         },
         "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
         **({"class_names": dict(run.classes)} if run.classes else {}),
-        "varied": list(figures.described()),
+        "varied": list(figures.summaries()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],
         "stages": stage_figures(run.stages),

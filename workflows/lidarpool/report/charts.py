@@ -19,7 +19,7 @@ from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
-from ..datasets.figures import Figures, Varied
+from ..datasets.figures import DataSetStatistics, VariedQuantity
 from .page.rendering import NARROW
 
 WIDTH = 1600
@@ -52,7 +52,7 @@ SWEEP_SHARE = 0.97  # share of the points that are within the drawing
 MAX_VALUES = 4  # limit for named values
 
 
-def draw_varied(figures: Figures) -> Page | None:
+def draw_varied(figures: DataSetStatistics) -> Page | None:
     """Draw a histogram of each varied quantity above a plot of the points of jobs by value.
 
     Jobs have the colors of the quantity of few labels whose groups differ most in points. None
@@ -61,7 +61,7 @@ def draw_varied(figures: Figures) -> Page | None:
     drawable = [varied for varied in figures.varied if len(varied.known_values)]
     if not drawable:
         return None
-    scales = [varied.folded() for varied in drawable[:MAX_VARIED]]
+    scales = [varied.merge_rare_labels() for varied in drawable[:MAX_VARIED]]
     layout = _Layout.for_scales(scales)
     page = Page((WIDTH, layout.page_height))
     points = figures.per_job("points")
@@ -96,12 +96,12 @@ class _Layout(NamedTuple):
     row_height: int
 
     @classmethod
-    def for_scales(cls, scales: Sequence[Varied]) -> _Layout:
+    def for_scales(cls, scales: Sequence[VariedQuantity]) -> _Layout:
         """Lay out two charts for each quantity."""
         rows = -(-len(scales) // MAX_COLUMNS)
         columns = -(-len(scales) // rows)
         width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (columns - 1)) / columns
-        is_slanted = any(scale.slanted(width) for scale in scales)
+        is_slanted = any(scale.needs_slanted_labels(width) for scale in scales)
         label_height = LABEL_HEIGHT + SLANTED_HEIGHT * is_slanted
         return cls(rows, columns, width, COUNTS_HEIGHT + GAP + DOTS_HEIGHT + label_height)
 
@@ -120,7 +120,7 @@ class _Layout(NamedTuple):
         return upper, lower
 
     def label_charts(
-        self, page: Page, number: int, scale: Varied, upper: Axes, lower: Axes
+        self, page: Page, number: int, scale: VariedQuantity, upper: Axes, lower: Axes
     ) -> None:
         """Label the axes of the charts of a quantity, and write its name above."""
         is_first = number % self.column_count == 0
@@ -135,7 +135,7 @@ class _Layout(NamedTuple):
         page.heading(upper, name, weight="bold", pad=4 * page.unit)
 
 
-def _dot_colors(informative: Varied | None, count: int) -> Floats:
+def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
     """Return the colors (jobs, 3) of dots, by the labels of a quantity, if any."""
     colors = np.tile(theme.rgb(DOT), (count, 1))
     if informative is not None:
@@ -145,7 +145,7 @@ def _dot_colors(informative: Varied | None, count: int) -> Floats:
     return colors
 
 
-def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
+def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hidden: int) -> str:
     """Return a sentence about colors, failures and the number of hidden quantities."""
     remarks = []
     if informative is not None:
@@ -160,7 +160,9 @@ def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) -> Varied | None:
+def _most_informative(
+    scales: Sequence[VariedQuantity], points: Floats, is_done: Bools
+) -> VariedQuantity | None:
     """Return the quantity of few labels whose groups differ most in points, or None without any."""
     variances = {}  # {quantity: variance of the means of its groups}
     for scale in scales:
@@ -172,27 +174,29 @@ def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) 
     return max(variances, key=lambda scale: variances[scale], default=None)
 
 
-def draw_results(figures: Figures) -> Page | None:
+def draw_results(figures: DataSetStatistics) -> Page | None:
     """Draw how points and hits are distributed over jobs, or None if no job is done."""
     is_done = ~figures.failures
     points, rays, hits = (figures.per_job(name)[is_done] for name in ("points", "rays", "hits"))
     with np.errstate(invalid="ignore"):
         quantities = (
-            Varied("points per job", points),
-            Varied("rays that hit, %", 100 * hits / rays),
+            VariedQuantity("points per job", points),
+            VariedQuantity("rays that hit, %", 100 * hits / rays),
         )
     return _draw_distributions(quantities, "Results", "Number of jobs by points and by hits")
 
 
-def draw_times(figures: Figures) -> Page | None:
+def draw_times(figures: DataSetStatistics) -> Page | None:
     """Draw how casting times are distributed over jobs, or None if none is known."""
     seconds = figures.per_job("seconds")[~figures.failures]
     seconds = seconds[np.isfinite(seconds)]
-    quantity = Varied("casting time per job (all tasks), s", seconds)
+    quantity = VariedQuantity("casting time per job (all tasks), s", seconds)
     return _draw_distributions((quantity,), "Casting time", "Number of jobs by casting time")
 
 
-def _draw_distributions(quantities: Sequence[Varied], title: str, caption: str) -> Page | None:
+def _draw_distributions(
+    quantities: Sequence[VariedQuantity], title: str, caption: str
+) -> Page | None:
     """Draw the numbers of jobs by quantities, side by side, or None without any job."""
     if not len(quantities[0].values):
         return None
@@ -237,7 +241,7 @@ def _tick(value: float, _: object = None) -> str:
     return f"{value:,.6g}"
 
 
-def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colors: Iterable[Any]) -> None:
+def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Iterable[Any]) -> None:
     """Draw a histogram with bars in `colors`, behind a histogram of failed jobs."""
     bar_width = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
     edges = scale.edges.tolist()
@@ -250,7 +254,7 @@ def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colors: Iterable[An
 
 
 def _draw_points(
-    page: Page, axes: Axes, scale: Varied, points: Floats, failures: Bools, colors: Floats
+    page: Page, axes: Axes, scale: VariedQuantity, points: Floats, failures: Bools, colors: Floats
 ) -> None:
     """Draw a dot for each job, in `colors` (jobs, 3), with failed jobs at the bottom."""
     unit = page.unit
@@ -290,7 +294,12 @@ def _draw_points(
 
 
 def _draw_percentiles(
-    axes: Axes, scale: Varied, x: Floats, points: Floats, done_jobs: Indices, line_width: float
+    axes: Axes,
+    scale: VariedQuantity,
+    x: Floats,
+    points: Floats,
+    done_jobs: Indices,
+    line_width: float,
 ) -> None:
     """Draw the percentiles of points (jobs,) of jobs with the same label, or similar x (jobs,).
 
@@ -350,14 +359,14 @@ def _limits(points: Floats) -> tuple[float, float]:
     return 0.0, 1.06 * max(upper, 1.0)
 
 
-def _set_labels(page: Page, axes: Axes, scale: Varied, width: float) -> None:
+def _set_labels(page: Page, axes: Axes, scale: VariedQuantity, width: float) -> None:
     """Set the limits of the axis of values, and name its bins or numbers."""
     axis = axes.xaxis
     lower, upper = scale.edges[[0, -1]].tolist()
     if scale.labels:
         axes.set_xlim(lower, upper)
         style: dict[str, Any] = {"parse_math": False, "fontsize": 6.8 * page.unit, "family": FONT}
-        if scale.slanted(width):
+        if scale.needs_slanted_labels(width):
             style |= {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
         axis.set_ticks(range(len(scale.labels)), scale.short_labels, **style)
         return

@@ -222,7 +222,7 @@ def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -
             if rows:
                 assert points.cells is not None, "of points"
                 writer.append(name, rows, points.cells)
-                points.tell(rows)
+                points.report(rows)
         return writer.finish()
 
 
@@ -292,7 +292,7 @@ class GrowingCloud:
         told_count = 0
         while self._thread.is_alive():
             self._thread.join(_LOOK_EVERY_S)
-            points.tell(self._appended_rows - told_count)
+            points.report(self._appended_rows - told_count)
             told_count = self._appended_rows
         writer = self._writer
         # On a network disk without locks, another run may have removed the file.

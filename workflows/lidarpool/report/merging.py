@@ -430,7 +430,7 @@ def _take_jobs(
     shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
 ) -> Iterator[JobRow]:
     """Copy the jobs of a shard folder, yield their rows, and add files to `damaged`."""
-    for _, row, wrong in dataset.take(
+    for _, row, wrong in dataset.copy_jobs(
         shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
     ):
         damaged += [wrong] if wrong else []

@@ -339,7 +339,7 @@ def _shown_points(result: RunResult, file: str, show: WritingProgress) -> Stored
         show(file, read_count, count, "points")
 
     tell(0)
-    return replace(result.points, tell=tell)
+    return replace(result.points, report=tell)
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:

@@ -33,7 +33,7 @@ from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_sc
 from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
-from ..plan.stations import Sight, StationPlan
+from ..plan.stations import StationPlan, StationVisibility
 from .page.rendering import put_picture
 
 # small letters are illegible; a pixel takes 0.4 kB of memory
@@ -391,7 +391,7 @@ def _pixel_visibility(
     # The shot has moved the objects a little, so its rays must meet the moved triangles. The
     # normals of small triangles would turn: the plan's scene has them as they are. The normals
     # of samples do not serve, because they are smoothed for shading.
-    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
+    sight = StationVisibility(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
     a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
     face_normals = normalize(np.cross(b - a, c - a))
 
@@ -402,7 +402,7 @@ def _pixel_visibility(
         normals = np.where(facing_away[:, None], -normals, normals)
         hidden = np.arange(len(indices))
         for position in positions:
-            sides = sight.sides(position, points[hidden], normals[hidden])
+            sides = sight.visible_sides(position, points[hidden], normals[hidden])
             hidden = hidden[sides <= 0]
         return ~np.isin(np.arange(len(indices)), hidden)
 

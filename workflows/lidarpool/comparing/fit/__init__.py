@@ -1,4 +1,4 @@
-"""Fits a sensor to a recording: its sweeps in cells, surfaces, motion, statistics and charts."""
+"""Fitting of sensor models to recordings."""
 
 from .fitting import Fit, fit
 

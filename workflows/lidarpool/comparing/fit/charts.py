@@ -1,4 +1,4 @@
-"""Charts of a fit: curves and rings, with their intervals."""
+"""Charts of a fit: curves, and values by ring, with their confidence intervals."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .estimates import Estimate
 
 
 class _Chart(NamedTuple):
-    """Labels of a chart, and the factor from the values of figures to the unit of the y axis."""
+    """Axis labels of a chart, and the factor that converts values to the unit of the y axis."""
 
     x_label: str
     y_label: str
     factor: float
 
 
-# {curve, or column of channels: chart}, three charts a row
+# {curve or channel field: chart}. There are three charts in a row.
 _CHARTS = {
     "noise_by_range": _Chart("range, m", "noise, mm", 1000),
     "noise_by_light": _Chart("intensity or energy", "noise, mm", 1000),
@@ -37,7 +37,7 @@ _CHARTS = {
 
 
 def draw_charts(figures: Mapping[str, Any]) -> Page:
-    """Draw the curves and rings, with their intervals."""
+    """Draw all curves, and the values by ring, with their confidence intervals."""
     channels = figures["channels"]
     curves = dict(figures["curves"])
     for name in ("noise_m", "bias_m", "uneven_deg"):
@@ -59,7 +59,7 @@ def draw_charts(figures: Mapping[str, Any]) -> Page:
 
 
 def _draw_curve(page: Page, axes: Axes, name: str, points: Sequence[Mapping[str, float]]) -> None:
-    """Draw the points of a curve of `_CHARTS`, and their intervals."""
+    """Draw the points of the curve `name` (a key of `_CHARTS`) and their confidence intervals."""
     chart = _CHARTS[name]
     x = np.array([point["x"] for point in points])
     value, lower, upper = (

@@ -1,4 +1,4 @@
-"""Figures with their confidence intervals of 95 %."""
+"""Estimated values with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats, Ints
 
-MIN_RAYS = 30  # rays that a figure or a point of a curve needs
-_CONFIDENCE = 0.95  # probability of intervals
-_CONFIDENCE_SIGMAS = 1.959964  # half of the interval of a normal distribution
+MIN_RAYS = 30  # minimum number of rays for an estimate or a point of a curve
+_CONFIDENCE = 0.95  # confidence level of intervals
+_CONFIDENCE_SIGMAS = 1.959964  # half width of the interval of a normal distribution
 
 
 class Estimate(NamedTuple):
-    """A figure with its confidence interval."""
+    """An estimated value with its confidence interval."""
 
     value: float
     low: float
@@ -22,22 +22,23 @@ class Estimate(NamedTuple):
 
     @classmethod
     def from_variance(cls, value: Any, variance: Any) -> Estimate:
-        """Build the estimate of a normally distributed value with a variance."""
+        """Create the estimate of a normally distributed value from its variance."""
         half = _CONFIDENCE_SIGMAS
         return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -half, half)))
 
     @classmethod
     def from_values(cls, values: Floats) -> Estimate:
-        """Estimate the mean of values (n,)."""
+        """Estimate the mean of the values."""
         return cls.from_variance(values.mean(), values.var() / len(values))
 
     @classmethod
     def from_shares(cls, counts: Floats, totals: Ints) -> Estimate:
-        """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
+        """Estimate the ratio of the sum of `counts` to the sum of `totals`, such as a loss rate.
 
-        The interval follows Clopper and Pearson for the number of independent pulses whose
-        binomial variance is the variance of the share by the n parts, at most the sum of totals.
-        The interval is not empty if the share is 0.
+        Both arrays have shape (n,). The Clopper-Pearson interval is computed for an effective
+        number of independent pulses. For this number, the binomial variance equals the observed
+        variance of the ratio over the n entries. It is at most the sum of `totals`. The interval is
+        not empty even if the ratio is 0.
         """
         from scipy.stats import beta
 
@@ -56,19 +57,23 @@ class Estimate(NamedTuple):
         return cls(share, float(lower), float(upper))
 
     def is_within(self, share: float) -> bool:
-        """Return True if half of the interval is at most a share of the value."""
+        """Return True if half of the interval is at most the fraction `share` of the value."""
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of `scale` times a power, where negative numbers count as 0."""
+        """Return the estimate of `scale` times a power of the value.
+
+        Negative values are treated as 0.
+        """
         value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
         return Estimate(value, min(limits), max(limits))
 
 
 def sandwich(design: Floats, residuals: Floats, patch: Ints | None = None) -> Floats:
-    """Estimate the covariance of a least-squares fit whose residuals (k,) are of unequal size.
+    """Estimate the covariance of a least-squares fit whose residuals have unequal variances.
 
-    Residuals of one patch (k,), such as of a surface, may be alike.
+    `residuals` has shape (k,). If `patch` is given, residuals with the same patch number may be
+    correlated, for example because they belong to the same surface.
     """
     inverse = np.linalg.pinv(design.T @ design, hermitian=True)
     score = design * residuals[:, None]

@@ -1,7 +1,6 @@
-"""Fits the performance of a sensor to a recording, and writes a sensor file and its page.
+"""Fit the performance parameters of a sensor to a recording, and save a sensor file and a report.
 
-A figure is a number of the performance, such as the noise of ranges; intervals of figures are
-confidence intervals of 95 %. Arrays have the axes of `stack`.
+Confidence intervals have a level of 95 %. The axes of arrays are described in `stack`.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from ...report.page.rendering import rendered
 from .charts import draw_charts
 from .estimates import Estimate
 from .known_poses import KnownPoses
-from .measured import Measured, measure_moving, measure_standing
+from .measured import SensorMeasurement, measure_moving, measure_standing
 from .performance import has_frontal_rays
 from .stack import SweepStack, check_sweeps
 from .standstill import moving_message
@@ -52,12 +51,12 @@ class Fit:
         return rendered("fit.txt", report=self.figures).rstrip("\n")
 
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file and an .html page next to it, and return both paths.
+        """Write the sensor file, and an .html report next to it, and return both paths.
 
         Raises
         ------
         LidarError
-            If the file is not a .yaml file, or cannot be written.
+            If the file is not a .yaml file, or if it cannot be written.
         """
         model_path = Path(file)
         if model_path.suffix not in MODEL_FILES:
@@ -134,7 +133,7 @@ def fit(
         recording = open_recording(recording, sensor, intensity, name="the recording")
     check_sweeps(recording)
     loaded = Scene.load(scene) if isinstance(scene, str | Path) else scene
-    poses = KnownPoses.of_recording(recording, pose, loaded)
+    poses = KnownPoses.from_recording(recording, pose, loaded)
     speed = None if poses is None else poses.speed(recording)
     if poses is None or speed is None:
         measured = measure_standing(recording, white, loaded, poses)
@@ -152,8 +151,8 @@ def fit(
     return _fit_of(recording, measured, base)
 
 
-def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
-    """Return the fit of a sensor `base` to what was measured."""
+def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel) -> Fit:
+    """Create the fit of a sensor from the measured performance."""
     stack = measured.stack
     name = Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
@@ -180,7 +179,7 @@ def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
 
 
 def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    """Return True if each ring is near a beam of a model, or a calibration file has the beams."""
+    """Return True if each ring has a beam nearby, or if a calibration file defines the beams."""
     offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
     is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
     return model.needs_calibration or is_near
@@ -189,10 +188,10 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor with estimates in its performance.
+    """Return a sensor whose performance is updated with `SensorMeasurement.estimates`.
 
-    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise
-    go together: an estimate of one replaces all of these, and `precision`.
+    Parameters without an estimate keep their values. The parameters of range noise belong together:
+    an estimate of one of them replaces all of them, and `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()
@@ -210,7 +209,7 @@ def _with_performance(
 
 
 def recorded_sensor(stack: SweepStack) -> SensorModel:
-    """Return a sensor with the beams of a recording."""
+    """Return a sensor model with the beams of a recording."""
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "median angles of the recorded points"},

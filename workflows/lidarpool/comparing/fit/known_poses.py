@@ -1,4 +1,4 @@
-"""Poses of the sweeps of a recording that are known: by the recording, or by its user."""
+"""Known poses of the sweeps in a recording, from the recording itself or from the user."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, with_compared_columns
 from .standstill import Speed, sweep_period_ns
 
-_MAX_SWEEPS = 64  # whose poses are read
-# Poses of a sensor that stands differ by less: exact poses, and poses of a localization.
+_MAX_SWEEPS = 64  # maximum number of sweeps whose poses are read
+# Poses of a stationary sensor differ by less. Limits for exact poses and for localization.
 _MIN_SHIFT_M = 0.001
 _MIN_TURN_DEG = 0.01
 _LOCALIZED_SHIFT_M = 0.05
 _LOCALIZED_TURN_DEG = 0.5
-_MIN_SPEED_DEG = 0.005  # a smaller turn from sweep to sweep is not named
+_MIN_SPEED_DEG = 0.005  # smaller rotations between sweeps are not reported
 
 
 @dataclass(frozen=True, eq=False)
 class KnownPoses:
-    """Poses of sweeps in the frame of a scene, or in the world without a scene."""
+    """Poses of sweeps in the frame of a scene, or in world coordinates without a scene."""
 
     numbers: Ints  # (n,): numbers of the sweeps
     matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
     are_given: bool  # whether the user gave the poses
-    origin: Floats  # (3,): of the scene in the world, meters
+    origin: Floats  # (3,): origin of the scene in world coordinates, meters
 
     @classmethod
-    def of_recording(
+    def from_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
-        """Return the poses given as `pose`, else the recording's poses, or None if unknown.
+        """Return the poses given by the user, otherwise the recording's poses, or None if unknown.
 
-        LidarError if the given poses are neither one nor one for each sweep.
+        Raises LidarError unless `pose` is a single pose or contains one pose for each sweep.
         """
         origin = np.zeros(3) if scene is None else scene.origin
         if pose is not None:
@@ -67,11 +67,11 @@ class KnownPoses:
         return cls(numbers, recorded, False, origin)
 
     def are_of_firings(self, recording: Recording) -> bool:
-        """Return True if the poses are of the firings of a result, and not of whole sweeps."""
+        """Return True if each firing has its own pose, as in a result."""
         return not self.are_given and recording.fired is not None
 
     def speed(self, recording: Recording) -> Speed | None:
-        """Return the mean motion from sweep to sweep, or None if the sensor stands."""
+        """Return the mean motion between consecutive sweeps, or None for a stationary sensor."""
         positions = self.matrices[:, :3, 3]
         rotations = self.matrices[:, :3, :3]
         is_exact = self.are_given or self.are_of_firings(recording)
@@ -92,8 +92,8 @@ class KnownPoses:
     def fired(self, recording: Recording) -> Callable[[int], Sweep]:
         """Return a function that reads a sweep as fired, with `firing_poses` in the scene frame.
 
-        A result says where each pulse was fired; otherwise the pose of a sweep counts for all its
-        pulses. LidarError if the recording has poses of some sweeps alone.
+        A result records the pose of each pulse. In other recordings, the pose of a sweep is used
+        for all its pulses. Raises LidarError if only some sweeps of the recording have poses.
         """
         if not self.are_of_firings(recording):
             return self._of_whole_sweeps(recording)
@@ -107,7 +107,7 @@ class KnownPoses:
         return read_in_scene
 
     def _of_whole_sweeps(self, recording: Recording) -> Callable[[int], Sweep]:
-        """Return a function that reads a sweep as fired from a single pose."""
+        """Return a function that reads a sweep and assigns the same pose to all its pulses."""
         matrices = self.matrices
         if not self.are_given:
             recorded = recording.poses(range(recording.count))
@@ -126,7 +126,7 @@ class KnownPoses:
 
 
 def _given_matrices(pose: Any, recording: Recording) -> Floats:
-    """Return one pose, or a pose for each sweep, as matrices (n, 4, 4)."""
+    """Return a single pose, or one pose for each sweep, as matrices of shape (n, 4, 4)."""
     if isinstance(pose, np.ndarray) and pose.shape[-2:] == (4, 4):
         matrices = pose.astype(np.float64).reshape(-1, 4, 4)
         check_rotations(matrices[:, :3, :3])
@@ -147,6 +147,6 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
 
 
 def _angles_deg(first: Floats, second: Floats) -> Floats:
-    """Return the angles (n,) between rotations (n, 3, 3), degrees."""
+    """Return the angles between pairs of rotations in degrees."""
     traces = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))

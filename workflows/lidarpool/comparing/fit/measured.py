@@ -1,4 +1,4 @@
-"""Measures a sensor by the rays of a recording: noise, losses, bias, and curves of these."""
+"""Measure a sensor from the rays of a recording: noise, losses, bias, and their curves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidarsim.simulator import Scanner
 from ...clouds.recording import Recording
 from .estimates import MIN_RAYS, Estimate
 from .known_poses import KnownPoses
-from .moving_pulses import Pulses, measure_pulses
+from .moving_pulses import ScenePulses, measure_pulses
 from .performance import alarm_share, fit_performance
 from .ring_bias import ring_bias
 from .smooth_surfaces import (
@@ -31,30 +31,30 @@ from .smooth_surfaces import (
 from .stack import SweepStack, finite_median
 from .standstill import read_static
 
-_CURVE_POINTS = 14  # points of a curve at most
-_MIN_SCENE_SHARE = 0.5  # share of rays that must be within `SCENE_TOLERANCE_M` of the scene
-_MIN_REFLECTANCE = 1 / 400  # reflectance of surfaces that are reported as 0
-_MIN_RANGE_ERROR_M = 0.001  # error of a ray's mean range, however often the range is measured
+_CURVE_POINTS = 14  # maximum number of points in a curve
+_MIN_SCENE_SHARE = 0.5  # fraction of rays that must be within `SCENE_TOLERANCE_M` of the scene
+_MIN_REFLECTANCE = 1 / 400  # reflectance assumed for surfaces with a reported intensity of 0
+_MIN_RANGE_ERROR_M = 0.001  # minimum error of a mean range, for any number of measurements
 
 Curve = list[dict[str, float]]  # points, each with x, value, low and high
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """Rays on smooth surfaces, and the performance that was fitted to their returns."""
+class SensorMeasurement:
+    """Rays on smooth surfaces, and the sensor performance fitted to their returns."""
 
     stack: SweepStack
     rays: SmoothRays
-    energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
-    # {figure: estimate}: fields of `Noise` (`fit_performance`), and for a sensor that stands also
-    # `false_alarms`, a field of `Performance`; empty for a single sweep of such a sensor
+    energy: Floats | None  # (k,): see `_pulse_energies`; None if unknown
+    # {field: estimate}. Fields of `Noise` (see `fit_performance`), and for a stationary sensor also
+    # `false_alarms`, a field of `Performance`. Empty for one sweep of a stationary sensor.
     estimates: dict[str, Estimate]
-    bias: dict[int, Estimate]  # {row: meters}
-    lost_by_range: Curve | None = None  # share by the range of the scene; None without a scene
+    bias: dict[int, Estimate]  # {row: range bias in meters}
+    lost_by_range: Curve | None = None  # fraction of lost pulses; None without a scene
     moves: bool = False  # whether the sensor moves
 
     def curves(self) -> dict[str, Curve]:
-        """Compute the curves of noise, returns and intensity: {name in `charts`: points}."""
+        """Compute the curves of noise, returns and intensity as {name in `charts`: points}."""
         rays = self.rays
         light = rays.intensity if self.energy is None else self.energy
         variance = np.where(rays.freedom > 0, rays.variance, np.nan)
@@ -73,7 +73,7 @@ class Measured:
         return curves
 
     def _range_variances(self) -> Floats:
-        """Return variances (k,) of ranges, m², less the variances that noise of directions causes.
+        """Return the range variance of each ray in m², without the contribution of angle noise.
 
         The variance of a single return is NaN.
         """
@@ -84,7 +84,7 @@ class Measured:
         return np.asarray(variance - (direction_noise_rad * rays.slope) ** 2)
 
     def channels(self) -> list[dict[str, Any]]:
-        """Return the noise, bias and spread of azimuths of each ring, as dictionaries."""
+        """Return the noise, bias and azimuth spread of each ring as dictionaries."""
         stack = self.stack
         row_of_ray = self.rays.row
         range_variance = self._range_variances()
@@ -105,11 +105,11 @@ class Measured:
 
 def measure_standing(
     recording: Recording, white: float | None, scene: Scene | None, poses: KnownPoses | None
-) -> Measured:
-    """Choose rays on smooth surfaces and fit the performance of the sensor to their returns.
+) -> SensorMeasurement:
+    """Measure a stationary sensor from its returns on smooth surfaces.
 
-    `white` is the intensity of a white surface. LidarError if the sensor moves, or is not at its
-    pose in the scene, or if too few rays meet smooth surfaces.
+    `white` is the intensity of a white surface. Raises LidarError if the sensor moves, if it is not
+    at its pose in the scene, or if too few rays hit smooth surfaces.
     """
     stack = read_static(recording, stands=poses is not None and poses.are_of_firings(recording))
     lost_by_range = None
@@ -122,7 +122,7 @@ def measure_standing(
         lost_by_range = _lost_by_range(stack, expected)
     sigma = stack.rough_sigma.copy()
     estimates: dict[str, Estimate] = {}
-    for _ in range(2):  # the second pass leaves returns out by the noise that the first pass fits
+    for _ in range(2):  # the second pass excludes outliers based on the noise from the first pass
         direction_noise_rad = 0.0 if estimates else ASSUMED_DIRECTION_NOISE_RAD
         rays = select_smooth_rays(stack, sigma, direction_noise_rad, expected)
         _check_rays(len(rays.row), recording.name)
@@ -132,16 +132,16 @@ def measure_standing(
     if estimates and (alarms := alarm_share(stack)):
         estimates["false_alarms"] = alarms
     bias = _bias(stack, rays, sigma, expected)
-    return Measured(stack, rays, energy, estimates, bias, lost_by_range)
+    return SensorMeasurement(stack, rays, energy, estimates, bias, lost_by_range)
 
 
 def measure_moving(
     recording: Recording, white: float | None, scene: Scene, poses: KnownPoses
-) -> Measured:
-    """Fit the performance of a sensor that moves to its pulses on the surfaces of a scene.
+) -> SensorMeasurement:
+    """Measure a moving sensor from its pulses on the surfaces of a scene.
 
-    `white` is the intensity of a white surface. LidarError if the sensor is not at its poses in the
-    scene, or if too few pulses meet smooth surfaces.
+    `white` is the intensity of a white surface. Raises LidarError if the sensor is not at its poses
+    in the scene, or if too few pulses hit smooth surfaces.
     """
     stack, sweeps = measure_pulses(recording, scene, poses.fired(recording))
     _check_pose(sweeps.near / max(sweeps.compared, 1), recording.name)
@@ -151,17 +151,19 @@ def measure_moving(
     _check_rays(np.isfinite(pulses.difference).sum(), recording.name)
     pulses = pulses.select(pulses.near_scene(pulses.rough_sigma()))
     sigma = pulses.rough_sigma()
-    for _ in range(2):  # the second pass leaves returns out by the noise that the first pass fits
+    for _ in range(2):  # the second pass excludes outliers based on the noise from the first pass
         rays = pulses.rays(sigma)
         energy = _pulse_energies(rays, white or recording.white, recording.energies)
         estimates, sigma = fit_performance(rays, energy, all_known=True)
     lost = 1 - rays.return_counts.astype(np.float64)
     bias = _pulse_bias(pulses)
-    return Measured(stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True)
+    return SensorMeasurement(
+        stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True
+    )
 
 
 def _check_rays(count: int, name: str) -> None:
-    """Raise LidarError for too few rays on smooth surfaces."""
+    """Raise LidarError if there are too few rays on smooth surfaces."""
     if count < MIN_RAYS:
         raise LidarError(
             f"{name} has only {count} rays on smooth surfaces, but at least {MIN_RAYS} are "
@@ -170,10 +172,7 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Cast a ray into each cell, and return ranges of the scene (r, c), meters.
-
-    The range of a ray that meets nothing is NaN.
-    """
+    """Return the range of the scene in each cell in meters, or NaN if the ray hits nothing."""
     rays = stack.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     pose = np.eye(4) if poses is None else poses.matrices[0]
@@ -182,7 +181,7 @@ def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> 
 
 
 def _check_pose(near_share: float, name: str) -> None:
-    """Raise LidarError unless half of the ranges are near the ranges of the scene."""
+    """Raise LidarError unless at least half of the ranges agree with the scene."""
     if not near_share > _MIN_SCENE_SHARE:
         message = (
             f"Less than half of the points in {name} are within {SCENE_TOLERANCE_M} m of the scene."
@@ -193,7 +192,7 @@ def _check_pose(near_share: float, name: str) -> None:
 
 
 def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
-    """Compute the curve of the share of lost pulses by the range of the scene, (r, c)."""
+    """Compute the fraction of lost pulses as a function of the range of the scene."""
     surfaces = find_surfaces(stack, expected, 0 * stack.rough_sigma)
     cells = surfaces.smooth & (stack.trials > 0)
     returned = np.isfinite(stack.ranges).sum(axis=0)
@@ -202,10 +201,10 @@ def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
 
 
 def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
-    """Return the mean energies of the returns of rays (k,), or None if unknown.
+    """Return the mean energy of the returns of each ray, or None if it is unknown.
 
-    The energy is 1 for a white surface at 10 m; or the energy is the intensity, if the intensities
-    of the recording `are_energies`. `white` is the intensity of a white surface, None if unknown.
+    A white surface at 10 m has an energy of 1. If `are_energies` is true, the recorded intensities
+    are already energies. `white` is the intensity of a white surface, or None if it is unknown.
     """
     if not np.isfinite(rays.intensity).all():
         return None
@@ -218,10 +217,10 @@ def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -
 def _bias(
     stack: SweepStack, rays: SmoothRays, sigma: Floats, expected: Floats | None
 ) -> dict[int, Estimate]:
-    """Estimate the bias of each row of the stack, {row: meters}, by rays that are not steep.
+    """Estimate the range bias of each row in meters, using rays with a small angle of incidence.
 
-    Bias is the difference from the scene's ranges `expected` (r, c), or from large planes. Ranges
-    have standard deviations `sigma` (r, c), meters.
+    The bias is the difference from the scene's ranges `expected` if they are known, otherwise from
+    fitted planes. `sigma` is the standard deviation of ranges in meters. Both have shape (r, c).
     """
     flat = rays.select(rays.slope < FLAT_TANGENT * rays.distance)
     cell = flat.row, flat.column
@@ -231,19 +230,19 @@ def _bias(
     return ring_bias(flat, stack.directions[cell], error_m)
 
 
-def _pulse_bias(pulses: Pulses) -> dict[int, Estimate]:
-    """Estimate the bias of each row, {row: meters}, by returns of pulses that are not steep."""
+def _pulse_bias(pulses: ScenePulses) -> dict[int, Estimate]:
+    """Estimate the range bias of each row in meters from returns that are not too oblique."""
     returned = np.isfinite(pulses.residual) & (pulses.slope < FLAT_TANGENT * pulses.expected)
     return _mean_by_row(pulses.row[returned], pulses.residual[returned])
 
 
 def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
-    """Estimate the mean of the errors (k,) of each row (k,): {row: meters}."""
+    """Estimate the mean error of each row that occurs in `row`."""
     return {number: Estimate.from_values(errors[row == number]) for number in set(row.tolist())}
 
 
 def _root_mean(variances: Floats) -> dict[str, float] | None:
-    """Estimate the root of the mean of finite variances (n,), or None for too few variances."""
+    """Estimate the root of the mean of finite variances, or return None if there are too few."""
     finite = variances[np.isfinite(variances)]
     if len(finite) < MIN_RAYS:
         return None
@@ -251,10 +250,10 @@ def _root_mean(variances: Floats) -> dict[str, float] | None:
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> Curve:
-    """Compute the curve of values (k,) over x (k,): a point for each of several intervals of x.
+    """Compute a curve of values over x, with one point for each interval of x.
 
-    The intervals hold equal numbers of finite values, at least `MIN_RAYS`. A point has the median
-    of x, and the mean of the values to the power `power`.
+    The intervals contain equal numbers of finite values, at least `MIN_RAYS`. The x of a point is
+    the median in its interval, and its value is the mean of the interval raised to `power`.
     """
     finite = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
     order = finite[np.argsort(x[finite], kind="stable")]

@@ -1,7 +1,7 @@
-"""Pulses of a sensor that moves, against a scene: the poses of their firings are known.
+"""Compare the pulses of a moving sensor, whose firing poses are known, with a scene.
 
-No two pulses share a ray, so the mean range of a ray is unknown: the scene gives the range.
-Arrays of a sweep have r rows and c columns, as of `stack`.
+No two pulses share a ray, so a ray has no mean range, and the scene provides the expected range.
+Arrays for a sweep have r rows and c columns, as described in `stack`.
 """
 
 from __future__ import annotations
@@ -31,51 +31,55 @@ from .smooth_surfaces import (
     MAX_TANGENT,
     MIN_RANGE_M,
     SCENE_TOLERANCE_M,
-    Neighbors,
+    CellNeighbors,
     SmoothRays,
     among_smooth,
 )
 from .stack import MAX_KINK_M, SweepStack
 
-_MAX_PULSES = 1 << 17  # pulses that are fitted, chosen evenly
-_SAME_RANGE_M = 1e-3  # difference of the ranges of a return, as rounded
-# angle from a cell to the nearest return of its ring, whose pose counts
+_MAX_PULSES = 1 << 17  # maximum number of pulses to fit, sampled evenly
+_SAME_RANGE_M = 1e-3  # maximum difference between ranges of the same return due to rounding
+# Maximum angle from a cell to the closest return of its ring, whose pose is used.
 _MAX_GAP_DEG = 2.0
 _MIN_LOST_STEPS = 1.5  # steps between two returns if a pulse between the two is lost
 _LIGHT_COLUMNS = 3  # cells on either side whose intensities count
 
 
 @dataclass(frozen=True, eq=False)
-class Pulses:
-    """Pulses that meet smooth surfaces of a scene, (n,) each."""
+class ScenePulses:
+    """Pulses that hit smooth surfaces of a scene. All arrays have shape (n,)."""
 
     row: Ints
     column: Ints
     expected: Floats  # range of the scene, meters
-    slope: Floats  # growth of the range with the direction, meters in a radian
+    slope: Floats  # growth of the range with the direction, meters per radian
     residual: Floats  # range less `expected`, meters; NaN of a lost pulse
     intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
     difference: Floats  # residual less the residual of the next pulse of the ring; NaN if unknown
 
     def rough_sigma(self) -> Floats:
-        """Estimate the standard deviations (n,) of ranges, meters, for the choice of outliers."""
+        """Estimate the standard deviation of each pulse's range in meters, to detect outliers."""
         scatter_m = float(np.nanmedian(np.abs(self.difference))) / (0.6745 * np.sqrt(2))
         return np.hypot(scatter_m, ASSUMED_DIRECTION_NOISE_RAD * self.slope)
 
-    def select(self, chosen: Bools | Indices) -> Pulses:
+    def select(self, chosen: Bools | Indices) -> ScenePulses:
         """Select pulses by mask or index."""
-        return Pulses(*(values[chosen] for values in vars(self).values()))
+        return ScenePulses(*(values[chosen] for values in vars(self).values()))
 
     def near_scene(self, sigma: Floats) -> Bools:
-        """Mark pulses (n,) that are lost, or return from the scene, by ranges' `sigma` (n,)."""
+        """Mark pulses that are lost, or whose range agrees with the scene.
+
+        `sigma` is the standard deviation of each range.
+        """
         limit_m = np.maximum(MAX_SIGMAS * sigma, SCENE_TOLERANCE_M)
         return ~(np.abs(self.residual) > limit_m)  # NaN is marked, too
 
     def rays(self, sigma: Floats) -> SmoothRays:
-        """Return the pulses as rays of one pulse each, with standard deviations (n,) of ranges.
+        """Convert the pulses to rays with one pulse each.
 
-        The variances belong to differences of neighboring pulses: errors of poses and of the
-        scene are alike in both.
+        `sigma` is the standard deviation of each range. The variances of the rays are derived from
+        differences between neighboring pulses, in which errors of the poses and of the scene cancel
+        out.
         """
         returned = np.isfinite(self.residual)
         with np.errstate(invalid="ignore"):
@@ -94,17 +98,17 @@ class Pulses:
 
 
 class SweepPulses(NamedTuple):
-    """Pulses of a sweep, or of all sweeps, on smooth surfaces of the scene."""
+    """Pulses on smooth surfaces of the scene, from one sweep or from all sweeps."""
 
-    pulses: Pulses
+    pulses: ScenePulses
     compared: int  # returns where the scene has a surface
     near: int  # returns of these within `SCENE_TOLERANCE_M` of the surface
 
     @classmethod
     def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
-        """Join the pulses of sweeps, and choose pulses evenly if there are many."""
+        """Join the pulses of several sweeps. If there are too many, they are sampled evenly."""
         columns = zip(*(vars(sweep.pulses).values() for sweep in sweeps), strict=True)
-        pulses = Pulses(*map(np.concatenate, columns))
+        pulses = ScenePulses(*map(np.concatenate, columns))
         return cls(
             pulses.select(even_indices(len(pulses.row), _MAX_PULSES)),
             sum(sweep.compared for sweep in sweeps),
@@ -115,13 +119,13 @@ class SweepPulses(NamedTuple):
 def measure_pulses(
     recording: Recording, scene: Scene, fired: Callable[[int], Sweep]
 ) -> tuple[SweepStack, SweepPulses]:
-    """Read the sweeps of a sensor that moves, and compare their pulses with a scene.
+    """Read the sweeps of a moving sensor, and compare their pulses with a scene.
 
-    `fired` reads the returns of a sweep as fired, with `firing_poses` in the scene frame.
-    LidarError as of `SweepStack.read`.
+    `fired` reads a sweep as fired, with `firing_poses` in the scene frame. Raises the same errors
+    as `SweepStack.read`.
     """
     stack = SweepStack.read(recording, fired)
-    caster = _CellCaster.of_stack(stack, scene)
+    caster = _CellCaster.from_stack(stack, scene)
     sweeps = enumerate(stack.numbers.tolist())
     return stack, SweepPulses.joined(
         [_pulses_of_sweep(stack, index, caster, fired(number)) for index, number in sweeps]
@@ -129,7 +133,7 @@ def measure_pulses(
 
 
 class _CellReturns(NamedTuple):
-    """For each cell of a sweep, its return, or the return of the ring nearest in azimuth."""
+    """The return of each cell in a sweep, or the closest return in azimuth on the same ring."""
 
     points: Floats  # (r, c, 3): in the sensor frame at their firings, meters
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
@@ -139,20 +143,20 @@ class _CellReturns(NamedTuple):
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
 
     @classmethod
-    def of_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
-        """Find the returns of the cells of a sweep."""
+    def from_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
+        """Find the returns for the cells of a sweep."""
         points = fired.points
         rings = fired.rings
         assert rings is not None
-        nearest = _NearestReturns.of_sweep(stack, sweep, points, rings)
+        nearest = _NearestReturns.from_sweep(stack, sweep, points, rings)
         index = nearest.indices
         ranges = np.linalg.norm(points, axis=1)[index]
         cell_ranges = stack.ranges[sweep]
         with np.errstate(invalid="ignore"):
             own = np.abs(cell_ranges - ranges) < _SAME_RANGE_M
         known = stack.covered[sweep] & (nearest.gap_deg < _MAX_GAP_DEG)
-        # In points without the motion of the sensor, steps of azimuth are longer or shorter: cells
-        # are empty though no pulse is lost.
+        # If the sensor's motion is compensated, azimuth steps are longer or shorter, so cells may
+        # be empty although no pulse was lost.
         min_spacing_deg = _MIN_LOST_STEPS * 360 / cell_ranges.shape[1]
         known &= np.where(np.isfinite(cell_ranges), own, nearest.spacing_deg > min_spacing_deg)
         return cls(
@@ -161,7 +165,7 @@ class _CellReturns(NamedTuple):
 
 
 class _NearestReturns(NamedTuple):
-    """For each cell of a sweep, the returns of its ring that are nearest in azimuth.
+    """The returns on the same ring that are closest in azimuth to each cell of a sweep.
 
     Distances are infinite in rings without a return.
     """
@@ -172,21 +176,24 @@ class _NearestReturns(NamedTuple):
     spacing_deg: Floats  # (r, c): between the points before and after the cell
 
     @classmethod
-    def of_sweep(
+    def from_sweep(
         cls, stack: SweepStack, sweep: int, points: Floats, rings: Ints
     ) -> _NearestReturns:
-        """Find the points (n, 3) of rings (n,) that are nearest to the cells of a sweep."""
+        """Find the points that are closest in azimuth to the cells of a sweep.
+
+        `rings` contains the ring of each point.
+        """
         azimuth = np.arctan2(stack.directions[..., 1], stack.directions[..., 0])
-        # A lost pulse has the mean azimuth of its cell.
+        # Lost pulses are assumed to have the mean azimuth of their cell.
         azimuth = azimuth + np.nan_to_num(stack.azimuth_offsets[sweep])
         cell_deg = (np.degrees(azimuth) + 180) % 360 - 180
         azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-        # Of several returns of a pulse the nearest is first.
+        # If a pulse has several returns, the closest one comes first.
         order = np.lexsort((np.linalg.norm(points, axis=1), azimuth_deg, rings))
         bounds = np.searchsorted(rings[order], np.stack([stack.rings, stack.rings + 1], axis=1))
         indices_by_ring = [order[start:stop] for start, stop in bounds.tolist()]
         nearest = [
-            cls._of_ring(ring_cells, azimuth_deg[ring_points], ring_points)
+            cls._for_ring(ring_cells, azimuth_deg[ring_points], ring_points)
             for ring_cells, ring_points in zip(cell_deg, indices_by_ring, strict=True)
         ]
         indices, gap_deg, sides, spacing_deg = zip(*nearest, strict=True)
@@ -195,8 +202,11 @@ class _NearestReturns(NamedTuple):
         )
 
     @classmethod
-    def _of_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
-        """Find the points (m,), of ascending azimuths, that are nearest to the cells (c,)."""
+    def _for_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
+        """Find the points of one ring that are closest to its cells.
+
+        Points are sorted by azimuth.
+        """
         if not len(points):
             no_point = np.zeros((2, len(cell_deg)), np.int64)
             far_deg = np.full(len(cell_deg), np.inf)
@@ -216,10 +226,7 @@ class _NearestReturns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _RayPoses:
-    """A trajectory that gives each ray of a list a pose.
-
-    The time of ray i is i nanoseconds.
-    """
+    """A trajectory with one pose for each ray in a list. The time of ray i is i nanoseconds."""
 
     positions: Floats  # (k, 3)
     rotations: Floats  # (k, 3, 3)
@@ -228,26 +235,26 @@ class _RayPoses:
     duration_ns: ClassVar[float] = np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose of the ray of a time."""
+        """Return the pose of the ray with this time."""
         positions, rotations = self.poses(station, np.array([time_ns]))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the poses of the rays of times (k,)."""
+        """Return the poses of the rays with these times."""
         ray = np.rint(times_ns).astype(np.int64).clip(0, len(self.positions) - 1)
         return self.positions[ray], self.rotations[ray]
 
 
 @dataclass(frozen=True, eq=False)
 class _CellCaster:
-    """Casts a ray into each cell of a sweep."""
+    """Casts one ray into each cell of a sweep."""
 
     scanner: Scanner
     directions: Floats  # (r, c, 3): unit directions in the sensor frame
 
     @classmethod
-    def of_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
-        """Make the caster of the cells of a stack."""
+    def from_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
+        """Create the caster for the cells of a stack."""
         rays = stack.directions.reshape(-1, 3)
         shot_ns = np.arange(len(rays), dtype=np.float64)
         sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=shot_ns)
@@ -255,7 +262,7 @@ class _CellCaster:
         return cls(scanner, stack.directions)
 
     def surfaces(self, positions: Floats, rotations: Floats) -> _SceneSurfaces:
-        """Cast the rays of all cells from poses (r c, 3) and (r c, 3, 3)."""
+        """Cast the rays of all cells from their positions (r c, 3) with rotations (r c, 3, 3)."""
         cloud = self.scanner.sweep(_RayPoses(positions, rotations), number=0)
         shape = self.directions.shape
         cell = np.unravel_index(cloud["ray"].astype(np.int64), shape[:2])
@@ -263,7 +270,7 @@ class _CellCaster:
         normal = np.full(shape, np.nan)
         distance[cell] = cloud["range"]
         normal[cell] = np.stack([cloud[name] for name in NORMAL], axis=1)
-        directions = _turned(rotations, self.directions)
+        directions = _rotate_vectors(rotations, self.directions)
         with np.errstate(invalid="ignore", divide="ignore"):
             cosine = (normal * directions).sum(axis=-1)
             slope = distance * np.sqrt(np.maximum(1 / cosine**2 - 1, 0))
@@ -272,7 +279,9 @@ class _CellCaster:
             points = positions.reshape(shape) + path
             smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
             tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance
-            smooth &= Neighbors.from_points(points).are_coplanar(points, scaled_normal, tolerance_m)
+            smooth &= CellNeighbors.from_points(points).are_coplanar(
+                points, scaled_normal, tolerance_m
+            )
         return _SceneSurfaces(distance, slope, path, scaled_normal, smooth)
 
 
@@ -280,20 +289,21 @@ class _SceneSurfaces(NamedTuple):
     """Surfaces of a scene in the cells of a sweep."""
 
     distance: Floats  # (r, c): meters; NaN without a hit
-    slope: Floats  # (r, c): growth of the range with the direction, meters in a radian
+    slope: Floats  # (r, c): growth of the range with the direction, meters per radian
     path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, meters
     scaled_normal: Floats  # (r, c, 3): normal n, as n / (n · d) for the direction d
     smooth: Bools  # (r, c): whether the neighbors lie in one plane with the cell
 
     def range_errors(self, points: Floats, rotations: Floats) -> Floats:
-        """Return the ranges (r, c) of points less the ranges of the planes of the cells, meters.
+        """Return the ranges of points minus the ranges of the planes in their cells, in meters.
 
-        Ranges are along the points (r, c, 3), in the sensor frame: pulses are beside the middle of
-        their cell. `rotations` (r c, 3, 3) turn the sensor frame into the scene frame.
+        `points` has shape (r, c, 3) and is in the sensor frame. The plane's range is computed in
+        the direction of the point, because pulses are not at the centers of their cells.
+        `rotations` has shape (r c, 3, 3) and rotates from the sensor frame to the scene frame.
         """
         ranges = np.linalg.norm(points, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            directions = _turned(rotations, points / ranges[..., None])
+            directions = _rotate_vectors(rotations, points / ranges[..., None])
             offset = (self.path * self.scaled_normal).sum(axis=-1)
             return np.asarray(ranges - offset / (directions * self.scaled_normal).sum(axis=-1))
 
@@ -301,8 +311,8 @@ class _SceneSurfaces(NamedTuple):
 def _pulses_of_sweep(
     stack: SweepStack, sweep: int, caster: _CellCaster, fired: Sweep
 ) -> SweepPulses:
-    """Compare the pulses of a sweep with the smooth surfaces of a scene."""
-    returns = _CellReturns.of_sweep(stack, sweep, fired)
+    """Compare the pulses of one sweep with the smooth surfaces of a scene."""
+    returns = _CellReturns.from_sweep(stack, sweep, fired)
     surfaces = caster.surfaces(returns.positions, returns.rotations)
     residual = np.where(
         returns.own, surfaces.range_errors(returns.points, returns.rotations), np.nan
@@ -313,16 +323,16 @@ def _pulses_of_sweep(
         limit_m = np.maximum(limit_m, SCENE_TOLERANCE_M)
         is_near = (np.abs(residual) < limit_m) & surfaces.smooth
         usable = returns.known & (surfaces.distance < np.nanmax(stack.ranges))
-        # A pulse is lost between two returns of a surface; elsewhere the surface may be hidden, or
-        # missing in the recorded place.
+        # A pulse counts as lost only between two returns from the surface. Elsewhere, the surface
+        # may be occluded, or may not exist in the recorded place.
         usable &= returns.own | (np.abs(beside) < limit_m).all(axis=0)
-    # A surface may be missing in the recorded place if no pulse nearby returns from the surface.
+    # The surface may not exist in the recorded place if no pulse nearby returns from it.
     usable &= np.isfinite(_means_beside(np.where(is_near, stack.ranges[sweep], np.nan)))
     difference = residual - np.roll(np.where(is_near, residual, np.nan), -1, axis=1)
-    difference[:, 1::2] = np.nan  # each return is in one difference
+    difference[:, 1::2] = np.nan  # so that each return contributes to only one difference
     intensity = _means_beside(np.where(is_near, stack.intensities[sweep], np.nan))
     cell = np.nonzero(usable & among_smooth(surfaces.smooth))
-    pulses = Pulses(
+    pulses = ScenePulses(
         row=cell[0],
         column=cell[1],
         expected=surfaces.distance[cell],
@@ -336,7 +346,7 @@ def _pulses_of_sweep(
 
 
 def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
-    """Return the positions (k, 3) and rotations (k, 3, 3) of the firings of points (k,)."""
+    """Return the positions (k, 3) and rotations (k, 3, 3) of the sensor when points were fired."""
     poses = fired.firing_poses
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)
@@ -346,14 +356,14 @@ def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
     return poses.position + poses.offsets[:, index].T, rotations
 
 
-def _turned(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors (r, c, 3) by rotations (r c, 3, 3)."""
+def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
+    """Rotate vectors of shape (r, c, 3) by rotations of shape (r c, 3, 3)."""
     turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
     return np.asarray(turned.reshape(vectors.shape))
 
 
 def _means_beside(values: Floats) -> Floats:
-    """Return the means (r, c) of the values of the cells beside each cell, NaN without values."""
+    """Return the mean of the cells around each cell, or NaN if all of them are NaN."""
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
     known = np.isfinite(beside)

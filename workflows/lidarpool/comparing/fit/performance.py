@@ -1,4 +1,4 @@
-"""Fits noise, lost pulses and false alarms to the statistics of rays."""
+"""Fit noise, lost pulses and false alarms to the statistics of rays."""
 
 from __future__ import annotations
 
@@ -14,34 +14,35 @@ from .estimates import MIN_RAYS, Estimate, sandwich
 from .smooth_surfaces import MIN_RETURN_SHARE, SmoothRays
 from .stack import SweepStack
 
-# chances of a variance above which a ray is left out: outliers only, and the upper tail
+# Rays are excluded if the probability of a larger variance is below these limits. The first limit
+# excludes only outliers, the second the upper tail.
 _OUTLIER_CHANCE = 1e-4
 _TAIL_CHANCE = 0.1
-# rings of a patch of rays; patches of a revolution
+# Number of rings in a patch of rays, and number of patches in a revolution.
 _PATCH_ROWS = 4
 _PATCHES = 36
-_FRONTAL_TANGENT = 1.0  # tangent of incidence: below, directions add hardly any noise
+_FRONTAL_TANGENT = 1.0  # tangent of incidence below which direction noise is negligible
 _MIN_FRONTAL_RAYS = 100
 _MIN_FRONTAL_SHARE = 0.05
-_MAX_HALF_INTERVAL = 0.75  # half of the interval of a figure of noise, over its value
+_MAX_HALF_INTERVAL = 0.75  # maximum half width of a noise parameter's interval, over its value
 _VARIANCE_ERROR = 0.03  # relative error of the variances of steep or distant rays
-_MAX_VARIANCE_RATIO = 3.0  # quotient of a variance and the expected variance that counts at most
-# quotient of ranges, and tangent of incidence, that determine noise by range and by direction
+_MAX_VARIANCE_RATIO = 3.0  # larger ratios of variance and expected variance are clipped
+# Minimum ratio of ranges, and minimum tangent of incidence, to determine how noise depends on them.
 _MIN_RANGE_RATIO = 2.0
 _MIN_TILT_TANGENT = 0.3
 
 # Lost pulses and false alarms
 _MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
 _LOG_STEP = 1e-3  # step of logarithms, for derivatives
-# Around a ray into the sky, no ray within these rings and degrees of azimuth returns twice: in
-# smaller gaps between leaves, leaves return once.
+# Around a ray into the sky, no ray within this number of rings and degrees of azimuth returns
+# twice. Smaller gaps between leaves do not count as sky, because leaves may return once.
 _SKY_RINGS = 7
 _SKY_DEG = 36.0
 _MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
 
 
 def has_frontal_rays(rays: SmoothRays) -> bool:
-    """Return True if enough frontal rays separate noise of ranges from noise of directions."""
+    """Return True if there are enough frontal rays to separate range noise from direction noise."""
     frontal = (rays.slope < _FRONTAL_TANGENT * rays.distance).sum()
     return bool(frontal >= max(_MIN_FRONTAL_RAYS, _MIN_FRONTAL_SHARE * len(rays.row)))
 
@@ -49,19 +50,20 @@ def has_frontal_rays(rays: SmoothRays) -> bool:
 def fit_performance(
     rays: SmoothRays, energy: Floats | None, *, all_known: bool = False
 ) -> tuple[dict[str, Estimate], Floats]:
-    """Estimate noise and lost pulses of a sensor from rays.
+    """Estimate the noise and the lost pulses of a sensor from its rays.
 
-    `energy` (k,) is the energy of the returns of rays, if known. `all_known` says that rays without
-    any return are known, too, by a scene.
+    `energy` is the energy of each ray's returns, or None if unknown. If `all_known` is true, rays
+    without any return are also known, because a scene is available.
 
     Returns
     -------
     estimates
-        {field of `Noise`: estimate}: `range_m`, `angle_deg`, and `range_per_m` or, if likelier,
-        `range_at_threshold_m`; `detection_range_m` and `dropout`. Without a field that the rays do
-        not determine.
+        {field of `Noise`: estimate}. The fields are `range_m`, `angle_deg`, either `range_per_m` or
+        `range_at_threshold_m` (whichever is more likely), `detection_range_m` and `dropout`. Fields
+        that the rays do not determine are omitted.
     sigma
-        Standard deviations of the ranges of rays (k,), meters, by the likelier of range and energy.
+        Standard deviation of each ray's range in meters, from the more likely of the two models.
+        Shape (k,).
     """
     threshold, dropout = _fit_detection(rays, energy, all_known)
     scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
@@ -86,9 +88,9 @@ def fit_performance(
 def _fit_detection(
     rays: SmoothRays, energy: Floats | None, all_known: bool
 ) -> tuple[Estimate | None, Estimate | None]:
-    """Estimate the energy at which half of the pulses return, and the share lost at any energy.
+    """Estimate the energy at which half of the pulses return, and the loss rate at any energy.
 
-    Either is None if undetermined; `energy` (k,) is None if unknown.
+    Values that cannot be determined are None. `energy` is None if it is unknown.
     """
     light = np.nan_to_num(rays.intensity) if energy is None else energy
     strong = light >= np.median(light)
@@ -101,17 +103,18 @@ def _fit_detection(
         threshold = fit_threshold(energy, rays, lost, all_known=all_known)
         if threshold is None:
             break
-        strong = energy > 2 * threshold.value  # no pulse of these is lost for want of energy
+        strong = energy > 2 * threshold.value  # none of these pulses is lost due to low energy
         dropout = lost_share(rays, strong, all_known=all_known) or dropout
     return threshold, dropout
 
 
 def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> Estimate | None:
-    """Estimate the share of pulses that chosen rays (k,) lose, or None for too few rays.
+    """Estimate the fraction of pulses that the chosen rays lose, or None if there are too few rays.
 
-    Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
-    pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
-    pulses: the mean of (trials - returns) / (trials - 1) over all returns is unbiased.
+    Unless `all_known` is true, rays without any return are missing, so the remaining rays lose
+    fewer pulses than average. To correct for this, the fraction is computed for each return from
+    the other `trials - 1` pulses of its ray. The mean of (trials - returns) / (trials - 1) over all
+    returns is unbiased.
     """
     min_trials = 1 if all_known else 2
     chosen = chosen & (rays.trials >= min_trials)
@@ -127,7 +130,7 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 
 
 class ScatterFit(NamedTuple):
-    """Noise of ranges and directions that was fitted to the variances of rays."""
+    """Noise of ranges and directions, fitted to the variances of rays."""
 
     # {`range_m`, `angle_deg` or the name of the increase, fields of `Noise`: estimate}
     estimates: dict[str, Estimate]
@@ -136,34 +139,34 @@ class ScatterFit(NamedTuple):
 
 
 class _VarianceSamples(NamedTuple):
-    """Variances of the ranges of rays that lose few pulses, (k,) each."""
+    """Range variances of rays that lose few pulses. All arrays have shape (k,)."""
 
     variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance
     growth: Floats  # a quantity that noise of ranges grows with, such as the range
-    slope: Floats  # meters in a radian
+    slope: Floats  # meters per radian
     distance: Floats  # meters
     patch: Ints  # number of the patch of neighboring rays, whose errors may be alike
 
 
 @dataclass(frozen=True, eq=False)
 class _VarianceModel:
-    """Variance of ranges: noise that grows with a quantity, plus noise of directions.
+    """Model of the range variance: range noise that grows with a quantity, plus direction noise.
 
-    The three parameters are relative to the usual variance v: for noise of ranges σ at growth 0,
-    (σ / √v) to the power `power`; the increase of that power at `growth_scale`; and the variance
-    by noise of directions at `slope_scale` over v. Methods take the parameters (p,) that `fitted`
-    marks; the others are 0.
+    The three parameters are relative to the typical variance v. The first is (σ / √v) to the power
+    `power`, where σ is the range noise at a growth of 0. The second is the increase of this term at
+    `growth_scale`. The third is the variance due to direction noise at `slope_scale`, divided by v.
+    Methods take only the parameters that are marked in `fitted`; the others are 0.
     """
 
     power: int  # power of σ and of the growth: 1 if noise adds, 2 if variances add
     fitted: Bools  # (3,): which parameters are fitted
     variance_scale: float  # usual variance v, square meters
     growth_scale: float  # usual growth, in its unit
-    slope_scale: float  # usual slope, meters in a radian
+    slope_scale: float  # usual slope, meters per radian
 
     def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
-        """Return the variances (k,) of the ranges of rays, square meters."""
+        """Return the range variance of each ray in square meters."""
         theta = np.zeros(3)
         theta[self.fitted] = parameters
         range_term = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
@@ -171,25 +174,25 @@ class _VarianceModel:
         return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
 
     def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
-        """Return the variances (k,) that the model gives samples, square meters."""
+        """Return the variance that the model predicts for each sample, in square meters."""
         return self.variance(parameters, samples.growth, samples.slope)
 
 
 def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int) -> ScatterFit:
-    """Fit noise of ranges and directions to the variances of rays, by their likelihood.
+    """Fit range noise and direction noise to the variances of rays by maximum likelihood.
 
-    The noise of ranges is a + b g for power 1 and √(a² + b² g²) for power 2, with the `growth` g
-    (k,); a is the figure `range_m`, and b the figure `increase_name`. Figures that the rays do not
-    determine, for want of different growths or inclined surfaces, are left out. Intervals are of
-    sandwich estimators, for patches of rays that may be alike, and of errors of the model: edges,
-    slopes, and growth.
+    The range noise is a + b g for power 1, and √(a² + b² g²) for power 2, where g is `growth`. The
+    parameter a is stored as `range_m`, and b as `increase_name`. Parameters that cannot be
+    determined, because the growth does not vary or there are no inclined surfaces, are omitted.
+    Intervals include sandwich estimates for patches of rays with correlated errors, and model
+    errors due to edges, slopes and growth.
     """
     lower, middle, upper = np.quantile(growth, (0.05, 0.5, 0.95))
     samples = _variance_samples(rays, growth)
     is_tilted = np.quantile(rays.slope / rays.distance, 0.9) > _MIN_TILT_TANGENT
     model = _VarianceModel(
         power=power,
-        # Growth is fitted even if undetermined: it widens the interval of range_m rightly.
+        # Growth is fitted even if it is undetermined, because it widens the interval of `range_m`.
         fitted=np.array([True, True, is_tilted]),
         variance_scale=max(float(np.median(samples.variance)), 1e-12),
         growth_scale=middle,
@@ -213,10 +216,10 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Choose the rays whose variances are fitted.
+    """Select the rays whose variances are fitted.
 
-    `growth` (k,) is the quantity that noise of ranges grows with, of each of the `rays` (k,). Rays
-    that lose many pulses are left out: only their nearer or brighter pulses return.
+    Rays that lose many pulses are excluded, because only their closer or brighter pulses return.
+    `growth` is the quantity that range noise grows with.
     """
     repeated = (rays.freedom > 0) & (rays.return_counts >= MIN_RETURN_SHARE * rays.trials)
     patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
@@ -232,14 +235,14 @@ def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
 
 
 def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Floats, Floats]:
-    """Fit the parameters of a model (p,) to samples, and estimate the variances (p,) of the fit."""
+    """Fit the parameters of a model to samples, and estimate the variances of the parameters."""
     start = np.array([1.0, 0.1, 0.1])[model.fitted]
     theta, covariance = _fit_trimmed(model, start, samples, _TAIL_CHANCE)
-    # Edges that are finer than the rays make the variances of some rays larger: the change of the
-    # figures if fewer rays are left out is an error of the model.
+    # Edges that are finer than the ray spacing increase the variances of some rays. The change in
+    # the parameters when fewer rays are excluded is used as a model error.
     untrimmed, _ = _fit_trimmed(model, theta, samples, _OUTLIER_CHANCE)
     variances = np.diag(covariance) + (theta - untrimmed) ** 2
-    # Slopes are not exact: variances of steep or distant rays may be wrong against the others.
+    # Slopes are not exact, so variances of steep or distant rays may be inconsistent with others.
     for quantity in (samples.slope / samples.distance, samples.growth):
         error = _VARIANCE_ERROR * np.where(quantity > np.median(quantity), 1.0, -1.0)
         changed = samples._replace(variance=samples.variance * (1 + error))
@@ -251,11 +254,11 @@ def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Fl
 def _fit_trimmed(
     model: _VarianceModel, start: Floats, samples: _VarianceSamples, chance: float
 ) -> tuple[Floats, Floats]:
-    """Fit a model to variances, and estimate the covariance (p, p) of its parameters (p,).
+    """Fit a model to variances, and estimate the covariance of its parameters.
 
-    Samples whose variance is above a quantile, which a share `chance` of the expected distribution
-    exceeds, are left out; the others have the mean of the truncated distribution.
-    `start` (p,) has initial parameters.
+    Samples whose variance exceeds a quantile of the expected distribution are excluded. The
+    probability to exceed the quantile is `chance`. The remaining samples have the mean of the
+    truncated distribution. `start` contains the initial parameters.
     """
     from scipy.optimize import least_squares
     from scipy.stats import chi2
@@ -290,11 +293,11 @@ def _fit_trimmed(
 def fit_threshold(
     energy: Floats, rays: SmoothRays, dropout: float, *, all_known: bool = False
 ) -> Estimate | None:
-    """Estimate the energy at which half of the pulses return, by the curve of `Noise.detected`.
+    """Estimate the energy at which half of the pulses return, with the model of `Noise.detected`.
 
-    `energy` (k,) is the energy of rays; `dropout` is the share that is lost at any energy. Without
-    `all_known`, a ray is known only if a pulse returns: the likelihood belongs to a truncated
-    binomial distribution. None if too few rays lose some of their pulses.
+    `dropout` is the loss rate at any energy. Unless `all_known` is true, a ray is known only if at
+    least one pulse returns, so the likelihood of a truncated binomial distribution is used. Return
+    None if too few rays lose some of their pulses.
     """
     from scipy.optimize import brute
     from scipy.special import ndtr
@@ -320,17 +323,17 @@ def fit_threshold(
 
 
 def alarm_share(stack: SweepStack) -> Estimate | None:
-    """Estimate the share of pulses into the sky that return.
+    """Estimate the fraction of pulses into the sky that return.
 
-    A pulse counts as a pulse into the sky if no other pulse of its ray returns, and no ray in its
-    neighborhood returns twice; rays of fewer than three pulses do not count. None with little sky,
-    or with two sweeps.
+    A pulse counts as a sky pulse if no other pulse of its ray returns, and if no ray in its
+    neighborhood returns twice. Rays with fewer than three pulses are ignored. Return None if there
+    is too little sky, or if there are only two sweeps.
     """
     from scipy.ndimage import maximum_filter
     from scipy.stats import binomtest
 
     count = np.isfinite(stack.ranges).sum(axis=0)
-    # Weak surfaces, which return seldom, are beside surfaces that return more often.
+    # Weak surfaces, which rarely return, are next to surfaces that return more often.
     size = _SKY_RINGS, round(_SKY_DEG / 360 * count.shape[1])
     repeated = maximum_filter(count, size=size, mode=("nearest", "wrap")) > 1
     sky = ~repeated & (stack.trials > 2) & stack.steady

@@ -1,6 +1,7 @@
-"""Motions of a sensor by the changes of the ranges of smooth surfaces.
+"""Estimate the motion of a sensor from changes in the ranges of smooth surfaces.
 
-In the direction d, the plane n · x = c is nearer by n · s / (n · d) after a shift s of the sensor.
+If the sensor shifts by s, the range of the plane n · x = c in the direction d decreases by n · s /
+(n · d).
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
 
 from .estimates import MIN_RAYS, sandwich
-from .sight import Evidence, RigidMotion, count_objects
-from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfaces
+from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, SmoothSurfaces, find_surfaces
 from .stack import SweepStack, finite_median
+from .visibility import Evidence, RigidMotion, count_objects
 
-SWEEP_PAIRS = 8  # pairs of sweeps that are compared
+SWEEP_PAIRS = 8  # number of pairs of sweeps to compare
 ARM_M = 10.0  # distance at which rotations are expressed in meters
-# noise of ranges, and motion, for which rays are weighted, meters
+# Assumed range noise and motion for the weights of rays, in meters.
 _ASSUMED_NOISE_M = 0.02
 _ASSUMED_SHIFT_M = 0.5
 _MIN_EXPLAINED_SHARE = 0.5  # share of the rays that a motion changes
 _MAX_FACE_M = 0.3  # shift beyond which rays leave the faces of cars
 _VEHICLE_M = 4.0  # no front of a vehicle is as wide
-_CALM_FACTOR = 4.0  # a change above this multiple of the median is of something that moves
+_CALM_FACTOR = 4.0  # changes above this multiple of the median belong to moving objects
 _CALM_SIGMAS = 6.0
-# change of a range that may be noise, at least, and for each meter
+# Changes of a range that may be noise: the minimum, and the change per meter of range.
 _STAYED_M = 0.05
 _STAYED_PER_M = 0.01
 
@@ -38,7 +39,7 @@ _CREEP_SWEEPS = 24  # sweeps, at most
 _CREEP_RAYS = 20_000  # rays, at most
 _SECTORS = 36  # sectors of a revolution; errors of the rays of a sector are alike
 _CREEP_SIGMAS = 5.0  # standard deviations of a significant motion
-# share of the returns of a ray that are nearer to their median than so many standard deviations
+# Minimum fraction of a ray's returns that lie within a number of sigmas of their median.
 _MIN_NEAR_SHARE = 0.95
 _MAX_CREEP_SIGMAS = 10.0
 _TUKEY_LIMITS = (20.0, 10.0, 4.7, 4.7, 4.7)  # standard deviations beyond which rays do not count
@@ -50,7 +51,7 @@ _OFFSET = 6  # column of the offset of all ranges
 class RangeChanges:
     """Changes of the ranges of smooth surfaces between two sweeps."""
 
-    surfaces: Surfaces  # surfaces of the first sweep
+    surfaces: SmoothSurfaces  # surfaces of the first sweep
     # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
     chosen: Bools
     change: Floats  # (r, c): meters, second less first, without the change by shifted azimuths
@@ -59,9 +60,9 @@ class RangeChanges:
 
     @classmethod
     def between(cls, stack: SweepStack, first: int, second: int) -> RangeChanges:
-        """Compare the ranges of two sweeps where the first sweep meets smooth surfaces."""
+        """Compare the ranges of two sweeps where the first sweep hits smooth surfaces."""
         distance = stack.ranges[first].astype(np.float64)
-        # If the sensor moves, changes of ranges from sweep to sweep are not noise.
+        # If the sensor moves, range changes between sweeps are not noise, so noise is assumed.
         surfaces = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
         with np.errstate(invalid="ignore"):
             azimuth_change = stack.azimuth_offsets[second] - stack.azimuth_offsets[first]
@@ -73,37 +74,39 @@ class RangeChanges:
 
     @cached_property
     def design(self) -> Floats:
-        """Changes (k, 4) of the ranges of chosen rays with the motion: shift, and yaw at `ARM_M`.
+        """Derivatives of the chosen rays' ranges with respect to the motion. Shape (k, 4).
 
-        Yaw is in meters, so that the unknowns are of about the same size.
+        The columns are the shift along x, y and z, and the yaw at `ARM_M`. Yaw is expressed in
+        meters so that all unknowns have a similar magnitude.
         """
         yaw = self.surfaces.azimuth_slope[self.chosen] / ARM_M
         return np.column_stack([-self.surfaces.scaled_normal[self.chosen], yaw])
 
     @cached_property
     def distance(self) -> Floats:
-        """Ranges (k,) of the chosen rays in the first sweep, meters."""
+        """Ranges of the chosen rays in the first sweep in meters. Shape (k,)."""
         return np.linalg.norm(self.points[self.chosen], axis=1)
 
     @cached_property
     def normal_error(self) -> Floats:
-        """Errors (k,) of the normals at the chosen rays, radians.
+        """Errors of the normals at the chosen rays in radians. Shape (k,).
 
-        Normals are of points two columns away on either side: normals of close points are inexact.
+        Normals are computed from points two columns away on either side, because adjacent points
+        would yield inaccurate normals.
         """
         step_rad = 2 * np.pi / self.change.shape[1]
         return np.asarray(_ASSUMED_NOISE_M / (np.sqrt(10) * self.distance * step_rad))
 
     @cached_property
     def noise(self) -> Floats:
-        """Assumed noise (k,) of the changes of the chosen rays, meters."""
+        """Assumed noise in the changes of the chosen rays in meters. Shape (k,)."""
         noise = _ASSUMED_NOISE_M + MAX_KINK_PER_M * self.distance
         return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
 
     def motion(self) -> RigidMotion | None:
         """Fit the motion of the sensor.
 
-        Return None unless a motion explains most changes that the motion predicts.
+        Return None if the motion does not explain most of the changes that it predicts.
         """
         change = self.change[self.chosen]
         if len(change) < MIN_RAYS:
@@ -121,7 +124,7 @@ class RangeChanges:
         return None
 
     def _large(self, motion: Floats) -> Bools:
-        """Mark the chosen rays (k,) that a motion (4,) changes by more than noise."""
+        """Mark the chosen rays whose range a motion changes by more than the noise."""
         predicted = self.design @ motion
         residual = np.abs(self.change[self.chosen] - predicted)
         scale = 1.4826 * np.median(residual / self.noise)
@@ -130,7 +133,7 @@ class RangeChanges:
         return np.asarray(np.abs(predicted) > limit)
 
     def evidence(self, motion: RigidMotion) -> Evidence:
-        """Count objects for and against a motion among the surfaces that the motion changes.
+        """Count the objects for and against a motion among the surfaces whose ranges it changes.
 
         A surface wider than a vehicle counts as several objects.
         """
@@ -150,10 +153,11 @@ class RangeChanges:
         return evidence
 
     def axes(self) -> tuple[Floats, Floats]:
-        """Return the axes (3, 3) of the normals of surfaces whose ranges stayed, and shares (3,).
+        """Return the principal axes of the normals of unchanged surfaces, and their fractions.
 
-        A share is the mean square of the normals' components on an axis, ascending: a shift along
-        an axis of a small share changes few of these ranges.
+        The fraction of an axis is the mean square of the normals' components along it. Fractions
+        are in ascending order. A shift along an axis with a small fraction changes few of these
+        ranges.
         """
         ranges = np.linalg.norm(self.points, axis=-1)
         with np.errstate(invalid="ignore"):
@@ -168,11 +172,11 @@ class RangeChanges:
 
 
 def range_scatter(stack: SweepStack, lag: int) -> float:
-    """Return the typical size of the change of a smooth surface's range in `lag` sweeps, meters.
+    """Return the typical change in the range of a smooth surface over `lag` sweeps, in meters.
 
-    The size in a pair of sweeps is a mean without the changes of things that move: ranges may be
-    rounded to more than their noise, so that a median is 0. The result is the median over the
-    pairs. It is 0 if no pair has enough rays.
+    For each pair of sweeps, changes due to moving objects are excluded, and the mean of the
+    remaining changes is used. A median would be 0 if ranges are rounded more coarsely than their
+    noise. The result is the median over all pairs, or 0 if no pair has enough rays.
     """
     scatter = []
     for first in even_indices(stack.sweep_count - lag, SWEEP_PAIRS).tolist():
@@ -186,11 +190,12 @@ def range_scatter(stack: SweepStack, lag: int) -> float:
 
 
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a motion (4,) to changes of ranges (k,): shift x, y, z and yaw at `ARM_M`, meters.
+    """Fit a motion to changes in ranges: shift along x, y and z, and yaw at `ARM_M`, in meters.
 
-    A row of `design` (k, 4) is the change of the range with the motion; `noise` (k,) is the noise
-    of `change`, meters. Components along principal axes of the covariance that are not significant
-    are 0. Huber's estimate: few rays of things that move count little.
+    A row of `design` contains the derivatives of a range with respect to the motion, and `noise` is
+    the noise of `change` in meters. Components along principal axes of the covariance are set to 0
+    if they are not significant. The fit uses Huber's estimator, which reduces the influence of rays
+    on moving objects.
     """
     motion: Floats = np.zeros(4)
     if len(change) < MIN_RAYS:
@@ -209,7 +214,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 
 
 class Creep(NamedTuple):
-    """Steady motion of a sensor over a recording, 0 where noise may explain the changes."""
+    """Steady motion of a sensor during a recording, or 0 if noise may explain the changes."""
 
     shift: Floats  # (3,): meters from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
@@ -220,13 +225,14 @@ class Creep(NamedTuple):
 def fit_creep(stack: SweepStack) -> Creep:
     """Fit the steady motion of a sensor to the ranges of all sweeps.
 
-    Each sweep has a small motion from the mean of all, by Tukey's biweight: rays of things that
-    move do not count. The steady motion is the slope of the small motions. Errors follow from
-    noise, and from sectors of a revolution, each of them left out in turn (jackknife): one thing
-    that moves is not a motion of the sensor. Nor is an offset that grows in all ranges, such as
-    the offset of a sensor that warms up.
+    Each sweep has a small motion relative to the mean of all sweeps. It is fitted with Tukey's
+    biweight, which ignores rays on moving objects. The steady motion is the slope of these motions.
+    Its error is derived from the noise, and from leaving out each sector of a revolution in turn
+    (jackknife), so that a single moving object is not mistaken for a motion of the sensor.
+    Similarly, an offset that grows in all ranges is not a motion; it occurs, for example, while a
+    sensor warms up.
     """
-    rays = _CreepRays.of_stack(stack)
+    rays = _CreepRays.from_stack(stack)
     if len(rays.design) < MIN_RAYS:
         return Creep(np.zeros(3), np.zeros(3), 0.0, 0.0)
     time = rays.numbers - rays.numbers.mean()
@@ -238,16 +244,16 @@ def fit_creep(stack: SweepStack) -> Creep:
     significant = np.abs(components) > _CREEP_SIGMAS * np.sqrt(variance)
     motion = axes @ np.where(significant, components, 0.0)
     spread_m = np.abs(rays.design[:, :_OFFSET] @ motion) * time.std()
-    # In a street, few rays show the motion.
+    # In a street, only a few rays are sensitive to the motion.
     shown = np.argsort(spread_m / rays.sigma)[-MIN_RAYS:]
     effect = float((spread_m / rays.sigma)[shown[0]])
     return Creep(motion[:3], motion[3:] / ARM_M, float(np.median(spread_m[shown])), effect)
 
 
 class _SweepMotion(NamedTuple):
-    """Motion of a sensor from the mean of all sweeps, and its errors.
+    """Motion of a sensor relative to the mean of all sweeps, and its errors.
 
-    Columns are the columns of `_CreepRays`.
+    The seven values correspond to the columns of `_CreepRays.design`.
     """
 
     values: Floats  # (7,)
@@ -257,7 +263,7 @@ class _SweepMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _CreepRays:
-    """Rays on smooth surfaces of the mean of all sweeps."""
+    """Rays on smooth surfaces in the mean of all sweeps."""
 
     numbers: Ints  # (t,): numbers of the sweeps
     # (k, 7): changes of ranges with the shift, with the rotation at `ARM_M`, and with the offset
@@ -267,8 +273,8 @@ class _CreepRays:
     sector: Ints  # (k,)
 
     @classmethod
-    def of_stack(cls, stack: SweepStack) -> _CreepRays:
-        """Choose rays and sweeps evenly."""
+    def from_stack(cls, stack: SweepStack) -> _CreepRays:
+        """Select rays and sweeps at even intervals."""
         numbers = even_indices(stack.sweep_count, _CREEP_SWEEPS)
         median = finite_median(stack.ranges, 0)
         count = np.isfinite(stack.ranges).sum(axis=0)
@@ -276,14 +282,14 @@ class _CreepRays:
         with np.errstate(invalid="ignore"):
             chosen = surfaces.smooth & stack.steady & (surfaces.slope < FLAT_TANGENT * median)
             near = np.abs(stack.ranges - median) < _MAX_CREEP_SIGMAS * stack.rough_sigma
-        chosen &= near.sum(axis=0) >= _MIN_NEAR_SHARE * count  # nothing passes in front
+        chosen &= near.sum(axis=0) >= _MIN_NEAR_SHARE * count  # no object passes in front
         cell = np.nonzero(chosen & (count > stack.sweep_count / 2))
         rays = even_indices(len(cell[0]), _CREEP_RAYS)
         row = cell[0][rays]
         column = cell[1][rays]
         directions = stack.directions[row, column]
         normals = surfaces.scaled_normal[row, column]
-        # A rotation w turns the direction d by w x d: the range changes by w · (d x gradient).
+        # A rotation w changes the direction d by w x d, and the range by w · (d x gradient).
         lever = -np.cross(directions, normals) * median[row, column, None]
         change = stack.ranges[numbers[:, None], row, column].astype(np.float64)
         change -= surfaces.azimuth_slope[row, column] * stack.azimuth_offsets[
@@ -298,7 +304,7 @@ class _CreepRays:
         )
 
     def steady_motion(self, contrast: Floats) -> _SweepMotion:
-        """Return the sum of the sweeps' motions by `contrast` (t,)."""
+        """Return the sum of the sweeps' motions, weighted by `contrast`."""
         motions = [self._sweep_motion(change) for change in self.change]
         return _SweepMotion(
             np.tensordot(contrast, [motion.values for motion in motions], 1),
@@ -326,9 +332,10 @@ class _CreepRays:
 
 
 def _tukey_weights(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, float]:
-    """Return weights (k,) of values (k,) in a linear fit, and the standard deviation of residuals.
+    """Return the weights of values in a robust linear fit, and the residuals' standard deviation.
 
-    The limit beyond which values do not count shrinks, so that larger motions are found, too.
+    The limit beyond which values are ignored decreases during the fit, so that larger motions are
+    also found.
     """
     motion = np.zeros(design.shape[1])
     for limit in _TUKEY_LIMITS:

@@ -1,4 +1,4 @@
-"""Bias of rings against large planes that several rings cross."""
+"""Estimate the range bias of rings from large planes that several rings cross."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ _MAX_PLANES = 8
 _PLANE_TOLERANCE_M = 0.05
 _MIN_PLANE_RAYS = 300
 _MAX_PLANE_POINTS = 20_000
-_MIN_RING_RAYS = 20  # rays of a ring on a plane that its bias needs
+_MIN_RING_RAYS = 20  # minimum number of rays of a ring on a plane
 _MAX_MEDIAN_OFFSET = 0.4  # median distance of points from their plane, over the tolerance
 _MAX_DIRECTION_GAP = 0.1  # distance of neighboring directions of one piece of a plane
-_OUTLIER_SIGMAS = 4.0  # beyond, points are not of their planes
-_STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error of the planes
+_OUTLIER_SIGMAS = 4.0  # points beyond this limit do not belong to their plane
+_STRICT_SIGMAS = 2.0  # stricter limit; the change in the solution is used as an error of the planes
 
 
 class _PlaneRays(NamedTuple):
-    """Rays on large flat surfaces that several rings cross, arrays (n,)."""
+    """Rays on large planes that several rings cross. Both arrays have shape (n,)."""
 
     rays: Indices  # indices into the rays
     plane: Ints  # numbers of the planes
 
 
 def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
-    """Estimate by how much the ranges of rows differ from the mean of all: {row: meters}.
+    """Estimate by how much the ranges of each row differ from the mean of all rows, in meters.
 
-    Large planes u · x = 1 and offsets b of the rows are fitted at once to the ranges r of rays with
-    `directions` d (k, 3): 1 / r = u · d − b / r², times r². Ranges have standard deviations
-    `error_m` (k,), meters. A row that meets a single plane has no offset. Surfaces are not quite
-    plane: intervals hold noise, and the changes of the offsets if points far from their planes, or
-    any of the planes, are left out (jackknife; Efron, 1982).
+    Planes u · x = 1 and offsets b of the rows are fitted simultaneously to the ranges r of rays
+    with directions d. The equation is 1 / r = u · d − b / r², multiplied by r². `error_m` is the
+    standard deviation of each range in meters. A row that crosses only one plane gets no offset.
+    Real surfaces are not perfectly plane, so the intervals include noise, and also the changes in
+    the offsets if points far from their planes, or single planes, are left out (jackknife; Efron,
+    1982).
     """
     if not len(rays.row):
         return {}
@@ -59,10 +60,10 @@ def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int
 
 
 def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
-    """Choose the rays on large planes, of rings that cross at least two of these planes.
+    """Select the rays on large planes, from rings that cross at least two of these planes.
 
-    `directions` (k, 3) are the unit directions of all `rays`. At most `_MAX_PLANE_POINTS` rays,
-    evenly spaced in the order of `rays`, are considered.
+    `directions` contains the unit directions of all `rays`. At most `_MAX_PLANE_POINTS` rays are
+    considered, which are sampled evenly.
     """
     indices = even_indices(len(rays.row), _MAX_PLANE_POINTS)
     plane = _segment_planes(rays.distance[indices, None] * directions[indices])
@@ -74,15 +75,16 @@ def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
 
 
 def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats, Floats]:
-    """Return the offsets of rows (r,), whose mean is 0, and the variances (r,) of the offsets.
+    """Return the offsets of the rows, whose mean is 0, and their variances.
 
-    The unknowns of `design` (n, 3 p + r) are the vectors u of p planes, then the offsets, see
-    `ring_bias`; `plane` (n,) is the plane of each equation, and `values` (n,) the right sides.
+    The unknowns of `design`, with shape (n, 3 p + r), are the vectors u of p planes, followed by
+    the offsets of r rows (see `ring_bias`). `plane` contains the plane of each equation, and
+    `values` its right-hand side.
     """
     plane_count = plane.max() + 1
     first = 3 * plane_count
     row_count = design.shape[1] - first
-    # One offset of all rows is nearly the same as other planes: the mean of the rows is 0.
+    # A common offset of all rows cannot be distinguished from shifted planes, so the mean is 0.
     centered = np.eye(row_count) - 1 / row_count
     solution, inliers = _solve_without_outliers(design, values, _OUTLIER_SIGMAS)
     offsets = centered @ solution[first:]
@@ -102,9 +104,9 @@ def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats,
 def _solve_without_outliers(
     design: Floats, values: Floats, max_sigmas: float
 ) -> tuple[Floats, Bools]:
-    """Solve least squares without residuals beyond a number of standard deviations.
+    """Solve a least-squares problem without residuals beyond `max_sigmas` standard deviations.
 
-    Returns the solution, and a mask of the equations (k,) that are used.
+    Returns the solution, and a mask of the equations that were used.
     """
     residuals = np.zeros(len(values))
     for _ in range(4):
@@ -116,7 +118,7 @@ def _solve_without_outliers(
 
 
 def _segment_planes(points: Floats) -> Ints:
-    """Return the number of the large plane that each point (n, 3) lies in, or -1."""
+    """Return the index of the large plane that contains each point, or -1."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
     plane = np.full(len(points), -1)
@@ -126,16 +128,16 @@ def _segment_planes(points: Floats) -> Ints:
             break
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[remaining]))
         (*normal, constant), _ = cloud.segment_plane(_PLANE_TOLERANCE_M, 3, 400)
-        # distance from the plane of all inliers
+        # Distance from the plane through all inliers.
         offset = np.abs(points[remaining] @ normal + constant)
         inliers = np.flatnonzero(offset < _PLANE_TOLERANCE_M)
         inlier_points = points[remaining[inliers]]
         directions = inlier_points / np.linalg.norm(inlier_points, axis=1)[:, None]
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(directions))
-        # Walls in a line are not quite one plane: the largest piece is.
+        # Aligned walls do not form an exact plane, so only the largest connected piece is used.
         piece = np.asarray(cloud.cluster_dbscan(_MAX_DIRECTION_GAP, 3))
         inliers = inliers[piece == np.bincount(piece + 1)[1:].argmax()]
-        # What fills the slab evenly is cut out of other surfaces.
+        # Points that fill the slab evenly are a cross section of other surfaces.
         is_large = len(inliers) >= _MIN_PLANE_RAYS
         if is_large and np.median(offset[inliers]) < _MAX_MEDIAN_OFFSET * _PLANE_TOLERANCE_M:
             plane[remaining[inliers]] = plane.max() + 1

@@ -1,4 +1,4 @@
-"""Finds the motion of a sensor between two sweeps that most of the changed objects show."""
+"""Search for the motion of a sensor between two sweeps that explains most changed objects."""
 
 from __future__ import annotations
 
@@ -10,62 +10,64 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 
 from .planes import ARM_M, RangeChanges
-from .sight import RigidMotion, Sight, SightPair
 from .stack import SweepStack
+from .visibility import RigidMotion, VisibilityImage, VisibilityPair
 
-MIN_SHIFT_M = 0.02  # a sensor that shifts by less stands
-MIN_YAW_RAD = 0.003  # a sensor that turns by less stands
-_MIN_OBJECTS = 3  # objects that show a motion; two without a contradiction
-_SIMILAR_SHARE = 0.95  # ratio of the scores of similar motions, at least
+MIN_SHIFT_M = 0.02  # smaller shifts count as stationary
+MIN_YAW_RAD = 0.003  # smaller rotations count as stationary
+_MIN_OBJECTS = 3  # minimum number of supporting objects, or two without a contradiction
+_SIMILAR_SHARE = 0.95  # minimum ratio of the scores of similar motions
 
-# Motions that are tried: of cars, and of turns on the spot.
+# Candidate motions: those of cars, and rotations in place.
 _MAX_SPEED_M_S = 70.0
 _MAX_SHIFT_M = 12.0
 _FIRST_SHIFT_M = 0.05
 _SHIFT_STEP = 0.05  # relative
-_DIRECTIONS = 36  # directions that are tried in a plane of free directions
-_FREE_SHARE = 0.02  # share of an axis of `RangeChanges.axes` along which a shift is free
+_DIRECTIONS = 36  # number of candidate directions in a plane of two free axes
+_FREE_SHARE = 0.02  # maximum fraction of a free axis (see `RangeChanges.axes`)
 _MAX_YAW_DEG = 45.0
 _YAW_STEP_DEG = 0.25
 _COARSE_POINTS = 120
 _CANDIDATES = 20
-_BATCH = 2000  # motions that are tried at once
+_BATCH = 2000  # number of motions that are scored at once
 _REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, meters at a distance of `ARM_M`
 _FINE_POINTS = 600
-_CENTER_STEPS = 15  # steps of the last size, to a side
-_SIMILAR_POINTS = 10  # difference of scores around the middle of a motion, at most
-_THINGS = 3  # things that are tried, the largest first
+_CENTER_STEPS = 15  # number of steps of the smallest size to either side
+_SIMILAR_POINTS = 10  # maximum difference between the scores of similar motions
+_THINGS = 3  # maximum number of moving objects to try, the largest first
 
 
 def motion_between(
     stack: SweepStack, first: int, second: int, period_ns: float | None
 ) -> RigidMotion | None:
-    """Find the motion of a sensor between two sweeps, or None if the sensor may stand.
+    """Find the motion of a sensor between two sweeps, or return None if it may be stationary.
 
-    `period_ns` is the time from sweep to sweep, if known.
+    `period_ns` is the time between consecutive sweeps, or None if it is unknown.
     """
     changes = RangeChanges.between(stack, first, second)
-    pair = SightPair.of_sweeps(Sight.of_sweep(stack, first), Sight.of_sweep(stack, second))
+    pair = VisibilityPair.from_images(
+        VisibilityImage.from_sweep(stack, first), VisibilityImage.from_sweep(stack, second)
+    )
     max_shift_m = _MAX_SHIFT_M
     if period_ns:
         max_shift_m = min(max_shift_m, _MAX_SPEED_M_S * period_ns / 1e9 * (second - first))
     by_planes = changes.motion()
     if by_planes is not None and not _is_shown(by_planes, pair, changes):
         by_planes = None
-    by_sight = _shown_by_sight(pair, changes, max_shift_m)
+    by_sight = _search_by_visibility(pair, changes, max_shift_m)
     if by_sight is None:
         return by_planes
-    by_sight = _centered(pair, by_sight)
+    by_sight = _center_motion(pair, by_sight)
     if by_planes is None:
         return by_sight
-    # Planes are more exact, unless the rays have left them.
+    # Planes are more accurate, unless the rays no longer hit the same planes.
     sample = pair.sample(_FINE_POINTS)
     planes_score, sight_score = (pair.score(motion, *sample) for motion in (by_planes, by_sight))
     return by_planes if planes_score > _SIMILAR_SHARE * sight_score else by_sight
 
 
-def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bool:
-    """Return True if more objects show a motion than speak against the motion."""
+def _is_shown(motion: RigidMotion, pair: VisibilityPair, changes: RangeChanges) -> bool:
+    """Return True if more objects support a motion than contradict it."""
     if np.linalg.norm(motion.shift) < MIN_SHIFT_M and abs(motion.yaw_rad) < MIN_YAW_RAD:
         return False
     evidence = pair.evidence(motion), changes.evidence(motion)
@@ -75,12 +77,13 @@ def _is_shown(motion: RigidMotion, pair: SightPair, changes: RangeChanges) -> bo
     return bool(is_clear and moved > against)
 
 
-def _shown_by_sight(
-    pair: SightPair, changes: RangeChanges, max_shift_m: float
+def _search_by_visibility(
+    pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 ) -> RigidMotion | None:
-    """Search motions until one is shown, or few objects are left that changed.
+    """Search for a motion that is supported by objects, until few changed objects remain.
 
-    The motion that explains most points may be the motion of a car beside the sensor.
+    The motion that explains most points may belong to a car beside the sensor, in which case the
+    points that it explains are removed and the search is repeated.
     """
     remaining = pair
     for _ in range(_THINGS):
@@ -93,18 +96,18 @@ def _shown_by_sight(
     return None
 
 
-def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
-    """Find the motion that brings most points of two sweeps to one place."""
+def _best_motion(pair: VisibilityPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
+    """Find the motion that aligns most points of two sweeps."""
     motions = _coarse_motions(_free_axes(changes), max_shift_m)
     sample = pair.sample(_COARSE_POINTS)
     scores = np.concatenate([pair.score(batch, *sample) for batch in _batches(motions)])
-    candidates = _chosen(motions, np.argsort(-scores, kind="stable")[:_CANDIDATES])
+    candidates = _select_motions(motions, np.argsort(-scores, kind="stable")[:_CANDIDATES])
     sample = pair.sample(_FINE_POINTS)
-    best, best_score = _highest(pair, candidates, sample)
+    best, best_score = _select_best(pair, candidates, sample)
     for step_m in _REFINEMENTS_M:
         while True:
             steps = step_m * np.concatenate([np.eye(4), -np.eye(4)])
-            refined, score = _highest(pair, _moved_by(best, steps), sample)
+            refined, score = _select_best(pair, _add_offsets(best, steps), sample)
             if score <= best_score:
                 break
             best, best_score = refined, score
@@ -112,9 +115,9 @@ def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> 
 
 
 def _free_axes(changes: RangeChanges) -> Floats:
-    """Return axes (m, 3) along which the sensor may shift.
+    """Return the axes along which a shift of the sensor would change few ranges, with shape (m, 3).
 
-    If the sensor may shift along none, the two freest axes are returned.
+    If there are none, the two axes with the smallest changes are returned.
     """
     axes, shares = changes.axes()
     free = int((shares < _FREE_SHARE).sum())
@@ -122,7 +125,7 @@ def _free_axes(changes: RangeChanges) -> Floats:
 
 
 def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
-    """Return turns on the spot, and shifts along one axis or in the plane of two axes (m, 3)."""
+    """Return candidate motions: rotations in place, and shifts along one or two axes."""
     yaw_rad = np.radians(np.arange(_YAW_STEP_DEG, _MAX_YAW_DEG, _YAW_STEP_DEG))
     directions = axes[:1]
     if len(axes) > 1:
@@ -136,36 +139,35 @@ def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
 
 
 def _batches(motions: RigidMotion) -> Iterator[RigidMotion]:
-    """Yield the motions in batches that fit into memory."""
     for start in range(0, len(motions.shift), _BATCH):
-        yield _chosen(motions, slice(start, start + _BATCH))
+        yield _select_motions(motions, slice(start, start + _BATCH))
 
 
-def _chosen(motions: RigidMotion, index: Any) -> RigidMotion:
+def _select_motions(motions: RigidMotion, index: Any) -> RigidMotion:
     """Select motions by index."""
     return RigidMotion(motions.shift[index], motions.yaw_rad[index])
 
 
-def _highest(
-    pair: SightPair, motions: RigidMotion, sample: tuple[Floats, Floats]
+def _select_best(
+    pair: VisibilityPair, motions: RigidMotion, sample: tuple[Floats, Floats]
 ) -> tuple[RigidMotion, int]:
-    """Return the first of the motions with the highest score, and the score."""
+    """Return the motion with the highest score, and its score. The first motion wins ties."""
     scores = pair.score(motions, *sample)
-    return _chosen(motions, scores.argmax()), int(scores.max())
+    return _select_motions(motions, scores.argmax()), int(scores.max())
 
 
-def _moved_by(motion: RigidMotion, offsets: Floats) -> RigidMotion:
-    """Add shifts, and yaws at `ARM_M`, (…, 4) in meters, to a motion."""
+def _add_offsets(motion: RigidMotion, offsets: Floats) -> RigidMotion:
+    """Add offsets of shape (…, 4) to a motion: shifts, and yaw at `ARM_M`, in meters."""
     return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
 
 
-def _centered(pair: SightPair, motion: RigidMotion) -> RigidMotion:
-    """Return the middle of the motions that explain two sweeps about as well as a motion."""
+def _center_motion(pair: VisibilityPair, motion: RigidMotion) -> RigidMotion:
+    """Return the center of the motions that explain two sweeps nearly as well as `motion`."""
     sample = pair.sample(_FINE_POINTS)
     steps_m = np.arange(-_CENTER_STEPS, _CENTER_STEPS + 1) * _REFINEMENTS_M[-1]
     for axis in np.eye(4):
         offsets = steps_m[:, None] * axis
-        scores = pair.score(_moved_by(motion, offsets), *sample)
+        scores = pair.score(_add_offsets(motion, offsets), *sample)
         similar = scores > scores.max() - _SIMILAR_POINTS
-        motion = _moved_by(motion, offsets[similar].mean(axis=0))
+        motion = _add_offsets(motion, offsets[similar].mean(axis=0))
     return motion

@@ -1,4 +1,4 @@
-"""Smooth surfaces of range images, and the rays that meet them in all sweeps."""
+"""Find smooth surfaces in range images, and the rays that hit them in all sweeps."""
 
 from __future__ import annotations
 
@@ -11,29 +11,31 @@ from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 
 from .stack import MAX_KINK_M, SweepStack, finite_median
 
-MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
-_MAX_BEAM_ORIGIN_M = 0.1  # how far from zero the beams of a head may meet
-MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
-FLAT_TANGENT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
+MIN_RANGE_M = 0.1  # closer points are on the sensor's cover
+_MAX_BEAM_ORIGIN_M = 0.1  # maximum distance of the beams' intersection from the sensor's origin
+# Tangents of the angle of incidence. Beyond the first, a beam hits several surfaces. Beyond the
+# second, direction noise increases mean ranges.
+MAX_TANGENT = 5.7
+FLAT_TANGENT = 1.7
 MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each meter of range
 SCENE_TOLERANCE_M = 0.3  # how far surfaces may be from the scene's
-# Noise of directions before the noise is estimated, for the choice of outliers.
+# Direction noise that is assumed for outlier detection until it has been estimated.
 ASSUMED_DIRECTION_NOISE_RAD = 0.002
-MAX_SIGMAS = 6.0  # a return beyond is of something that moves
-MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
+MAX_SIGMAS = 6.0  # returns beyond this limit belong to moving objects
+MIN_RETURN_SHARE = 0.8  # minimum fraction of a ray's returns that belong to the same surface
 
 
-class Surfaces(NamedTuple):
-    """Surfaces of a range image, (r, c) each."""
+class SmoothSurfaces(NamedTuple):
+    """Local surfaces in the cells of a range image. Arrays have shape (r, c)."""
 
-    azimuth_slope: Floats  # growth of the range with the azimuth, meters in a radian
-    slope: Floats  # growth of the range with the direction of steepest growth, meters in a radian
+    azimuth_slope: Floats  # growth of the range with the azimuth, meters per radian
+    slope: Floats  # growth of the range with the direction of steepest growth, meters per radian
     smooth: Bools  # whether the neighbors lie in one plane with the cell
     scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
-class Neighbors(NamedTuple):
-    """Points (r, c, 3) of the cells beside each cell of a range image, meters."""
+class CellNeighbors(NamedTuple):
+    """Points in the cells beside each cell of a range image, in meters. Shape (r, c, 3) each."""
 
     next_1: Floats
     previous_1: Floats
@@ -43,23 +45,26 @@ class Neighbors(NamedTuple):
     below: Floats
 
     @classmethod
-    def from_points(cls, points: Floats) -> Neighbors:
-        """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
+    def from_points(cls, points: Floats) -> CellNeighbors:
+        """Find the neighbors of each point.
+
+        Columns wrap around, because they cover a full revolution.
+        """
         row_numbers = np.arange(len(points))
         columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
         rings = (points[np.clip(row_numbers + shift, 0, row_numbers[-1])] for shift in (-1, 1))
         return cls(*columns, *rings)
 
     def normals(self) -> Floats:
-        """Return the normals (r, c, 3) of surfaces, of any length."""
+        """Return the surface normals, which are not normalized."""
         rise = self.above - self.below if len(self.above) > 2 else np.array([0, 0, 1.0])
         run = 2 * (self.next_2 - self.previous_2) + self.next_1 - self.previous_1
         return np.cross(run, rise)
 
     def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
-        """Mark points (r, c, 3) whose neighbors lie in the plane of the point and its normal.
+        """Mark points whose neighbors lie in the plane defined by the point and its normal.
 
-        Tolerances (r, c) are for neighbors in the next column; for others they are doubled.
+        The tolerance applies to neighbors in adjacent columns. It is doubled for other neighbors.
         """
         means_1 = (self.next_1 + self.previous_1) / 2
         means_2 = (self.next_2 + self.previous_2) / 2
@@ -71,14 +76,14 @@ class Neighbors(NamedTuple):
         return coplanar
 
 
-def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
-    """Find slopes and edges of a range image `distance` (r, c) with errors (r, c), meters."""
+def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> SmoothSurfaces:
+    """Find slopes and edges in a range image. `error_m` is the error of each range in meters."""
     points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _beam_origins(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
         directions = beams / length
-        neighbors = Neighbors.from_points(points)
+        neighbors = CellNeighbors.from_points(points)
         normal = neighbors.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * directions).sum(axis=-1, keepdims=True)
@@ -88,14 +93,14 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfa
         smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
         smooth &= neighbors.are_coplanar(points, normal, tolerance_m)
     azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
-    return Surfaces(azimuth_slope, slope, smooth, normal)
+    return SmoothSurfaces(azimuth_slope, slope, smooth, normal)
 
 
 def _beam_origins(points: Floats) -> Floats:
-    """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), meters.
+    """Return the origin of the beams in each row, in meters. Shape (r, 1, 3).
 
-    Beams of a row meet on the z axis, near zero: heights grow linearly with the distance from the
-    axis, and the height at distance 0 is the origin.
+    The beams in a row intersect on the z axis, near the sensor's origin. Their height increases
+    linearly with the distance from the axis, and the height at distance 0 is the origin.
     """
     with warnings.catch_warnings(action="ignore"):
         distance = np.hypot(points[..., 0], points[..., 1])
@@ -104,21 +109,21 @@ def _beam_origins(points: Floats) -> Floats:
         offset = distance - np.nanmean(distance, axis=1, keepdims=True)
         tangent = np.nansum(offset * height, axis=1) / np.nansum(offset**2, axis=1)
         origin = np.nanmean(height, axis=1) - tangent * mean_distance
-    plausible = np.abs(origin) < _MAX_BEAM_ORIGIN_M  # also false of NaN
+    plausible = np.abs(origin) < _MAX_BEAM_ORIGIN_M  # False for NaN
     return np.where(plausible, origin, 0)[:, None, None] * np.array([0, 0, 1.0])
 
 
 class SmoothRays(NamedTuple):
-    """Rays that meet smooth surfaces, (k,) each."""
+    """Rays that hit smooth surfaces. All arrays have shape (k,)."""
 
     row: Ints
     column: Ints
     distance: Floats  # mean of the ranges, meters
-    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, meters in a radian
+    slope: Floats  # meters per radian, see `SmoothSurfaces.slope`
     intensity: Floats  # mean; NaN if unknown
     return_counts: Ints  # number of sweeps with a return
-    trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
-    variance: Floats  # variance of the range over the sweeps, square meters
+    trials: Ints  # number of sweeps that cover the ray, see `SweepStack`
+    variance: Floats  # variance of the range over all sweeps, in square meters
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
@@ -127,7 +132,7 @@ class SmoothRays(NamedTuple):
 
 
 class _RayStatistics(NamedTuple):
-    """Statistics of the returns of rays, without returns that are outliers, (k,) each."""
+    """Statistics of the returns of rays without outliers. All arrays have shape (k,)."""
 
     mean_range: Floats  # meters
     mean_intensity: Floats
@@ -138,12 +143,12 @@ class _RayStatistics(NamedTuple):
 def select_smooth_rays(
     stack: SweepStack, sigma: Floats, direction_noise_rad: float, expected: Floats | None = None
 ) -> SmoothRays:
-    """Choose rays away from edges, and compute the statistics of their returns.
+    """Select rays away from edges, and compute the statistics of their returns.
 
-    A return is an outlier if the range is more than `MAX_SIGMAS` standard deviations from the
-    median of the ray, by the noise of ranges `sigma` (r, c), meters, and of directions. Outliers
-    are left out, and rays with many outliers. Slopes are taken from a scene's ranges `expected`
-    (r, c), meters, if known.
+    A return is an outlier if its range differs from the median of the ray by more than `MAX_SIGMAS`
+    standard deviations. The standard deviation combines the range noise `sigma` in meters and the
+    direction noise. Outliers, and rays with many outliers, are excluded. If the scene's ranges
+    `expected` are known, slopes are derived from them.
     """
     median = finite_median(stack.ranges, 0)
     return_count = np.isfinite(stack.ranges).sum(axis=0)
@@ -176,9 +181,9 @@ def select_smooth_rays(
 
 
 def among_smooth(smooth: Bools) -> Bools:
-    """Mark smooth cells (r, c) that have smooth cells beside them.
+    """Mark smooth cells that have smooth neighbors.
 
-    A cell that is smooth by chance, as in leaves, has none.
+    Cells that are smooth by chance, such as in foliage, usually have none.
     """
     neighbors = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
     return np.asarray(smooth & (neighbors >= 3))
@@ -191,10 +196,10 @@ def _ray_statistics(
     median: Floats,
     limit_m: Floats,
 ) -> _RayStatistics:
-    """Compute the statistics of returns within a distance (k,) from the median range (k,).
+    """Compute the statistics of returns within `limit_m` of the median range of their ray.
 
-    `cell` has the rows and columns (k,) of the rays. Ranges are corrected for the azimuths of
-    their pulses by `azimuth_slope` (k,), as of `Surfaces`; all distances are in meters.
+    `cell` contains the row and column indices of the rays. Ranges are corrected for the azimuths of
+    their pulses by `azimuth_slope` (see `SmoothSurfaces`). All distances are in meters.
     """
     row, column = cell
     ranges = stack.ranges[:, row, column].astype(np.float64)

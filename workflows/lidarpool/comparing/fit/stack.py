@@ -1,8 +1,8 @@
-"""Sweeps of a recording in the same cells.
+"""Sweeps of a recording on common cells.
 
-A cell is a ring and a column, which is a step of azimuth of a revolution. All pulses that the
-sweeps send into a cell are pulses of the same ray. Arrays have s sweeps, r rings (rows), c columns
-and k rays; positions and directions are in the sensor frame.
+A cell is defined by a ring and a column, which is an azimuth step. All pulses in the same cell
+belong to the same ray. Arrays have s sweeps, r rings (rows), c columns and k rays. Positions and
+directions are in the sensor frame.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, rings_note
 from ..range_image import RangeImages, range_images
 
-MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly
-_MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
-_NEIGHBOR_RAYS = 5  # rays on either side whose scatter counts
-_MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
-_MAX_LOG_CHANCE = -16.0  # pulses missing together are a gap if losing them is unlikelier
-_STEADY_PATCH = (3, 9)  # rows and columns of cells whose returns are counted together
-MAX_KINK_M = 0.01  # distance of a surface from its plane within four columns, at most
+MAX_RETURNS = 1 << 24  # maximum number in memory; longer recordings are sampled evenly by sweep
+_MAX_FOREIGN_SHARE = 0.1  # maximum fraction of points in rings that the reference does not have
+_NEIGHBOR_RAYS = 5  # number of rays on either side whose scatter is included
+_MIN_CELL_SHARE = 0.3  # cells that return in a smaller fraction of sweeps do not reveal gaps
+_MAX_LOG_CHANCE = -16.0  # missing pulses are a gap if losing them by chance is less likely
+_STEADY_PATCH = (3, 9)  # rows and columns of the patches in which returns are counted
+MAX_KINK_M = 0.01  # maximum distance of a surface from its plane within four columns
 
 
 @dataclass(frozen=True, eq=False)
 class SweepStack:
-    """Returns of all sweeps in the same cells, the highest ring first, NaN without a return."""
+    """Returns of all sweeps on common cells, by descending ring elevation, NaN without a return."""
 
     numbers: Ints  # (s,): numbers of the sweeps in the recording
     rings: Ints  # (r,): numbers of the rings
-    elevation_deg: Floats  # (r,): of the rings
+    elevation_deg: Floats  # (r,): elevations of the rings
     directions: Floats  # (r, c, 3): mean unit directions of the cells
     ranges: Floats32  # (s, r, c): meters
     intensities: Floats32  # (s, r, c)
-    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less `directions`, radians
+    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses minus `directions`, radians
     rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, meters
-    covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, returned or lost
+    covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, even if it was lost
     notes: tuple[str, ...]
 
     @property
@@ -56,21 +56,21 @@ class SweepStack:
 
     @cached_property
     def trials(self) -> Ints:
-        """Number of sweeps that cover each cell, with a return or a lost pulse: (r, c)."""
+        """Number of sweeps that cover each cell, with a return or a lost pulse. Shape (r, c)."""
         return np.asarray(self.covered.sum(axis=0))
 
     @cached_property
     def steady(self) -> Bools:
-        """Cells (r, c) around which no thing comes or goes between the sweeps."""
+        """Mask of the cells around which no object appears or disappears. Shape (r, c)."""
         return steady_cells(np.isfinite(self.ranges), self.covered)
 
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep] | None = None) -> SweepStack:
-        """Read the sweeps of a recording into the same cells.
+        """Read the sweeps of a recording into common cells.
 
-        `read` reads the returns of a sweep by its number. The default is `compared_sweep`.
-
-        LidarError if the recording has no sweeps with points and rings, or is of several sensors.
+        `read` is a function that reads the returns of a sweep by its index. The default is
+        `compared_sweep`. Raises LidarError if the recording has no sweeps with points and rings, or
+        contains several sensors.
         """
         check_sweeps(recording)
         read = read or partial(compared_sweep, recording)
@@ -110,7 +110,7 @@ class SweepStack:
 
 
 def check_sweeps(recording: Recording) -> None:
-    """Raise LidarError unless a recording has sweeps, with all returns."""
+    """Raise LidarError unless a recording has sweeps that contain all returns."""
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
     if recording.is_cloud or not recording.count:
@@ -121,10 +121,7 @@ def check_sweeps(recording: Recording) -> None:
 
 @dataclass(eq=False)
 class _CommonCells:
-    """Cells of a sensor that are filled sweep by sweep.
-
-    A ring is added with its first return.
-    """
+    """Cells that are filled sweep by sweep. A ring is added with its first return."""
 
     numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
     reference: Sweep  # the sweep whose rings and steps of azimuth define the cells
@@ -136,11 +133,12 @@ class _CommonCells:
 
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep]) -> _CommonCells:
-        """Define empty cells by the largest of the first three sweeps."""
+        """Create empty cells, defined by the largest of the first three sweeps."""
         reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
-        # This determines the rings. Errors of reading a sweep already name the recording.
+        # This call determines the rings. It stays outside `prefixed`, because errors that occur
+        # when a sweep is read already name the recording.
         ring_notes = rings_note(recording, reference)
         with prefixed(recording.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
@@ -153,13 +151,13 @@ class _CommonCells:
 
     @property
     def step_deg(self) -> float:
-        """Width of a column, degrees."""
+        """Width of a column in degrees."""
         return self.images.step_deg
 
     def add_sweep(self, index: int, points: Sweep) -> None:
-        """Put the sweep `numbers[index]` into the cells.
+        """Add the points of the sweep `numbers[index]` to the cells.
 
-        LidarError if the sweep is of another sensor.
+        Raises LidarError if the sweep comes from a different sensor.
         """
         if not len(points):
             return
@@ -167,10 +165,10 @@ class _CommonCells:
         names = (f"sweep {number}", "another")
         sweep = range_images(points, self.reference, names, self.step_deg)
         returned = np.isfinite(sweep.images[0, 0])
-        # Rings of false alarms alone may have no return in the first sweeps.
+        # A ring that contains only false alarms may have no return in the first sweeps.
         foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
         is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
-        # With other steps of azimuth, more points lie behind others of their cell.
+        # If the azimuth steps differ, more points share a cell with another point.
         if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
             raise LidarError(
                 f"sweep {number} comes from a different sensor, or was recorded in a different "
@@ -184,7 +182,7 @@ class _CommonCells:
         self.values[:, index, row_indices[:, None], columns] = sweep.images[0][:, sweep_rows]
 
     def _add_rings(self, sweep: RangeImages) -> None:
-        """Append rows for the rings of a sweep that no earlier sweep had."""
+        """Append rows for the rings of a sweep that no earlier sweep contained."""
         is_new = ~np.isin(sweep.rings, self.rings)
         if not is_new.any():
             return
@@ -196,21 +194,21 @@ class _CommonCells:
 
     @property
     def have_points(self) -> Bools:
-        """Mask of the sweeps that have points: (s,)."""
+        """Mask of the sweeps that have points. Shape (s,)."""
         return np.asarray(np.isfinite(self.values[0]).any(axis=(1, 2)))
 
     def _order(self) -> Ints:
-        """Order of the rows by elevation, the highest first."""
+        """Return row indices that sort the rows by descending elevation."""
         return np.argsort(-self.elevation_deg, kind="stable")
 
     def sorted_rings(self) -> Ints:
-        """Return the rings, the highest first."""
+        """Return the rings by descending elevation."""
         return np.asarray(self.rings[self._order()])
 
     def sorted_by_elevation(self) -> tuple[Floats, Floats32]:
-        """Return elevations (r,) and values (4, s, r, c), the highest ring first.
+        """Return the elevations and values by descending elevation.
 
-        Sweeps without points are left out.
+        The arrays have shapes (r,) and (4, s, r, c). Sweeps without points are omitted.
         """
         order = self._order()
         return self.elevation_deg[order], self.values[:, self.have_points][:, :, order]
@@ -219,9 +217,10 @@ class _CommonCells:
 def _mean_directions(
     values: Floats32, elevation_deg: Floats, step_deg: float
 ) -> tuple[Floats, Floats32]:
-    """Return the mean directions of cells (r, c, 3), and offsets of azimuths (s, r, c), radians.
+    """Return the mean direction of each cell, and the azimuth offsets from it in radians.
 
-    `values` (4, s, r, c) come from `_CommonCells`, `elevation_deg` (r,) holds elevations of rings.
+    The shapes are (r, c, 3) and (s, r, c). `values` comes from `_CommonCells`, and `elevation_deg`
+    contains the elevation of each ring.
     """
     grid_azimuth = np.radians(step_deg * np.arange(values.shape[-1]))
     grid_elevation = elevation_deg[:, None]
@@ -242,16 +241,16 @@ def _mean_directions(
 
 
 def finite_median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
-    """Return medians of the finite values along axes, float64, NaN without finite values."""
+    """Return the median of the finite values along axes in float64, or NaN if there are none."""
     with warnings.catch_warnings(action="ignore"):
         return np.nanmedian(values, axis=axis).astype(np.float64)
 
 
 def rough_scatter(ranges: Floats32) -> Floats:
-    """Estimate the standard deviation (r, c) over the sweeps of ranges (s, r, c), meters.
+    """Estimate the standard deviation of ranges in each cell over all sweeps, in meters.
 
-    The estimate is a median over neighboring rays, and at least the median of the ring. Ranges of
-    weak or steep surfaces scatter more than ranges of other surfaces of the ring.
+    The result is a median over neighboring rays, but not less than the median of the ring. Ranges
+    of weak or steep surfaces scatter more than other ranges of the same ring.
     """
     changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
     ring_scatter = finite_median(changes, (0, 2))[:, None]
@@ -265,15 +264,15 @@ def rough_scatter(ranges: Floats32) -> Floats:
 
 
 def covered_cells(returned: Bools) -> Bools:
-    """Return a mask of the cells (s, r, c) into which a sweep sent a pulse: no gaps.
+    """Return a mask of the cells into which a sweep sent a pulse, with shape (s, r, c).
 
-    Lost packets and sweeps cut short make gaps. `returned` (s, r, c) marks the cells with a return.
-    A run of cells without a return, in all rings or in one ring, is a gap if pulses that are lost
-    independently would hardly ever make such a run.
+    The other cells are gaps due to lost packets or incomplete sweeps. `returned` marks the cells
+    with a return. A run of cells without a return, in one ring or in all rings, is considered a gap
+    if independent losses of pulses are very unlikely to produce such a run.
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
     log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)
-    # Columns without a return in any ring are gaps also where few sweeps return at all.
+    # Columns without a return in any ring are gaps even if few sweeps return there.
     sparse_log_chance = np.log1p(-returned.sum(axis=0) / (len(returned) + 1)).sum(axis=0)
     columns = _improbable_runs(np.asarray(~returned.any(axis=1)), sparse_log_chance)
     rings = _improbable_runs(~returned, log_chance)
@@ -281,9 +280,10 @@ def covered_cells(returned: Bools) -> Bools:
 
 
 def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
-    """Mark runs of empty cells along the last axis, a revolution, that are too long for chance.
+    """Mark runs of empty cells that are too long to be a coincidence.
 
-    `log_chance` are the logarithms of the chances that cells are empty; the last axis is columns.
+    Runs extend along the last axis, which is a revolution. `log_chance` contains the logarithm of
+    the probability that a cell is empty.
     """
     count = empty.shape[-1]
     edge = np.zeros((*empty.shape[:-1], 1), bool)
@@ -303,12 +303,13 @@ def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
 
 
 def steady_cells(returned: Bools, covered: Bools) -> Bools:
-    """Mark the cells (r, c) around which no thing comes or goes.
+    """Mark the cells around which no object appears or disappears between sweeps.
 
-    Where a car drives past in front of the sky, pulses of many cells return in some sweeps and in
-    none of the others. Pulses that are lost independently would hardly ever do so: the number of
-    returns of a patch of cells would be near the mean, by the bound of Chernoff (1952). `returned`
-    and `covered` (s, r, c) mark cells with a return, and cells into which a sweep sent a pulse.
+    If a car drives past in front of the sky, the pulses of many cells return in some sweeps and in
+    none of the others. Independent losses are very unlikely to produce this pattern: by the bound
+    of Chernoff (1952), the number of returns in a patch of cells would be close to its mean.
+    `returned` and `covered` mark cells with a return, and cells into which a sweep sent a pulse.
+    Both have shape (s, r, c).
     """
     from scipy.ndimage import maximum_filter, uniform_filter
     from scipy.special import rel_entr

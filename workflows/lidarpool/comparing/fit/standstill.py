@@ -1,4 +1,4 @@
-"""Whether a sensor stands during a recording: motion, creep, and drift of its ranges."""
+"""Determine whether a sensor is stationary during a recording: motion, creep and range drift."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from lidarsim.base.words import rounded
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
 from .search import MIN_SHIFT_M, MIN_YAW_RAD, motion_between
-from .sight import RigidMotion
 from .stack import SweepStack, finite_median
+from .visibility import RigidMotion
 
-_NEXT_PAIRS = 5  # pairs of a sweep and the next that are compared
-_MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static scene
-# ranges drift if changes over many sweeps grow by this factor
+_NEXT_PAIRS = 5  # number of pairs of consecutive sweeps to compare
+_MAX_CHANGE_M = 0.1  # maximum median range change between consecutive sweeps of a static scene
+# Ranges drift if their changes over many sweeps are larger by this factor.
 _DRIFT_FACTOR = 1.5
 _DRIFT_M = 0.002
-_MIN_CREEP_M = 0.0015  # standard deviation of ranges by creep
-_MIN_CREEP_EFFECT = 0.15  # the same, over that by noise: noise would be 1 % too large
+_MIN_CREEP_M = 0.0015  # minimum standard deviation of ranges due to creep
+_MIN_CREEP_EFFECT = 0.15  # minimum ratio to the noise, which would be overestimated by 1 %
 
 
 class Speed(NamedTuple):
-    """Motion of a sensor from sweep to sweep."""
+    """Motion of a sensor between consecutive sweeps."""
 
     shift_m: float
     turn_deg: float
@@ -35,10 +35,10 @@ class Speed(NamedTuple):
 
 
 def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
-    """Read the sweeps of a sensor that stands into the same cells.
+    """Read the sweeps of a stationary sensor into common cells.
 
-    `stands` says that the sensor is known to stand. LidarError as of `SweepStack.read`, or if the
-    sensor or the recorded scene moves.
+    If `stands` is true, the sensor is known to be stationary. Raises the same errors as
+    `SweepStack.read`, and LidarError if the sensor or the recorded scene moves.
     """
     stack = SweepStack.read(recording)
     if stack.sweep_count < 2:
@@ -65,17 +65,14 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
 
 
 def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
-    """Return the median time from a sweep of `numbers` to the next, or None if unknown."""
+    """Return the median time between consecutive sweeps, or None if it is unknown."""
     if len(numbers) < 2 or recording.stamps_ns is None:
         return None
     return float(np.median(np.diff(recording.stamps_ns[numbers])))
 
 
 def moving_message(name: str, speed: Speed, advice: str) -> str:
-    """Return the message that the sensor of a recording moves.
-
-    `advice` is the first piece of advice.
-    """
+    """Return the error message for a moving sensor. `advice` is the first suggested remedy."""
     amounts = []
     if speed.shift_m > 0:
         by_time = ""
@@ -92,10 +89,10 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
 
 
 def find_motion(stack: SweepStack, period_ns: float | None) -> Speed | None:
-    """Find the motion of a sensor by the rays that the motion changes.
+    """Find the motion of a sensor, or return None if the sensor is stationary.
 
-    Return None if the sensor stands. Sweeps are compared with the next, and with the sweeps half a
-    recording later. The first sweep is compared with the last: a slow motion shows in sweeps that
+    Sweeps are compared with the next sweep, and with the sweep half a recording later. The first
+    sweep is also compared with the last, because a slow motion is detectable only in sweeps that
     are far apart.
     """
     last = stack.sweep_count - 1
@@ -122,7 +119,7 @@ def find_motion(stack: SweepStack, period_ns: float | None) -> Speed | None:
 
 
 def _speed(motions: list[RigidMotion], lag: int, period_ns: float | None) -> Speed:
-    """Return the median of motions in `lag` sweeps."""
+    """Return the median of motions between sweeps that are `lag` sweeps apart."""
     shift_m = float(np.median([np.linalg.norm(motion.shift) for motion in motions]))
     yaw_rad = float(np.median([abs(motion.yaw_rad) for motion in motions]))
     return Speed(
@@ -133,7 +130,7 @@ def _speed(motions: list[RigidMotion], lag: int, period_ns: float | None) -> Spe
 
 
 def _check_drift(stack: SweepStack, name: str) -> None:
-    """Raise LidarError if ranges change more over many sweeps than from sweep to sweep."""
+    """Raise LidarError if ranges change more over many sweeps than between consecutive sweeps."""
     lag = stack.sweep_count // 2
     step_m = range_scatter(stack, 1)
     drift_m = range_scatter(stack, lag)

@@ -9,7 +9,7 @@ from copy import deepcopy
 
 from lidarsim.base.errors import LidarError
 
-from ...datasets.figures import Figures
+from ...datasets.figures import DataSetStatistics
 from ...datasets.job_table import JobRow
 from ...report.charts import draw_results, draw_varied
 from .cpu_share import CpuShare
@@ -25,7 +25,7 @@ class Charts:
     """
 
     def __init__(self, names: Sequence[str], count: int) -> None:
-        self._figures = Figures(names)
+        self._figures = DataSetStatistics(names)
         self._count = count
         self._lock = threading.Lock()
         self._drawing = threading.Lock()

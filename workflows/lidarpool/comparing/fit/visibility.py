@@ -1,9 +1,9 @@
-"""What one sweep sees at the points of another: evidence of a sensor's motion in few rays.
+"""Evidence of a sensor's motion: whether one sweep sees the points of another.
 
-In a street, a sensor that moves along the walls measures nearly the same ranges in each sweep: only
-parked cars and posts move past. Cars that drive past a sensor that stands look alike, so a motion
-is judged by all that both sweeps see: by the objects that the motion brings to one place, by the
-objects that were in one place without the motion, and by those that neither explains.
+In a street, a sensor that moves parallel to the walls measures nearly the same ranges in each
+sweep. Only parked cars and posts appear to move. Cars that drive past a stationary sensor look
+similar. Therefore a motion is judged by all objects that both sweeps see: objects that the motion
+aligns, objects that are aligned without the motion, and objects that neither explains.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from lidarsim.base.even_samples import even_indices
 
 from .stack import SweepStack
 
-# Tolerance of ranges: at least, for each standard deviation of noise, and for each meter.
+# Range tolerance: its minimum, per standard deviation of the noise, and per meter of range.
 _TOLERANCE_M = 0.05
 _TOLERANCE_SIGMAS = 6.0
 _TOLERANCE_PER_M = 0.01
-# Rows and columns of cells, to either side of a direction, where an object would have returned.
+# Number of rows and columns on either side of a direction in which an object would have returned.
 _EMPTY_ROWS = 1
 _EMPTY_COLUMNS = 3
-_MAX_RANGE_SHARE = 0.7  # share of the largest ranges where an object would have returned
-_MAX_POINTS = 20_000  # points of a sweep that are looked up in the other sweep
+_MAX_RANGE_SHARE = 0.7  # fraction of the largest ranges up to which an object would have returned
+_MAX_POINTS = 20_000  # maximum number of points of a sweep to classify by the other sweep
 _MAX_DISTANCE_M = 60.0  # farther objects are too small
 _CLUSTER_M = 2.0  # points of one object are closer
 _MIN_CLUSTER_POINTS = 3
@@ -36,7 +36,7 @@ _OWN_VEHICLE_M = 2.5  # distance from the sensor to its vehicle
 _STAYED = 1  # index of the field of `Evidence`
 WALL_OBJECTS = 3  # objects that a wall counts as
 
-# What a sweep says of a point: there is a surface, nothing is known, or a ray passed through.
+# Classes of a point in another sweep: on a surface, unknown, or in empty space that a ray passed.
 _SURFACE = 1
 _UNKNOWN = 0
 _EMPTY = -1
@@ -44,25 +44,27 @@ _KNOWN = (_EMPTY, _SURFACE)
 
 
 class RigidMotion(NamedTuple):
-    """Motion of a sensor from one sweep to another, in the sensor frame of the first.
+    """Motion of a sensor between two sweeps, in the sensor frame of the first sweep.
 
-    Leading axes (…) are of several motions.
+    Leading axes (…) index several motions.
     """
 
     shift: Floats  # (…, 3): meters
     yaw_rad: Floats  # (…)
 
     def to_first(self, points: Floats) -> Floats:
-        """Convert points (n, 3) of the second sweep to the frame of the first: (…, n, 3)."""
-        return np.asarray(_rotated(points, self.yaw_rad[..., None]) + self.shift[..., None, :])
+        """Convert points of the second sweep to the frame of the first: (n, 3) to (…, n, 3)."""
+        return np.asarray(
+            _rotate_about_z(points, self.yaw_rad[..., None]) + self.shift[..., None, :]
+        )
 
     def to_second(self, points: Floats) -> Floats:
-        """Convert points (n, 3) of the first sweep to the frame of the second: (…, n, 3)."""
-        return _rotated(points - self.shift[..., None, :], -self.yaw_rad[..., None])
+        """Convert points of the first sweep to the frame of the second: (n, 3) to (…, n, 3)."""
+        return _rotate_about_z(points - self.shift[..., None, :], -self.yaw_rad[..., None])
 
 
-def _rotated(points: Floats, yaw_rad: Floats) -> Floats:
-    """Rotate points (…, 3) about the z axis by angles (…)."""
+def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
+    """Rotate points of shape (…, 3) about the z axis by angles of shape (…)."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
@@ -70,34 +72,34 @@ def _rotated(points: Floats, yaw_rad: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """Nearest and farthest surfaces of a sweep around each direction."""
+class VisibilityImage:
+    """Closest and farthest surfaces of a sweep around each direction."""
 
     elevation_rad: Floats  # (r,): of the rows, descending
     step_rad: float  # width of a column
     row_phase: Floats  # (r,): azimuths of pulses less azimuths of columns, in steps
     points: Floats  # (n, 3): points on objects wider than a column, meters
-    # (r - 1, c), meters: smallest and largest range in the rows i and i + 1, and in the columns
-    # beside; inf where rays passed without a return, -inf where nothing is known
+    # (r - 1, c), meters: smallest and largest range in rows i and i + 1 and in the adjacent
+    # columns. The range is inf if rays passed without a return, and -inf if it is unknown.
     lower_m: Floats
     upper_m: Floats
-    empty_m: float  # rays without a return have met nothing up to this range
+    empty_m: float  # rays without a return hit nothing up to this range
     tolerance_m: float
 
     @classmethod
-    def of_sweep(cls, stack: SweepStack, number: int) -> Sight:
-        """Return what the sweep `number` of a stack sees."""
+    def from_sweep(cls, stack: SweepStack, number: int) -> VisibilityImage:
+        """Determine what one sweep of a stack sees."""
         ranges = stack.ranges[number].astype(np.float64)
         returned = np.isfinite(ranges)
         columns = ranges.shape[1]
         step_rad = 2 * np.pi / columns
         azimuth = np.arctan2(stack.directions[..., 1], stack.directions[..., 0])
         phase = (azimuth / step_rad - np.arange(columns) + columns / 2) % columns - columns / 2
-        nearest = _pairs_of_rows(
-            _beside(np.where(returned, ranges, np.inf), np.minimum), np.minimum
+        nearest = _reduce_row_pairs(
+            _reduce_neighbors(np.where(returned, ranges, np.inf), np.minimum), np.minimum
         )
-        farthest = _pairs_of_rows(
-            _beside(np.where(returned, ranges, -np.inf), np.maximum), np.maximum
+        farthest = _reduce_row_pairs(
+            _reduce_neighbors(np.where(returned, ranges, -np.inf), np.maximum), np.maximum
         )
         is_unknown = ~np.isfinite(nearest) & ~_empty_around(returned | ~stack.covered[number])
         noise_m = float(np.quantile(stack.rough_sigma, 0.25))
@@ -115,12 +117,12 @@ class Sight:
             tolerance_m=tolerance_m,
         )
 
-    def look_up(self, points: Floats) -> Ints:
-        """Say of points (…, 3) in the sensor frame: `_SURFACE`, `_UNKNOWN` or `_EMPTY`, (…)."""
+    def classify_points(self, points: Floats) -> Ints:
+        """Classify points in the sensor frame as `_SURFACE`, `_UNKNOWN` or `_EMPTY`."""
         x, y, z = np.moveaxis(points, -1, 0)
         across = np.hypot(x, y)
         distance = np.hypot(across, z)
-        # Points without a row are beyond the field of view.
+        # Points without a row are outside the field of view.
         row = np.interp(
             -np.arctan2(z, across),
             -self.elevation_rad,
@@ -141,20 +143,23 @@ class Sight:
         return np.where(in_view & passed, _EMPTY, np.where(in_view & met, _SURFACE, _UNKNOWN))
 
 
-def _beside(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values (r, c) over each column and the columns beside."""
+def _reduce_neighbors(values: Floats, reduce: np.ufunc) -> Floats:
+    """Reduce values over each column and its two neighbors."""
     return np.asarray(
         reduce(reduce(values, np.roll(values, 1, axis=1)), np.roll(values, -1, axis=1))
     )
 
 
-def _pairs_of_rows(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values (r, c) over each row and the next row: (r - 1, c), or (1, c) of one row."""
+def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
+    """Reduce values of shape (r, c) over adjacent rows, to shape (r - 1, c).
+
+    A single row is returned as it is.
+    """
     return np.asarray(reduce(values[:-1], values[1:])) if len(values) > 1 else values
 
 
 def _empty_around(returned: Bools) -> Bools:
-    """Mark pairs of rows (r - 1, c) around which no cell has a return."""
+    """Mark pairs of rows around which no cell has a return."""
     wide = returned.copy()
     for shift in range(1, _EMPTY_COLUMNS + 1):
         wide |= np.roll(returned, shift, axis=1) | np.roll(returned, -shift, axis=1)
@@ -166,7 +171,7 @@ def _empty_around(returned: Bools) -> Bools:
 
 
 def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
-    """Mark cells (r, c) beside which the next cell of the row is of the same surface."""
+    """Mark cells whose neighbor in the same row belongs to the same surface."""
     with np.errstate(invalid="ignore"):
         joined = np.abs(np.diff(ranges, axis=1, append=ranges[:, :1])) < (
             tolerance_m + _TOLERANCE_PER_M * ranges
@@ -175,33 +180,38 @@ def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
 
 
 class Evidence(NamedTuple):
-    """Numbers of objects by what explains that both sweeps see them."""
+    """Numbers of objects that both sweeps see, by the explanation for it."""
 
-    moved: int  # the motion, and not a sensor that stands
-    stayed: int  # the sensor stands, and not the motion
-    unexplained: int  # neither
+    moved: int  # explained only by the motion
+    stayed: int  # explained only by a stationary sensor
+    unexplained: int  # explained by neither
 
 
 @dataclass(frozen=True, eq=False)
-class SightPair:
-    """Two sweeps, and what each says of the points of the other if the sensor stands."""
+class VisibilityPair:
+    """Two sweeps, and how each classifies the points of the other if the sensor is stationary."""
 
-    first: Sight
-    second: Sight
-    seen_first: Ints  # (n,): what the second sweep says of the points of the first
-    seen_second: Ints  # (m,): what the first sweep says of the points of the second
+    first: VisibilityImage
+    second: VisibilityImage
+    seen_first: Ints  # (n,): classes of the first sweep's points in the second sweep
+    seen_second: Ints  # (m,): classes of the second sweep's points in the first sweep
 
     @classmethod
-    def of_sweeps(cls, first: Sight, second: Sight) -> SightPair:
-        """Look up the points of each sweep in the other."""
-        return cls(first, second, second.look_up(first.points), first.look_up(second.points))
+    def from_images(cls, first: VisibilityImage, second: VisibilityImage) -> VisibilityPair:
+        """Classify the points of each sweep by the other sweep."""
+        return cls(
+            first,
+            second,
+            second.classify_points(first.points),
+            first.classify_points(second.points),
+        )
 
     def sample(self, count: int) -> tuple[Floats, Floats]:
-        """Sample points of the first sweep and of the second: (a, 3) and (b, 3), meters.
+        """Sample points of both sweeps, in their sensor frames and in meters.
 
-        Points are in the sensor frames of their sweeps. If the sensor stands, the other sweep says
-        of some points that they are in empty space, and of some that they are on surfaces. About
-        `count` points of either kind are sampled evenly from both sweeps together.
+        If the sensor were stationary, the other sweep would see some points in empty space and
+        others on surfaces. About `count` points of each kind are sampled evenly from both sweeps
+        together.
         """
         seen = np.append(self.seen_first, self.seen_second)
         shares = {kind: min(1.0, count / max((seen == kind).sum(), 1)) for kind in _KNOWN}
@@ -219,20 +229,26 @@ class SightPair:
         return samples[0], samples[1]
 
     def score(self, motions: RigidMotion, first: Floats, second: Floats) -> Ints:
-        """Count the points of each sweep (n, 3) on surfaces of the other, less those in space."""
-        seen_first = self.second.look_up(motions.to_second(first)).sum(axis=-1)
-        return np.asarray(seen_first + self.first.look_up(motions.to_first(second)).sum(axis=-1))
+        """Score motions by how well they align two sweeps.
+
+        The score is the number of points on surfaces of the other sweep, minus the number in empty
+        space.
+        """
+        seen_first = self.second.classify_points(motions.to_second(first)).sum(axis=-1)
+        return np.asarray(
+            seen_first + self.first.classify_points(motions.to_first(second)).sum(axis=-1)
+        )
 
     def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
-        """Return what each sweep says of the points of the other if the sensor moves."""
+        """Return how each sweep classifies the other's points if the sensor moves."""
         in_second = motion.to_second(self.first.points)
         in_first = motion.to_first(self.second.points)
-        return self.second.look_up(in_second), self.first.look_up(in_first)
+        return self.second.classify_points(in_second), self.first.classify_points(in_first)
 
     def evidence(self, motion: RigidMotion | None) -> Evidence:
         """Count the objects for and against a motion.
 
-        Without a motion, the objects that changed are counted.
+        If `motion` is None, the objects that changed are counted.
         """
         at_rest = np.append(self.seen_first, self.seen_second)
         if motion is None:
@@ -248,8 +264,8 @@ class SightPair:
         ]
         return count_objects(points, kinds, _LONGEST_VEHICLE_M)
 
-    def without_explained(self, motion: RigidMotion) -> SightPair:
-        """Return the pair without the changed points that a motion explains, as of a car."""
+    def without_explained(self, motion: RigidMotion) -> VisibilityPair:
+        """Return the pair without the changed points that a motion explains."""
         seen_first, seen_second = (
             np.where((at_rest == _EMPTY) & (in_motion == _SURFACE), _UNKNOWN, at_rest)
             for at_rest, in_motion in zip(
@@ -260,11 +276,11 @@ class SightPair:
 
 
 def count_objects(points: Floats, kinds: Sequence[Bools], wide_m: float) -> Evidence:
-    """Count the objects that points (n, 3) belong to, by the kind of most points of an object.
+    """Count the objects in a point cloud by the kind of most of their points.
 
-    `kinds` are masks (n,) for the fields of `Evidence`. An object wider than `wide_m`, seen from
-    above, counts as `WALL_OBJECTS`. An object beside the sensor may be the sensor's own vehicle, of
-    which nothing follows if it stays.
+    `kinds` contains one mask for each field of `Evidence`. An object wider than `wide_m` in the top
+    view counts as `WALL_OBJECTS` objects. An object close to the sensor may be the sensor's own
+    vehicle, so it is no evidence of a stationary sensor.
     """
     from scipy.ndimage import label
 
