@@ -19,6 +19,7 @@ import sys
 import tokenize
 import tomllib
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -740,3 +741,14 @@ def test_modules_that_comments_and_docstrings_name_exist():
     }
     assert len(named) > 20
     assert sorted(pair for pair in named if pair[1] not in endings) == []
+
+
+def test_public_class_names_are_unique():
+    modules = defaultdict[str, list[str]](list)
+    for folder in ("kernels", "scheduler", "workflows"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    modules[node.name].append(str(path.relative_to(ROOT)))
+    assert len(modules) > 500
+    assert {name: paths for name, paths in modules.items() if len(paths) > 1} == {}

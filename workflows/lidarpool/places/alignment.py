@@ -26,7 +26,7 @@ from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS, elevations
 from .lost_pulses import Answering, lost_pulses
-from .motion import Motion, Step
+from .motion import Motion, MotionStep
 from .odometry import RecordedPoses
 from .recorded_sweeps import RecordedSweeps
 from .voxel_planes import VoxelPlanes
@@ -115,7 +115,7 @@ class Alignment:
         """Return the poses and times of some sweeps, ascending."""
         return replace(self, poses=self.poses[numbers], times_s=self.times_s[numbers])
 
-    def step(self, number: int, *, backward: bool = False) -> tuple[Step, float]:
+    def step(self, number: int, *, backward: bool = False) -> tuple[MotionStep, float]:
         """Return the motion from a sweep to the next or to the previous sweep, and its seconds.
 
         The seconds are negative for a step backward. The last sweep has the motion of the step
@@ -127,7 +127,7 @@ class Alignment:
             first = min(number, len(self.poses) - 2)
             second = first + 1
         step_s = float(self.times_s[second] - self.times_s[first])
-        return Step.between(self.poses[first], self.poses[second]), step_s
+        return MotionStep.between(self.poses[first], self.poses[second]), step_s
 
     def compensated(self, sweep: Sweep, number: int) -> tuple[Floats, Floats]:
         """Return the points (n, 3) of a sweep in the sensor frame at its stamp, calibrated.
@@ -165,7 +165,7 @@ class Alignment:
         poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
         return self._calibrated(sweep), poses
 
-    def _moved(self, number: int, times_s: Floats) -> Iterator[tuple[Bools, Step, Floats]]:
+    def _moved(self, number: int, times_s: Floats) -> Iterator[tuple[Bools, MotionStep, Floats]]:
         """Yield masks of the points fired at times (n,), their step, and their shares of it."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():

@@ -42,7 +42,7 @@ from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, draw_sweep
-from .finished_steps import FinishedSteps, Map, Step
+from .finished_steps import FinishedSteps, Map, TwinStep
 from .held_out import HeldOut
 from .labels import divided
 from .lost_pulses import Answering, firings_per_turn
@@ -75,9 +75,9 @@ _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
 _POSE_DECIMALS = 6
 _RESPONSE_STRETCHES = 4  # that tell the response of the sensor
-_POSES = Step("poses", (RecordedPoses,))
-_ALIGN = Step("align", (AlignedStretch,))
-_BUILD = Step("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
+_POSES = TwinStep("poses", (RecordedPoses,))
+_ALIGN = TwinStep("align", (AlignedStretch,))
+_BUILD = TwinStep("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
 NO_RETURN = "no return"  # name of the object of dark surfels
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # which are written even by default
 _RATE_DECIMALS = 4
@@ -86,7 +86,7 @@ _MIN_LEAD = 0.01  # of a revolution, by which a stamp is after the first point
 _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
 
 
-class TimedPose(NamedTuple):
+class TwinPose(NamedTuple):
     """Pose at a time."""
 
     pose: Floats  # (4, 4)
@@ -121,8 +121,8 @@ class Twin:
     scene: Scene
     poses: Floats
     times_s: Floats
-    start: TimedPose
-    stop: TimedPose
+    start: TwinPose
+    stop: TwinPose
     origin: Floats
     model: SensorModel
     figures: dict[str, Any]
@@ -591,19 +591,19 @@ class SweepTiming(NamedTuple):
             rotation = recorded.starts(is_clockwise=alignment.motion is Motion.CLOCKWISE)
         return cls(rate_hz, steps + 1, first_s, rotation)
 
-    def start(self, alignment: Alignment) -> TimedPose:
+    def start(self, alignment: Alignment) -> TwinPose:
         """Return the start of the first sweep."""
         step, step_s = alignment.step(0)
         pose = alignment.poses[0] @ step.part(self.first_s / step_s)
-        return TimedPose(pose, float(alignment.times_s[0]) + self.first_s)
+        return TwinPose(pose, float(alignment.times_s[0]) + self.first_s)
 
-    def stop(self, alignment: Alignment) -> TimedPose:
+    def stop(self, alignment: Alignment) -> TwinPose:
         """Return the end of the last sweep, to which its motion goes on."""
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
         rest_s = self.first_s + self.revolutions / self.rate_hz - span_s
         step, step_s = alignment.step(len(alignment.poses) - 1)
         pose = alignment.poses[-1] @ step.part(rest_s / step_s)
-        return TimedPose(pose, float(alignment.times_s[-1]) + rest_s)
+        return TwinPose(pose, float(alignment.times_s[-1]) + rest_s)
 
     def sensor(self, sweeps: AlignedSweeps, number: int) -> SensorModel | None:
         """Return a sensor with the recorded rings and rotation, or None without rings.

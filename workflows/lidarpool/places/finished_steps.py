@@ -26,7 +26,7 @@ _OF_FILE = "of.json"  # of what the steps are results
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
-class Step(NamedTuple):
+class TwinStep(NamedTuple):
     """What a step is called, and the classes of the arrays that it returns."""
 
     name: str
@@ -70,7 +70,7 @@ class FinishedSteps:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def each(
-        self, step: Step, run: Map, function: Callable[[Any], Any], items: Sequence[Any]
+        self, step: TwinStep, run: Map, function: Callable[[Any], Any], items: Sequence[Any]
     ) -> Iterator[tuple[Any, ...]]:
         """Yield what a function returns for each item: of earlier calls, or called by `run`.
 
@@ -85,23 +85,23 @@ class FinishedSteps:
                 self._save(step, index, next(results))
             yield self.load(step, index)
 
-    def once(self, step: Step, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
+    def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
         """Return what a call returns: of an earlier call, or of this."""
         if not self._file(step, 0).exists():
             self._save(step, 0, call())
         return self.load(step, 0)
 
-    def load(self, step: Step, index: int) -> tuple[Any, ...]:
+    def load(self, step: TwinStep, index: int) -> tuple[Any, ...]:
         """Return the records of a step for an item."""
         with np.load(self._file(step, index)) as arrays:
             return tuple(
                 _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
             )
 
-    def _file(self, step: Step, index: int) -> Path:
+    def _file(self, step: TwinStep, index: int) -> Path:
         return self.folder / f"{step.name}-{index:05d}.npz"
 
-    def _save(self, step: Step, index: int, records: Sequence[Any]) -> None:
+    def _save(self, step: TwinStep, index: int, records: Sequence[Any]) -> None:
         arrays = {
             f"{number}.{name}": getattr(record, name)
             for number, record in enumerate(records)

@@ -46,14 +46,14 @@ class Motion(StrEnum):
         return turn * sweep_s
 
 
-class Step(NamedTuple):
+class MotionStep(NamedTuple):
     """Motion of the sensor from the stamp of a sweep to that of another, in the sensor frame."""
 
     rotation: Floats  # (3,): rotation vector, radians
     translation: Floats  # (3,): meters
 
     @classmethod
-    def between(cls, pose: Floats, following: Floats) -> Step:
+    def between(cls, pose: Floats, following: Floats) -> MotionStep:
         """Return the step from a pose (4, 4) to another."""
         from scipy.spatial.transform import Rotation
 

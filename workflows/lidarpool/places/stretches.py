@@ -19,7 +19,7 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
 
 from .alignment import Alignment
-from .motion import Step
+from .motion import MotionStep
 
 _OWN_SWEEPS = 80  # of a stretch, about
 _AROUND_SWEEPS = 40  # before and after, at most
@@ -155,14 +155,14 @@ def joined(
         weights = _weights(len(stretch.numbers), stretch.own).tolist()
         for number, pose, weight in zip(stretch.numbers.tolist(), one.poses, weights, strict=True):
             if total[number]:
-                twist[number] += weight * np.concatenate(Step.between(poses[number], pose))
+                twist[number] += weight * np.concatenate(MotionStep.between(poses[number], pose))
             else:
                 poses[number] = pose
             total[number] += weight
         distance_m[stretch.own_numbers] = one.plane_distance_m[stretch.own]
     for number in np.flatnonzero(twist.any(axis=1)).tolist():
         mean = twist[number] / total[number]
-        poses[number] = poses[number] @ Step(mean[:3], mean[3:]).part(1.0)
+        poses[number] = poses[number] @ MotionStep(mean[:3], mean[3:]).part(1.0)
     counting = np.flatnonzero(total)
     for number in np.flatnonzero(total == 0).tolist():
         nearest = counting[np.abs(counting - number).argmin()]

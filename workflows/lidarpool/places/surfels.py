@@ -23,7 +23,7 @@ from lidarsim.scene.face_materials import join_materials
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..scenario.point_files import POINT_BYTES
-from ..scenario.point_scene import Voxels, surfel_faces, surfel_materials
+from ..scenario.point_scene import PointVoxels, surfel_faces, surfel_materials
 
 _NEIGHBORS = (12, 32, 80)  # of which the first number that is no line counts
 _MIN_WIDTH = 0.1  # smaller over larger variance within a plane: less is a line
@@ -120,7 +120,7 @@ class Surfels:
         """
         from scipy.spatial import cKDTree
 
-        voxels = Voxels.of_points(Path(name), points, voxel_m)
+        voxels = PointVoxels.of_points(Path(name), points, voxel_m)
         count = len(voxels.counts)
         if count * POINT_BYTES > memory() // 2:
             raise LidarError(

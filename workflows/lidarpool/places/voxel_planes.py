@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
 
-from ..scenario.point_scene import Voxels
+from ..scenario.point_scene import PointVoxels
 
 _NEIGHBORS = 12
 _MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
@@ -34,7 +34,7 @@ class VoxelPlanes:
         """
         from scipy.spatial import cKDTree
 
-        means = Voxels.of_points(Path(name), points, voxel_m).means(points)
+        means = PointVoxels.of_points(Path(name), points, voxel_m).means(points)
         if len(means) < _NEIGHBORS:
             return None
         _, neighbors = cKDTree(means).query(means, _NEIGHBORS)

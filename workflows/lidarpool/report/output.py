@@ -78,8 +78,10 @@ def run_survey(
         ):
             assert store.only_job is not None, "of a survey"
             with GrowingCloud(staged / CLOUD, store.only_job) as cloud:
-                load_open3d()  # writes the cloud in the end; reported at the start if it is missing
-                committed = cast(store, connection, Listener(page, None, cloud.add, options.pace))
+                load_open3d()  # writes the cloud; a missing library is reported before casting
+                committed = cast(
+                    store, connection, Listener(page, on_parts=cloud.add, pace=options.pace)
+                )
                 result = committed.result(screen)
                 page.finish(result.seconds, result)
                 if compare is not None and (note := compare(result)):

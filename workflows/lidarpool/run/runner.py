@@ -1,10 +1,10 @@
 """A run: its jobs are cast, and their points are committed to a store.
 
-Surveys, campaigns, shards and merges are compositions of the same steps. `cast_to_store` below is
-the shortest of them: open a store, cast what is missing, keep the result. `run_survey`
-(`report/output.py`) and `run_campaign` (`report/campaign_output.py`) publish a result in the end
-and remove the store; `merge` (`report/merging.py`) fills the store with points of shards instead of
-casting.
+`cast_to_store` below is the shortest kind of run: open a store, cast what is missing, and keep the
+points in the store. `simulate` and the shards of surveys are runs of this kind. `run_survey`
+(`report/output.py`) and `run_campaign` (`report/campaign_output.py`) do the same, and then publish
+a result, such as `cloud.ply`, and remove the store. `merge` (`report/merging.py`) fills a store with
+the points of shards instead of casting, and publishes it.
 """
 
 from __future__ import annotations
@@ -142,7 +142,10 @@ def cast(
 
 
 def _first_job(store: RunStore, maker: JobMaker | None, page: RunPage) -> Job | None:
-    """Return the first job that can be made, or None if all scans are cast."""
+    """Return the first job to run, or None if nothing is left to cast, plan or deliver.
+
+    Jobs that cannot be made are recorded as failed.
+    """
     if maker is None:
         only_job = store.only_job
         assert only_job is not None, "of a survey"

@@ -250,7 +250,7 @@ def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -
     voxel_m = voxel_m or _spacing_m(o3d, positions)
     if not voxel_m:
         raise LidarError(f"Most points of {path} have the same positions. Set `voxel_m`.")
-    voxels = Voxels.of_points(path, positions, voxel_m)
+    voxels = PointVoxels.of_points(path, positions, voxel_m)
     count = len(voxels.counts)
     if count * POINT_BYTES > memory() // 2:
         raise LidarError(
@@ -287,7 +287,7 @@ def surfel_faces(count: int) -> Ints:
 
 
 @dataclass(frozen=True, eq=False)
-class Voxels:
+class PointVoxels:
     """Points sorted by the voxels that contain the points.
 
     Only voxels with points are counted.
@@ -298,7 +298,7 @@ class Voxels:
     counts: Ints  # (v,): number of points in each voxel
 
     @classmethod
-    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> Voxels:
+    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> PointVoxels:
         """Sort the points (n, 3) of a file into voxels.
 
         LidarError if there are too many voxels.
@@ -361,7 +361,7 @@ def _directions(outward: Floats) -> Floats:
     return np.divide(outward, lengths, out=np.zeros_like(outward), where=lengths > 0)
 
 
-def _surfel_colors(o3d: Any, points: Sweep, voxels: Voxels, centers: Floats) -> Colors | None:
+def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats) -> Colors | None:
     """Return the mean colors of surfels in linear light, or grays of their mean intensities.
 
     `centers` (v, 3) are the centers of the surfels. A surfel whose points have neither has the mean
@@ -402,7 +402,7 @@ def _light(colors: AnyArray) -> Floats:
     return np.where(known, light, np.nan)
 
 
-def surfel_materials(point_classes: Ints | None, voxels: Voxels) -> FaceMaterials | None:
+def surfel_materials(point_classes: Ints | None, voxels: PointVoxels) -> FaceMaterials | None:
     """Return the most frequent classes of surfels as names of materials, such as «class 2».
 
     `point_classes` (n,) are the classes of the points, `NO_CLASS` for points without a class, or

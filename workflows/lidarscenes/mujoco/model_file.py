@@ -37,7 +37,7 @@ from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine
 from lidarsim.worlds.mujoco_bodies import (
-    Choice,
+    BodySelection,
     bodies_of,
     excluded,
     names_of,
@@ -177,13 +177,15 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     return nodes
 
 
-def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]) -> Choice:
+def _choice(
+    model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]
+) -> BodySelection:
     """Return which parts of a model are visible.
 
     Raises MeshFileError if there are too many geoms.
     """
     plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
-    choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)
+    choice = BodySelection(options.groups, bodies, geoms, "body", plane_m=plane_m)
     seen = np.array(seen_geoms(model, choice), np.int64)
     if len(seen) > MAX_NODES:
         raise MeshFileError(

@@ -37,7 +37,7 @@ class ModelBodies(NamedTuple):
     moving: list[ModelBody]
 
 
-class Choice(NamedTuple):
+class BodySelection(NamedTuple):
     """What a lidar sees of a model, and how."""
 
     groups: Sequence[int]  # groups of geoms that are seen
@@ -101,7 +101,7 @@ def _unknown(name: str | int, kind: str, known: list[str]) -> str:
     return f"The model has no {kind} {name!r}.{name_hint(str(name), known)}"
 
 
-def bodies_of(model: Any, choice: Choice) -> ModelBodies:
+def bodies_of(model: Any, choice: BodySelection) -> ModelBodies:
     """Return the bodies of a model with visible geoms.
 
     Bodies that are welded to the world stand; mocap bodies and all others move. Geoms that are
@@ -139,7 +139,7 @@ def _static_bodies(model: Any) -> Any:
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
-def seen_geoms(model: Any, choice: Choice) -> list[int]:
+def seen_geoms(model: Any, choice: BodySelection) -> list[int]:
     """Return the numbers of the geoms that a lidar may see."""
     colors = _colors(model)
     seen = np.isin(model.geom_group, choice.groups) & (colors[:, 3] > 0)
@@ -177,7 +177,9 @@ def _srgb_of(model: Any, geom: int, color: Floats) -> Bytes:
     return as_srgb(LINEAR[srgb] * light)
 
 
-def _mesh_of_geoms(model: Any, geoms: list[int], colors: Floats, choice: Choice) -> SceneMesh:
+def _mesh_of_geoms(
+    model: Any, geoms: list[int], colors: Floats, choice: BodySelection
+) -> SceneMesh:
     """Return the mesh of geoms of a body, in the frame of the body, without a name.
 
     `colors` (geoms, 4) are the colors of all geoms of the model.
@@ -195,7 +197,7 @@ def _mesh_of_geoms(model: Any, geoms: list[int], colors: Floats, choice: Choice)
     )
 
 
-def _placed_geom(model: Any, geom: int, choice: Choice) -> GeomMesh:
+def _placed_geom(model: Any, geom: int, choice: BodySelection) -> GeomMesh:
     """Return the triangles of a geom in the frame of its body."""
     shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
     points = rotate(shape.vertices, _rotation(model.geom_quat[geom]))

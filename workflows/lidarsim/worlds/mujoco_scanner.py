@@ -14,7 +14,7 @@ from ..columns.cloud import Cloud
 from ..sensor import Sensor
 from ..survey.survey import Mounted
 from .follower import Follower
-from .mujoco_bodies import Choice, Objects, bodies_of, excluded, required_number, soft_bodies
+from .mujoco_bodies import BodySelection, Objects, bodies_of, excluded, required_number, soft_bodies
 from .mujoco_geoms import SAG_M
 
 _log = logging.getLogger(__name__)
@@ -97,7 +97,7 @@ class MujocoScanner:
         excluded_bodies, excluded_geoms = excluded(model, exclude)
         # The world, body 0, cannot carry a lidar that would not see it.
         unseen = [*excluded_bodies, *(carrier for carrier in carriers.tolist() if carrier)]
-        choice = Choice(tuple(groups), unseen, excluded_geoms, objects, sag_m)
+        choice = BodySelection(tuple(groups), unseen, excluded_geoms, objects, sag_m)
         if soft := soft_bodies(model):
             _log.warning("the model has %s, which the lidar ignores", soft)
         bodies = bodies_of(model, choice)

@@ -1,10 +1,11 @@
 """The long-running stages 1, 3 and 4, and the pipes between them and the driver.
 
-A pipe is a Queue and a Variable of Dask, which other clients see by its name. RUN is the id of the
-run, in the keys of its tasks as well; N grows each time that a stage is started.
+The functions that run on workers are in `long_stage_tasks.py`. A pipe consists of a Dask Queue and
+a Dask Variable, which other clients see by its name. RUN is the id of the run, which the keys of
+its tasks contain as well. N increases each time a stage is started.
 
 ===============================  ============================================
-lidarpool-RUN-scans              ranges of scans, from stage 1 to the driver
+lidarpool-RUN-scans              ranges of scans and errors, from stage 1 to the driver
 lidarpool-RUN-news               summaries in order, receipts and errors, from stages 3 and 4
 lidarpool-RUN-generate-N         surveys to describe, from the driver to stage 1
 lidarpool-RUN-sort-N             summaries, from the driver to stage 3

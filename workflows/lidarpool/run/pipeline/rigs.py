@@ -1,9 +1,9 @@
 """Stage 2: casts batches on GPU workers, with rigs that each worker process builds once.
 
-Casting tasks name the rig of their job. The first task of a job on a worker brings the plan of the
-rig, and the scene; the worker keeps the rig in a table of this module, and the scene with its trees
-for other jobs of the same scene. A task's result would not work: Dask drops copies that no task
-needs at an instant, and every new copy would build its tree again.
+A casting task names the rig of its job. The first task of a job on a worker contains the plan of
+the rig and the scene. The worker keeps the rig in `cached_rigs`, and the scene with its trees for
+other jobs of the same scene. Rigs are not results of Dask tasks, because Dask drops a copy as soon
+as no task needs it, and each new copy would have to build its tree again.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ class Summaries(Scans):
     """To stage 3, and back in scan order: the summaries of the scans of a committed part."""
 
     data: bytes  # bytes of an array of `summary_type`
-    framed: int  # one past the last scan that had been handed out when it was sent
+    framed: int  # one past the last scan that stage 3 need not wait for
     until: int  # one past the last scan of the job
 
 
@@ -118,7 +118,7 @@ class ColumnsLost:
 
 @dataclass(frozen=True, slots=True)
 class Receipt(Scans):
-    """From stage 4: a part is whole in storage."""
+    """From stage 4: a part is complete in storage, or in the memory of the worker `held_at`."""
 
     name: str  # name of the part
     point_count: int
@@ -127,7 +127,7 @@ class Receipt(Scans):
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
     summaries: bytes  # summaries of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
-    held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
+    held_at: str = ""  # address of a worker that cannot access the storage, and holds the part
 
     @classmethod
     def from_part(

@@ -1,4 +1,4 @@
-"""Names of the stages and of the partitions that they run on, in a leaf module."""
+"""Names of the stages and of the partitions that they run on."""
 
 GPU = "GPU"
 LIDAR = "LIDAR"
@@ -7,5 +7,5 @@ OTHER = "OTHER"
 GENERATE = "generate"  # 1, on LIDAR: one long task
 INTERSECT = "intersect"  # 2, on GPU: a short task for each batch
 SORT = "sort"  # 3, on LIDAR: one long task
-COLLECT = "collect"  # 4, on LIDAR: two long tasks
-EXPORT = "export"  # runs on LIDAR, after the survey: a short task for each range of files
+COLLECT = "collect"  # 4, on LIDAR: `collectors` long tasks, two by default
+EXPORT = "export"  # on LIDAR: short tasks that write jobs of a campaign, or ranges of the files of a survey
