@@ -3,8 +3,8 @@
 `cast_to_store` below is the shortest kind of run: open a store, cast what is missing, and keep the
 points in the store. `simulate` and the shards of surveys are runs of this kind. `run_survey`
 (`report/output.py`) and `run_campaign` (`report/campaign_output.py`) do the same, and then publish
-a result, such as `cloud.ply`, and remove the store. `merge` (`report/merging.py`) fills a store with
-the points of shards instead of casting, and publishes it.
+a result, such as `cloud.ply`, and remove the store. `merge` (`report/merging.py`) fills a store
+with the points of shards instead of casting, and publishes it.
 """
 
 from __future__ import annotations

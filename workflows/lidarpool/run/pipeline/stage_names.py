@@ -8,4 +8,4 @@ GENERATE = "generate"  # 1, on LIDAR: one long task
 INTERSECT = "intersect"  # 2, on GPU: a short task for each batch
 SORT = "sort"  # 3, on LIDAR: one long task
 COLLECT = "collect"  # 4, on LIDAR: `collectors` long tasks, two by default
-EXPORT = "export"  # on LIDAR: short tasks that write jobs of a campaign, or ranges of the files of a survey
+EXPORT = "export"  # on LIDAR: short tasks that write jobs, or ranges of the files of a survey
