@@ -20,9 +20,9 @@ import open3d  # noqa: F401 - counted among the libraries
 
 from lidarpool.clouds.writing import save_cloud
 from lidarpool.columns.parts import StoredCloud, pack
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import ALWAYS
+from lidarsim.io.storage import Storage
 
 PER_SCAN = 20_000
 PER_PART = 10  # scans

@@ -47,8 +47,8 @@ from lidarpool.run.run_page import RunPage
 from lidarpool.run.store.run_store import RUN_FOLDER
 from lidarpool.scenario.job import Job
 from lidarpool.scenario.sections import TaskOptions
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.io.storage import Storage
 from lidarsim.scene.actors import box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

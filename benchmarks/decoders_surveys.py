@@ -12,9 +12,9 @@ import numpy as np
 
 from lidarpool import Material, Mounted, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.clouds.writing import ExportSpec, with_format_columns
-from lidarsim.base.arrays import Floats, Ints
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh

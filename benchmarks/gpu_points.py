@@ -24,8 +24,8 @@ import lidarsim.simulator.points.device_columns
 from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.io.storage import Storage
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

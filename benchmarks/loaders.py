@@ -29,7 +29,7 @@ import numpy as np
 import lidarpool as lp
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarpool import MujocoScanner, Sensor, load_sensor
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 
 _ROUNDS = 21
 MAX_M = 120.0  # range of MuJoCo's rays

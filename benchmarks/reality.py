@@ -33,21 +33,21 @@ import numpy as np
 from PIL import Image
 
 from lidarpool.clouds.recording import Recording
-from lidarpool.places.alignment import AlignedSweeps, align, first_alignment
-from lidarpool.places.building import DEFAULT_VOXEL_M
-from lidarpool.places.free_space import standing_points
-from lidarpool.places.held_out import HeldOut, hold_out
-from lidarpool.places.lost_pulses import Answering
-from lidarpool.places.odometry import RecordedPoses, find_poses
-from lidarpool.places.place import Place
-from lidarpool.places.recorded_sweeps import RecordedSweeps
-from lidarpool.places.reflectances import Reflectances
-from lidarpool.places.stretch_tasks import BuildTask, align_stretch, compared_sweeps, rebuild
-from lidarpool.places.stretches import divide, joined
+from lidarpool.reconstruction.alignment import AlignedSweeps, align, first_alignment
+from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
+from lidarpool.reconstruction.free_space import standing_points
+from lidarpool.reconstruction.held_out import HeldOut, hold_out
+from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.reconstruction.reflectances import Reflectances
+from lidarpool.reconstruction.submap_tasks import BuildTask, align_stretch, compared_sweeps, rebuild
+from lidarpool.reconstruction.submaps import divide, joined
+from lidarpool.reconstruction.surface_map import Place
 from lidarpool.recordings.opening import open_recording
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.even_samples import even_indices
 from lidarsim.columns.sweep import Sweep
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20

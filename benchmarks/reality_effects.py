@@ -28,17 +28,17 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool.places.alignment import AlignedSweeps
-from lidarpool.places.building import NO_RETURN, colored, fit_sensor
-from lidarpool.places.lost_pulses import Answering
-from lidarpool.places.motion import Motion
-from lidarpool.places.place import Place
-from lidarpool.places.recorded_sweeps import RecordedSweeps
-from lidarpool.places.reflectances import Reflectances
-from lidarpool.places.surfels import surfel_mesh
+from lidarpool.reconstruction.alignment import AlignedSweeps
+from lidarpool.reconstruction.building import NO_RETURN, colored, fit_sensor
+from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.motion import Motion
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.reconstruction.reflectances import Reflectances
+from lidarpool.reconstruction.surface_map import Place
+from lidarpool.reconstruction.surfels import surfel_mesh
 from lidarsim import Material, Noise, Returns, Scanner, Scene
-from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.motion.trajectory import CENTER
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.beams import Spin
 from lidarsim.sensor.models import SensorModel, read_model

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .reality import SOURCES, HalfPlace
 

@@ -106,7 +106,7 @@ def write_data_set(folder, sweep_count):
     """Write the data set of a campaign with `keep: kitti`."""
     from lidarpool.datasets.dataset import DataSet
     from lidarpool.datasets.job_table import JobRow, write_table
-    from lidarsim.base.storage import Storage
+    from lidarsim.io.storage import Storage
 
     cloud, sweeps = make_drive(sweep_count)
     data = DataSet(Storage.at(folder), "kitti")
@@ -153,8 +153,8 @@ def read_items(path):
 
 def view(path):
     """Open a recording in the viewer."""
+    from lidarpool.pages.recorded import recorded_view
     from lidarpool.recordings.opening import open_sensors
-    from lidarpool.showing.pages.recorded import recorded_view
 
     return len(recorded_view(open_sensors(path), "recording", None).points)
 

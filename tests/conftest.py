@@ -133,7 +133,7 @@ def _fork_server() -> Iterator[None]:
     A command in this process does not end it: workers of the session's clusters would end with it.
     """
     try:
-        from lidarpool.base import fork_server
+        from lidarpool.processes import fork_server
     except ImportError:
         yield
         return

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpool import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 # of a sensor, of a turn

@@ -15,8 +15,8 @@ import lidarpool.cli.run_command, lidarpool.run.pipeline.policies
 import lidarpool.report.campaign_output as campaign_output
 import lidarpool.report.result_pictures as pictures
 from lidarpool.__main__ import main
-from lidarsim.base.storage import Storage
-from lidarpool.base.tracing import trace_to
+from lidarsim.io.storage import Storage
+from lidarpool.processes.tracing import trace_to
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.report.growing_cloud import CloudWriter
 from lidarpool.run.store.database import RunDatabase

@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from lidarsim import load_sensor
-from lidarsim.base.model_names import model_names
+from lidarsim.schema.model_names import model_names
 from lidarview.render.pattern_picture import pattern_page
 
 IMAGES = Path(__file__).parents[1] / "images/sensors"

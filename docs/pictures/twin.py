@@ -18,7 +18,7 @@ from docs.pictures.film import frame
 from PIL import Image, ImageDraw
 
 from lidarpool import Actor, Mounted, Pose, Scanner, Survey, Track, load_sensor, twin
-from lidarpool.places.building import Twin
+from lidarpool.reconstruction.building import Twin
 from lidarscenes.procedural.city import city
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN

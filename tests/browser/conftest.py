@@ -21,10 +21,10 @@ from tests.spirals import WET, spiral, spiral_view
 from websockets.sync.client import connect
 
 from lidarpool.datasets.job_table import JobRow
+from lidarpool.pages.downloads import downloads
+from lidarpool.pages.job_list import JobList
+from lidarpool.pages.live_page import LivePage, live_page
 from lidarpool.run.progress import Progress
-from lidarpool.showing.pages.downloads import downloads
-from lidarpool.showing.pages.job_list import JobList
-from lidarpool.showing.pages.live_page import LivePage, live_page
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import render_page
 

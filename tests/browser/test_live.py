@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Job, Scene, Survey
+from lidarpool.pages.live_page import live_page
 from lidarpool.run.cluster.cluster import ClusterConnection
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
@@ -16,7 +17,6 @@ from lidarpool.run.listener import Listener
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
 from lidarpool.run.runner import cast, open_store
-from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lidarpool import Campaign, Job, Scene, Sensor, Survey
+from lidarpool.pages.live_page import live_page
 from lidarpool.report.campaign_output import run_campaign
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
-from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

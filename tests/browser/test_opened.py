@@ -13,9 +13,9 @@ from tests.shapes import room
 
 from lidarpool import LidarError, Mounted, Pose, Survey, Track, load_sensor
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.showing.pages import opened, recorded
-from lidarpool.showing.pages.job_list import JobList
-from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view
+from lidarpool.pages import opened, recorded
+from lidarpool.pages.job_list import JobList
+from lidarpool.pages.opened import growing_view, is_data_set, open_view
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.picture_file import PICTURE_FILE, PictureContent
 from lidarview.viewer.server import page_server

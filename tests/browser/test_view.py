@@ -11,7 +11,7 @@ import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
 from lidarpool import Actor, Pose, Scene, Sensor, Survey, Track, box
-from lidarpool.showing.pages.downloads import downloads
+from lidarpool.pages.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE

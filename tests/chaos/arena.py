@@ -13,8 +13,8 @@ from typing import Any
 import dask
 from distributed import Client, SpecCluster
 
-from lidarpool.base.fork_server import start_fork_server
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.fork_server import start_fork_server
+from lidarpool.processes.tracing import trace_to
 from lidarpool.run.cluster.connection import local_cluster
 from poolpart.deploy import forked_workers
 

@@ -40,7 +40,7 @@ from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}

@@ -27,7 +27,7 @@ from typing import Any
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.worker import thread_state
 
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.tracing import trace_to
 from poolpart import pipe
 
 Event = dict[str, Any]

@@ -24,10 +24,10 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.scenario_commands import import_
+from lidarpool.playback.pcap_recording import PcapRecording
 from lidarpool.recordings.opening import open_sensors
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.showing.playback.pcap_recording import PcapRecording
 from raybeam.compiled import compiled
 
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}

@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 from distributed import Worker
 
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
 from .events import (

@@ -16,7 +16,7 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 
 import poolpart.task_locations
 from lidarpool import simulate
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.tracing import trace_to
 from lidarpool.run.pipeline.stage_names import GPU
 
 JOIN_S = 300.0

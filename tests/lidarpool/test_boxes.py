@@ -22,12 +22,12 @@ from lidarpool import (
     Track,
     box,
     save_cloud,
-)  # fmt: skip
+)
 from lidarpool.clouds.boxes import Boxes, SweepBoxes
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps

@@ -15,7 +15,7 @@ from lidarpool.datasets.figures import DataSetStatistics
 from lidarpool.datasets.job_seconds import read_seconds
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_report import write_card
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarview.render.picture_page import Page
 
 NAMES = ("visibility", "model", "night")

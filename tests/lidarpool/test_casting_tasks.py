@@ -11,8 +11,8 @@ from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F4
 from tests.lidarsim.test_rig import TURNED, survey
 
 from lidarpool import Scene, box
-from lidarpool.base.shared_memory import Pickled
 from lidarpool.columns.parts import pack
+from lidarpool.processes.shared_memory import Pickled
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim.simulator.rig import Rig

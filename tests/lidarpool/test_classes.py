@@ -17,15 +17,15 @@ from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
-from lidarpool.base.fingerprint import fingerprint
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
+from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.report.charts import draw_sweep
 from lidarpool.scenario.field_paths import find_field
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE, PictureContent
 from lidarview.viewer.result_views import open_result

@@ -13,10 +13,10 @@ from tests.plugin_files import write_distribution
 
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import EXPORTS, LAYOUTS
-from lidarpool.showing.playback.bridge_table import BRIDGES
-from lidarsim.base.model_names import model_names
-from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
+from lidarpool.playback.bridge_table import BRIDGES
 from lidarsim.columns.table import OPTIONAL, TABLE
+from lidarsim.schema.model_names import model_names
+from lidarsim.schema.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
 from lidarview.render.coloring import NORMALS, RGB
 
 

@@ -23,7 +23,7 @@ from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarpool.datasets.job_table import JobRow
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.base.software import PACKAGES
 from lidarpool.cli import doctor, installed_copies
-from lidarsim.base.extras import CHECKOUT, install_command
+from lidarpool.identity.software import PACKAGES
+from lidarsim.environment.extras import CHECKOUT, install_command
 from raybeam import installation
 
 SOUND = {

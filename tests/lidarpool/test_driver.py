@@ -34,7 +34,7 @@ from lidarpool.run.pipeline.stage_messages import (
 )
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.store.database import RunDatabase
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from poolpart.task_locations import PartitionSnapshot
 
 SCANS = 60

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
+from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
-from lidarpool.showing.pages.opened import open_view
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("pye57", reason="pye57 is an extra")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lidarpool import Planning
-from lidarpool.base.field_words import describe_changes, describe_fields
+from lidarpool.identity.field_words import describe_changes, describe_fields
 from lidarpool.run.job_source import fields_of
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.words import rounded
+from lidarsim.words import rounded
 
 POSES = [[x, 0, 1] for x in range(30)]
 

@@ -10,9 +10,9 @@ from lidarpool import LidarError, Scene
 from lidarpool.scenario.campaign_jobs import ScenarioJobs
 from lidarpool.scenario.field_paths import find_field, replace_value
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.scene.files.mesh_formats import known_formats
 from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions
+from lidarsim.schema.vocabulary import UNITS_M
 
 
 def scenario(**entry):

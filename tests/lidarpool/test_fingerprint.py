@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from lidarpool import Beams, LidarError, Sensor, Spin
-from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.software import PACKAGES, describe_difference, software, source_hash
+from lidarpool.identity.fingerprint import fingerprint
+from lidarpool.identity.software import PACKAGES, describe_difference, software, source_hash
 from lidarsim.sensor import Head
 
 Pair = namedtuple("Pair", "a b")
@@ -166,7 +166,7 @@ def test_a_function_that_ran_has_the_same():
 SCRIPT = """
 import numpy as np
 from lidarpool import Beams, Column, Pose, Sensor, Spin, Survey
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from raybeam import available_backends
 
 GAIN = {"low": 0.5, "high": 2.0, "none": None}
@@ -216,7 +216,7 @@ def test_what_has_none_is_refused_by_name(thing, name):
             fingerprint(outer)
 
 
-ASK = "from lidarpool.base.software import source_hash; print(source_hash())"
+ASK = "from lidarpool.identity.software import source_hash; print(source_hash())"
 
 
 @pytest.fixture

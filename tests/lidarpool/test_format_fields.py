@@ -38,8 +38,8 @@ from lidarpool import (
 )
 from lidarpool.clouds.writing import ExportSpec
 from lidarscenes.procedural.city import city
-from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
+from lidarsim.io.yamlfile import load_yaml
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -44,18 +44,18 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import multi_file_format, parquet, well_known_text
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import EXPORTS, FORMATS
 from lidarpool.clouds.ros.layouts import LAYOUTS
 from lidarpool.clouds.well_known_text import wkt
 from lidarpool.clouds.writing import ExportSpec
-from lidarsim.base.storage import Storage
-from lidarsim.base.yamlfile import load_yaml
+from lidarpool.open3d_access.open3d_module import load_open3d
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLORS, TABLE
+from lidarsim.io.storage import Storage
+from lidarsim.io.yamlfile import load_yaml
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps

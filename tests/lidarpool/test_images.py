@@ -30,9 +30,9 @@ from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
-from lidarsim.base.model_names import model_names
-from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
+from lidarsim.io.yamlfile import load_yaml
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.models import read_model
 from lidarsim.sensor.plain_data import from_plain_data, to_plain_data

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarError
 from lidarpool.datasets.job_table import JobRow, Tally, read_table, write_table
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 
 DONE = JobRow(
     7, "0007", "train", {"weather.rain": 2, "sensors.roof.model": "vlp16", "night": True},

@@ -11,10 +11,10 @@ from tests.drives import points_of, the_scene, the_sweeps
 
 from lidarpool.clouds.format_table import FORMATS, load_format
 from lidarpool.clouds.writing import ExportSpec
+from lidarpool.pages.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.showing.pages.preview import first_sweeps
 from lidarscenes.procedural.city import city as city_scene
 from lidarscenes.writers.scene_file import write_scene
 

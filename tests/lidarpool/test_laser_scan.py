@@ -9,12 +9,7 @@ import pytest
 from tests.shapes import room
 
 from lidarpool import Beams, Cloud, Sensor, Spin, Survey, load_sensor
-from lidarpool.clouds.laser_scan import (
-    ScanRays,
-    has_laser_scans,
-    has_planar_sensors,
-    is_planar,
-)
+from lidarpool.clouds.laser_scan import ScanRays, has_laser_scans, has_planar_sensors, is_planar
 from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Mirror

@@ -20,6 +20,10 @@ from tests.shapes import box
 
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
+from lidarpool.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
+from lidarpool.pages.live_job import LiveJob
+from lidarpool.pages.live_page import LivePage, live_page
+from lidarpool.pages.run_status import busy_slots
 from lidarpool.report.campaign_output import run_campaign
 from lidarpool.run import listener
 from lidarpool.run.job_source import OneJob
@@ -28,10 +32,6 @@ from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.runner import cast_to_store
 from lidarpool.run.store.run_store import RunStore
-from lidarpool.showing.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
-from lidarpool.showing.pages.live_job import LiveJob
-from lidarpool.showing.pages.live_page import LivePage, live_page
-from lidarpool.showing.pages.run_status import busy_slots
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats
@@ -233,7 +233,7 @@ def test_a_run_brings_no_page_and_no_pictures_before_it_needs_them():
     """Matplotlib takes a second."""
     code = "import sys, lidarpool.cli.run_command; print(*sys.modules, sep='\\n')"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pages = {"lidarview.viewer.server", "matplotlib", "open3d", "lidarpool.showing.pages.live_page"}
+    pages = {"lidarview.viewer.server", "matplotlib", "open3d", "lidarpool.pages.live_page"}
     assert pages.isdisjoint(told.stdout.split())
 
 

@@ -10,8 +10,8 @@ from tests.lidarpool.test_scenario import mesh_file
 
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.showing.pages.opened import open_view
-from lidarpool.showing.playback.sources import open_source, scenario_job
+from lidarpool.pages.opened import open_view
+from lidarpool.playback.sources import open_source, scenario_job
 
 
 @pytest.mark.parametrize("name", ["init", "check", "run", "stations", "view", "play"])

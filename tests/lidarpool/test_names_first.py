@@ -21,7 +21,7 @@ def unread(monkeypatch):
     for place in (
         "lidarpool.scenario.prepare.read_static_scene",
         "lidarpool.comparing.fit.fitting.open_recording",
-        "lidarpool.places.building.RecordedSweeps.open",
+        "lidarpool.reconstruction.building.RecordedSweeps.open",
     ):
         monkeypatch.setattr(place, read)
 

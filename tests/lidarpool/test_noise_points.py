@@ -7,9 +7,9 @@ from click.testing import CliRunner
 from lidarpool import Comparison, LidarError, Scene, compare
 from lidarpool.cli.result_commands import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
+from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
-from lidarpool.showing.pages.opened import open_view
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")

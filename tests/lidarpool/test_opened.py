@@ -27,10 +27,10 @@ from lidarpool.cli.result_commands import view as view_command
 from lidarpool.clouds import las
 from lidarpool.clouds.ros import bags
 from lidarpool.clouds.writing import ExportSpec
+from lidarpool.pages import recorded
+from lidarpool.pages.job_list import JobList
+from lidarpool.pages.opened import growing_view, is_data_set, open_view, open_views
 from lidarpool.recordings.opening import open_recording
-from lidarpool.showing.pages import recorded
-from lidarpool.showing.pages.job_list import JobList
-from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view, open_views
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -492,7 +492,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         with pytest.raises(LidarError, match=words) as raised:
             open_view(tmp_path / name)
         assert len(str(raised.value).splitlines()) == 1
-    monkeypatch.setattr("lidarsim.base.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarsim.environment.extras.find_spec", lambda name: None)
     for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet")):
         with pytest.raises(LidarError, match=rf"\.\[{extra}\]"):
             open_view(folder / name)

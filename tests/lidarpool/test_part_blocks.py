@@ -8,9 +8,9 @@ import pytest
 from lidarpool import LidarError
 from lidarpool.columns.part_blocks import BlockMemory, read_blocks
 from lidarpool.columns.parts import pack, read_part
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import ALWAYS, SCAN, TABLE
+from lidarsim.io.storage import Storage
 
 COLUMNS = (*ALWAYS, TABLE["time"], TABLE["range"], TABLE["returns"])
 COUNTS = [0, 3, 0, 0, 5, 1, 0, 4, 0]  # rows of scans

@@ -22,9 +22,9 @@ from lidarpool.columns.parts import (
     scans_of,
     unpack,
 )
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import OPTIONAL, stored
+from lidarsim.io.storage import Storage
 
 COLUMNS = stored(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])

@@ -14,11 +14,11 @@ from click.testing import CliRunner
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.showing.playback import bridge as bridges
-from lidarpool.showing.playback.bridge import Bridge
-from lidarpool.showing.playback.bridge_table import BRIDGES, BridgeEntry
-from lidarpool.showing.playback.schedule import MadeAhead
-from lidarpool.showing.playback.sources import open_source
+from lidarpool.playback import bridge as bridges
+from lidarpool.playback.bridge import Bridge
+from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry
+from lidarpool.playback.schedule import MadeAhead
+from lidarpool.playback.sources import open_source
 
 SCENARIO = """
 sensor: {model: velodyne/vlp16, rate_hz: 20}

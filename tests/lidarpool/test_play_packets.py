@@ -39,10 +39,10 @@ from lidarpool import (
 )
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.showing.playback.live_sensor import RepeatedInstruments
-from lidarpool.showing.playback.pcap_recording import PcapRecording
-from lidarpool.showing.playback.sources import open_source, scenario_job
-from lidarpool.showing.playback.transmitter import Transmitter, sensor_streams
+from lidarpool.playback.live_sensor import RepeatedInstruments
+from lidarpool.playback.pcap_recording import PcapRecording
+from lidarpool.playback.sources import open_source, scenario_job
+from lidarpool.playback.transmitter import Transmitter, sensor_streams
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -340,8 +340,8 @@ def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(
         time.sleep(0.2)
         return columns_of(batches)
 
-    monkeypatch.setattr("lidarpool.showing.playback.sources.columns_of", columns_of_slow_cast)
-    monkeypatch.setattr("lidarpool.showing.playback.sources.casting_threads", lambda: 1)
+    monkeypatch.setattr("lidarpool.playback.sources.columns_of", columns_of_slow_cast)
+    monkeypatch.setattr("lidarpool.playback.sources.casting_threads", lambda: 1)
     (tmp_path / "s.yaml").write_text(VLP16)
     to = f"127.0.0.1:{port_of(receiver)}"
     outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--to", to, "--rate", "1000")

@@ -9,17 +9,17 @@ from tests.meshes import write
 from tests.plugin_files import write_distribution
 
 from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
-from lidarpool.base.software import describe_difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import format_row
 from lidarpool.clouds.writing import ExportSpec
+from lidarpool.identity.software import describe_difference, plugin_versions, software
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import scenario_schema
-from lidarsim.base.plugins import find_plugin, plugins_of
+from lidarsim.environment.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
 
 # A mesh of one triangle, whatever is in the file.
@@ -344,8 +344,8 @@ def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, dis
 @pytest.mark.slow
 def test_the_hash_of_a_plugin_is_that_of_its_package(tmp_path):
     code = (
-        "from lidarsim.base.plugins import find_plugin\n"
-        "from lidarpool.base.software import plugin_versions\n"
+        "from lidarsim.environment.plugins import find_plugin\n"
+        "from lidarpool.identity.software import plugin_versions\n"
         "print(*plugin_versions([find_plugin('lidarsim.meshes', '.hashed')]).values())"
     )
     texts = {"same": "", "other": "# a comment", "again": ""}

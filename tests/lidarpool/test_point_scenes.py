@@ -5,11 +5,11 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
-from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
+from lidarpool.open3d_access.open3d_module import load_open3d
+from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
-from lidarpool.showing.pages.opened import open_view
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.pcd import pcd_bytes
 

@@ -22,10 +22,10 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.comparing.fit.stack import SweepStack
-from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.pages.recorded import recorded_view
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_sensors
 from lidarpool.scenario.point_files import read_points
-from lidarpool.showing.pages.recorded import recorded_view
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

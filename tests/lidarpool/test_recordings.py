@@ -14,14 +14,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import LidarError, compare, twin
 from lidarpool.comparing.fit.stack import SweepStack
-from lidarpool.places.alignment import AlignedSweeps, Alignment, first_alignment
-from lidarpool.places.lost_pulses import Answering
-from lidarpool.places.motion import Motion
-from lidarpool.places.odometry import RecordedPoses, find_poses
-from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
+from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.motion import Motion
+from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
-from lidarsim.base.archives import packed
 from lidarsim.columns.bags import POINT_CLOUD
+from lidarsim.io.archives import packed
 
 # From axes of a lidar to those of a camera of KITTI: x to the right, y down, z forward.
 TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1.0]])

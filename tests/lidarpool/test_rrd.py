@@ -21,7 +21,7 @@ from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.showing.playback.sources import open_source
+from lidarpool.playback.sources import open_source
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
 

@@ -26,7 +26,7 @@ from lidarpool import (
     Survey,
     box,
 )
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.demo import demo_scenario
 from lidarpool.scenario.prepare import prepare

@@ -12,7 +12,7 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from lidarpool import LidarError
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_sections import is_campaign
 from lidarpool.scenario.prepare import prepare
@@ -24,7 +24,7 @@ from lidarpool.scenario.schema import (
     schema_text,
     short_scenario,
 )
-from lidarsim.base.section_fields import fields_of, is_section
+from lidarsim.schema.section_fields import fields_of, is_section
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]

@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from lidarpool.base.shared_memory import Pickled, SharedHandle, SharedValue
+from lidarpool.processes.shared_memory import Pickled, SharedHandle, SharedValue
 
 linux = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="shares no memory")
 
@@ -49,7 +49,7 @@ def test_another_process_loads_it_as_long_as_the_owner_lives():
     owner = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent("""
             import sys, numpy as np
-            from lidarpool.base.shared_memory import Pickled, SharedValue
+            from lidarpool.processes.shared_memory import Pickled, SharedValue
             shared = SharedValue(Pickled.from_value(np.arange(100_000)))
             print(tuple(shared.handle), flush=True)
             sys.stdin.read()

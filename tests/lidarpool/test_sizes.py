@@ -15,8 +15,8 @@ from tests.drives import the_scene, the_sweeps, write_set
 import lidarpool
 from lidarpool import LidarError, load_trajectory
 from lidarpool.recordings.opening import open_recording
-from lidarsim.base import allowance
 from lidarsim.columns.bags import livox_columns
+from lidarsim.io import allowance
 
 
 @pytest.fixture

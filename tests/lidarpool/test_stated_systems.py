@@ -10,11 +10,11 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
+from lidarpool.pages.opened import growing_view, open_view
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.showing.pages.opened import growing_view, open_view
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files import coordinate_systems
 

@@ -22,7 +22,7 @@ from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.store.run_store import RunStore
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 
 SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))

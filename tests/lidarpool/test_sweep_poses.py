@@ -9,11 +9,11 @@ import pytest
 
 from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
-from lidarpool.places.alignment import Alignment
-from lidarpool.places.free_space import RangeImage
-from lidarpool.places.labels import divided, labels_of
-from lidarpool.places.motion import Motion
-from lidarpool.places.odometry import RecordedPoses
+from lidarpool.reconstruction.alignment import Alignment
+from lidarpool.reconstruction.free_space import RangeImage
+from lidarpool.reconstruction.labels import divided, labels_of
+from lidarpool.reconstruction.motion import Motion
+from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials

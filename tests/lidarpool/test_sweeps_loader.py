@@ -28,7 +28,7 @@ from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS, load_format
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.recordings.opening import open_recording
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 JOBS = len(SPLITS)

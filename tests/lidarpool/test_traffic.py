@@ -24,12 +24,12 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base import allowance
+from lidarsim.io import allowance
 from lidarsim.simulator.casting.surfaces import SceneSurfaces
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

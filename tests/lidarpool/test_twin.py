@@ -33,11 +33,11 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.rings import Rings, elevations
-from lidarpool.places.alignment import Alignment
-from lidarpool.places.lost_pulses import Answering, lost_pulses
-from lidarpool.places.motion import Motion
-from lidarpool.places.odometry import find_poses
-from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.reconstruction.alignment import Alignment
+from lidarpool.reconstruction.lost_pulses import Answering, lost_pulses
+from lidarpool.reconstruction.motion import Motion
+from lidarpool.reconstruction.odometry import find_poses
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

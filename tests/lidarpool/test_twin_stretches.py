@@ -18,10 +18,10 @@ from distributed import Client
 import poolpart.deploy
 from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
 from lidarpool.cli.commands import cli
-from lidarpool.places.alignment import Alignment
-from lidarpool.places.finished_steps import STEPS_FOLDER
-from lidarpool.places.motion import Motion, Step
-from lidarpool.places.stretches import AlignedStretch, divide, joined
+from lidarpool.reconstruction.alignment import Alignment
+from lidarpool.reconstruction.finished_steps import STEPS_FOLDER
+from lidarpool.reconstruction.motion import Motion, Step
+from lidarpool.reconstruction.submaps import AlignedStretch, divide, joined
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -37,11 +37,11 @@ from lidarpool import (
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.shown_sweeps import ShownSweep, Surroundings
-from lidarpool.showing.playback.bridge import BridgeOptions, bridge_class
-from lidarpool.showing.playback.schedule import Schedule
-from lidarpool.showing.playback.sources import open_source
-from lidarpool.showing.viewers import attached_child
-from lidarpool.showing.viewers.viewer import Address, Viewer, open_viewer
+from lidarpool.playback.bridge import BridgeOptions, bridge_class
+from lidarpool.playback.schedule import Schedule
+from lidarpool.playback.sources import open_source
+from lidarpool.viewers import attached_child
+from lidarpool.viewers.viewer import Address, Viewer, open_viewer
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 
@@ -305,7 +305,7 @@ def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
 
 
 def test_what_is_missing_names_its_extra(room, monkeypatch, tmp_path):
-    monkeypatch.setattr("lidarpool.showing.viewers.viewer.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.viewers.viewer.find_spec", lambda name: None)
     scanner = Scanner(room, Sensor.grid(), backend="numpy")
     with pytest.raises(
         LidarError, match=r'requires foxglove-sdk\. Run pip install -e "\.\[live\]"'
@@ -389,7 +389,7 @@ class Kept(Viewer):
 
 def test_a_run_shows_its_finished_sweeps_and_its_path(room, monkeypatch):
     viewer = Kept()
-    monkeypatch.setattr("lidarpool.showing.pages.viewer_page.open_viewer", lambda *_, **__: viewer)
+    monkeypatch.setattr("lidarpool.pages.viewer_page.open_viewer", lambda *_, **__: viewer)
     survey = Survey(
         load_sensor("velodyne/vlp16"),
         [Pose((0, 0, 1)), Pose((2, 0, 1), yaw_deg=40)],

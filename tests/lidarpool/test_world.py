@@ -17,12 +17,12 @@ from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.las_header import las_system
 from lidarpool.clouds.writing import ExportSpec
+from lidarpool.pages.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.empty_cloud import empty_cloud_reason
 from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.showing.pages.preview import first_sweeps
 from lidarsim.scene.files.stated_system import StatedSystem
 
 ORIGIN = [500_000, 5_400_000]

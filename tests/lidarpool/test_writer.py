@@ -12,7 +12,7 @@ from lidarpool.run import writer
 from lidarpool.run.cluster.checks import check_workers
 from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.writer import MAX_JOBS_PER_TASK, DataSetWriter
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 
 
 @pytest.fixture

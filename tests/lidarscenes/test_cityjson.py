@@ -334,7 +334,7 @@ def test_what_is_wrong_is_said(tmp_path, document, words):
 
 
 def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarsim.base.allowance.memory", lambda: 100_000_000)
+    monkeypatch.setattr("lidarsim.io.allowance.memory", lambda: 100_000_000)
     with pytest.raises(LidarError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
 

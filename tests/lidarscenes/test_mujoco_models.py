@@ -21,7 +21,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.mujoco import model_file
 from lidarsim import SceneInstance
-from lidarsim.base import allowance
+from lidarsim.io import allowance
 from lidarsim.scene.files.meshfile import load_objects
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")

@@ -12,13 +12,13 @@ from tests.lidarsim.test_moving import stored_positions
 from tests.shapes import level, made
 
 from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim import Mounted, box
-from lidarsim.base.vectors import rotate_into_frames
 from lidarsim.motion.trajectory import presence_ns
+from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -23,8 +23,8 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
 from lidarsim import LidarError, SceneInstance
-from lidarsim.base import allowance
 from lidarsim.columns.table import COLORS
+from lidarsim.io import allowance
 from lidarsim.scene.colors import LINEAR, as_srgb
 from lidarsim.scene.files import scene_graph as nodes
 from lidarsim.scene.files.meshfile import load_meshes, load_objects

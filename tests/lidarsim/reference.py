@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarpool import Noise
-from lidarsim.base.arrays import Floats
-from lidarsim.base.random_numbers import Purpose, quantiles
 from lidarsim.media.weather import Air, Particles
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.random_numbers import Purpose, quantiles
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.steps.detection import DETECTION, LOSS
 from lidarsim.simulator.steps.particles import (

@@ -12,7 +12,7 @@ import trimesh
 from tests.meshes import NESTED
 
 from lidarsim import LidarError
-from lidarsim.base import allowance, input_files
+from lidarsim.io import allowance, input_files
 from lidarsim.scene.files.meshfile import load_meshes
 
 VERTEX = b'<vertex x="0" y="0" z="0"/>'

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarsim.base import archives
-from lidarsim.base.archives import read_arrays, stored_pieces
+from lidarsim.io import archives
+from lidarsim.io.archives import read_arrays, stored_pieces
 
 
 def zipfile_bytes(arrays):

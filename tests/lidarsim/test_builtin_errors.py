@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from lidarsim import LidarError, Pose, Scene, load_sensor
-from lidarsim.base.errors import MissingFileError, explained, prefixed
+from lidarsim.errors import MissingFileError, explained, prefixed
 
 
 @pytest.mark.parametrize(("load", "name"), [(Scene.load, "a.glb"), (load_sensor, "a.yaml")])

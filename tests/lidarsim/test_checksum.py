@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from lidarsim.base.checksum import crc32
+from lidarsim.io.checksum import crc32
 
 
 @pytest.mark.parametrize("size", [0, 1, 15, 64, 1000, 1 << 20])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarsim import LidarError
-from lidarsim.base.errors import CutShortError
 from lidarsim.columns.column_names import standard_names
+from lidarsim.errors import CutShortError
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 
 TEXT_ENDINGS = (".xyz", ".txt", ".asc", ".csv")
@@ -387,6 +387,6 @@ def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
 
 @pytest.mark.parametrize("ending", SCAN_READERS)
 def test_a_file_that_is_larger_than_the_memory_is_refused(tmp_path, monkeypatch, ending):
-    monkeypatch.setattr("lidarsim.base.input_files.memory", lambda: 10)
+    monkeypatch.setattr("lidarsim.io.input_files.memory", lambda: 10)
     with pytest.raises(LidarError, match="exceeds the memory of this machine"):
         read(tmp_path, f"a{ending}", "1 2 3\n" * 20)

@@ -11,20 +11,12 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import (
-    LidarError,
-    Material,
-    Mounted,
-    Noise,
-    Returns,
-    Survey,
-    load_sensor,
-)
+from lidarpool import LidarError, Material, Mounted, Noise, Returns, Survey, load_sensor
 from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.model_names import model_names
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import Detection, read_model
 
 RAYS = 20_000

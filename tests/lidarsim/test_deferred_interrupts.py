@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from lidarsim.base.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import deferred_interrupts
 
 
 @pytest.fixture

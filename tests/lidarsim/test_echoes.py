@@ -39,8 +39,8 @@ from lidarpool import (
 )
 from lidarsim import SceneMesh
 from lidarsim import box as cuboid
-from lidarsim.base.random_numbers import raw
 from lidarsim.media.materials import extinction, fresnel
+from lidarsim.numerics.random_numbers import raw
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig

@@ -7,8 +7,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from lidarsim.base import elementary
-from lidarsim.base.vectors import determinant, inverse, matmul, rank
+from lidarsim.numerics import elementary
+from lidarsim.numerics.vectors import determinant, inverse, matmul, rank
 
 RNG = np.random.default_rng(7)
 COUNT = 300

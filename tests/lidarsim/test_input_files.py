@@ -19,9 +19,9 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
 from lidarsim import LidarError
-from lidarsim.base.input_files import open_input, read_input, read_input_text
-from lidarsim.base.storage import Storage
-from lidarsim.base.yamlfile import read_yaml
+from lidarsim.io.input_files import open_input, read_input, read_input_text
+from lidarsim.io.storage import Storage
+from lidarsim.io.yamlfile import read_yaml
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.scene.files.meshfile import load_meshes

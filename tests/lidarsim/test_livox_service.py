@@ -14,7 +14,7 @@ import pytest
 from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_shots
 
 from lidarpool import LidarError, load_sensor
-from lidarpool.showing.playback.transmitter import sensor_streams
+from lidarpool.playback.transmitter import sensor_streams
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.send import Sender
 from lidarsim.packets.service import Destination

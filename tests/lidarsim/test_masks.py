@@ -14,7 +14,7 @@ from tests.meshes import write
 from lidarpool import LidarError, Pose, Scanner, Scene
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim import Actor, SceneInstance, SceneMesh, Sensor
-from lidarsim.base import allowance
+from lidarsim.io import allowance
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import Cutout
 

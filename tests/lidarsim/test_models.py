@@ -10,7 +10,7 @@ import pytest
 
 from lidarpool import LidarError
 from lidarsim import Sensor, Spin, load_sensor
-from lidarsim.base.model_names import model_names
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import read_model
 from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
 from raybeam import Pattern

@@ -23,7 +23,7 @@ from lidarpool import (
 )
 from lidarpool.run.job_source import identity_of
 from lidarsim import Actor, Returns, box
-from lidarsim.base.vectors import rotate_into_frames
+from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweep_motion import poses_at
 from raybeam import moving_loops

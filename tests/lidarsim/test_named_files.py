@@ -3,8 +3,8 @@
 import pytest
 
 from lidarsim import LidarError
-from lidarsim.base.named_files import file_below, is_inside, is_plain
-from lidarsim.base.storage import Storage
+from lidarsim.io.named_files import file_below, is_inside, is_plain
+from lidarsim.io.storage import Storage
 from lidarsim.scene.files.meshfile import load_meshes
 
 

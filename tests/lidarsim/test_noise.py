@@ -26,9 +26,9 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Weather, rain, snow
 from lidarsim.motion.navigation import fixes, imu_samples
+from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
 from lidarsim.simulator.steps.losses import PACKET

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarsim.base.other_sites import names_of_machine, refusal
+from lidarsim.environment.other_sites import names_of_machine, refusal
 
 NAMES = {"localhost", "lab"}
 BROWSER = {"host": "192.168.1.50", "user-agent": "Mozilla/5.0 (X11; Linux x86_64)"}
@@ -13,7 +13,10 @@ BROWSER = {"host": "192.168.1.50", "user-agent": "Mozilla/5.0 (X11; Linux x86_64
 
 def test_both_packages_have_the_same_check():
     root = Path(__file__).parents[2]
-    files = ("workflows/lidarsim/base/other_sites.py", "scheduler/poolpart/extras/other_sites.py")
+    files = (
+        "workflows/lidarsim/environment/other_sites.py",
+        "scheduler/poolpart/extras/other_sites.py",
+    )
     assert len({(root / file).read_bytes() for file in files}) == 1
 
 

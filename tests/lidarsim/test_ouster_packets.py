@@ -33,12 +33,12 @@ from lidarpool import (
 )
 from lidarpool.clouds.navigation_files import write_instruments
 from lidarpool.recordings.opening import open_recording
-from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.ouster import LIDAR_PORT, PROFILES, OusterDecoder
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
+from lidarsim.schema.model_names import model_names
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

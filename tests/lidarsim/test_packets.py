@@ -14,7 +14,6 @@ from tests.plugin_files import write_distribution
 from tests.shapes import room
 
 from lidarpool import LidarError, Pose, Returns, Sensor, Survey, load_sensor
-from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import (
     Datagrams,
@@ -26,6 +25,7 @@ from lidarsim.packets.encoders import (
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import CarryOver, Shots
 from lidarsim.packets.velodyne_position import PositionPackets
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarsim import LidarError
-from lidarsim.base.errors import CutShortError
+from lidarsim.errors import CutShortError
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 
 RNG = np.random.default_rng(3)

@@ -11,8 +11,8 @@ from tests.lidarsim.reference import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
-from lidarsim.base.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.media.weather import Air, spray
+from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight

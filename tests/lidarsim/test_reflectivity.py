@@ -9,7 +9,7 @@ import pytest
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import LidarError, Material, Noise, load_sensor
-from lidarsim.base.model_names import model_names
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import read_model
 from lidarsim.sensor.reflectivity import SCALES
 

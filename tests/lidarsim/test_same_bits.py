@@ -74,7 +74,9 @@ def test_no_byte_comes_from_functions_that_differ(name):
     if name in EXCEPTIONS:
         assert lines, f"{name} is no exception any more"
     if not name.startswith((*EXCEPTIONS,)):
-        assert not lines, f"{SOURCES[name]}, lines {lines}: use lidarsim.base.elementary or vectors"
+        assert not lines, (
+            f"{SOURCES[name]}, lines {lines}: use lidarsim.numerics.elementary or vectors"
+        )
 
 
 @pytest.mark.parametrize(

@@ -12,21 +12,16 @@ import pytest
 from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
-from lidarsim.base.random_numbers import Purpose
 from lidarsim.columns.table import CAUSES
 from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
+from lidarsim.numerics.random_numbers import Purpose
 from lidarsim.simulator.returns import SURFACE, PulseReturns, merge_returns, returns_without_surface
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.cast import CastStep
 from lidarsim.simulator.steps.doppler import VELOCITY
 from lidarsim.simulator.steps.losses import DirtStep
 from lidarsim.simulator.steps.step import PulseStep, Role
-from lidarsim.simulator.steps.step_list import (
-    STEPS,
-    add_step,
-    received_causes,
-    remove_step,
-)
+from lidarsim.simulator.steps.step_list import STEPS, add_step, received_causes, remove_step
 from lidarsim.simulator.steps.waveform_samples import RecordingStep
 from lidarsim.survey.survey import OPTIONAL_NAMES
 

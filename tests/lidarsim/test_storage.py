@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
-from lidarsim.base import allowance
-from lidarsim.base.archives import open_archive
-from lidarsim.base.storage import Storage
+from lidarsim.io import allowance
+from lidarsim.io.archives import open_archive
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 

@@ -26,7 +26,7 @@ from lidarpool import (
     load_sensor,
     load_trajectory,
 )
-from lidarpool.base.fingerprint import fingerprint
+from lidarpool.identity.fingerprint import fingerprint
 from lidarsim.motion.rotations import matrices, quaternions_of, rotations_of
 from lidarsim.motion.trajectory import velocities
 from lidarsim.survey.survey import MAX_STEPS

@@ -8,12 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lidarsim.columns.column_names import (
-    ALIASES,
-    columns_for,
-    standard_names,
-    with_standard_names,
-)
+from lidarsim.columns.column_names import ALIASES, columns_for, standard_names, with_standard_names
 from lidarsim.columns.sweep import Sweep
 
 POINTS = np.array([[1, 0, 0], [np.nan, 0, 0], [0, 2, 0], [0, 0, 0]], np.float32)

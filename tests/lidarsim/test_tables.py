@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarsim.base.tables import DEGREES, METERS, SECONDS, Quantity, column_name, read_table
+from lidarsim.io.tables import DEGREES, METERS, SECONDS, Quantity, column_name, read_table
 
 TIME = Quantity("time_s", ("time", "t"), SECONDS, None)
 RANGE = Quantity("range_m", ("range", "distance"), METERS, "m")

@@ -26,7 +26,7 @@ from lidarpool import (
     Track,
     box,
 )
-from lidarpool.showing.pages.opened import open_views
+from lidarpool.pages.opened import open_views
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Z

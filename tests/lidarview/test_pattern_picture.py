@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lidarsim import Sensor, load_sensor
-from lidarsim.base.model_names import model_names
+from lidarsim.schema.model_names import model_names
 from lidarview.render.pattern_picture import pattern_page
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -31,7 +31,7 @@ from lidarpool.cli.commands import cli
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.picture_content import planning_picture
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 from lidarview.picture_file import PICTURE_FILE, PictureContent, SensorPositions, sensor_positions
 from lidarview.render.picture_page import Page

@@ -28,7 +28,7 @@ FOLDER = ROOT / "build" / "mutants"
 PACKAGES = [
     *("workflows/lidarsim/" + name for name in (
         "simulator", "motion", "media", "sensor", "sensor_files", "packets", "columns", "sweeps",
-        "survey", "scene", "base/random_numbers.py", "base/vectors.py", "base/tables.py",
+        "survey", "scene", "numerics/random_numbers.py", "numerics/vectors.py", "io/tables.py",
     )),
     "kernels/raybeam",
     "scheduler/poolpart",
@@ -37,7 +37,7 @@ PACKAGES = [
     *("workflows/lidarpool/" + name for name in (
         "clouds", "comparing", "places", "plan", "columns", "datasets", "recordings",
         "run/pipeline", "run/store", "scenario/campaign_sections.py", "scenario/campaign_jobs.py",
-        "report/merging.py", "report/growing_cloud.py", "base/shard.py",
+        "report/merging.py", "report/growing_cloud.py", "identity/shard.py",
     )),
 ]  # fmt: skip
 _FIRST_S = 10.0  # estimated time of the tests that are tried first

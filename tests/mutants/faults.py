@@ -20,7 +20,7 @@ SKIPPED_MODULES = (
     "workflows/lidarview/render/*",
     "workflows/lidarview/viewer/*",
     "workflows/lidarview/cell_pictures.py",
-    "workflows/lidarpool/showing/pages/*",
+    "workflows/lidarpool/pages/*",
     "workflows/lidarpool/**/*picture*.py",
     "workflows/lidarpool/**/*page*.py",
     "workflows/lidarpool/**/*drawing*.py",

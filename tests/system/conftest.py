@@ -23,8 +23,8 @@ import lidarpool.report.charts
 import lidarpool.report.result_pictures
 import lidarpool.run.pipeline.long_stages
 from lidarpool import Cloud
-from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
+from lidarpool.processes.tracing import trace_to
 from lidarpool.run.cluster.connection import local_cluster
 from poolpart.fetch import fetch_available
 from poolpart.pipe_states import pipes_of

@@ -34,14 +34,14 @@ from lidarpool import (
     simulate,
     sweeps,
 )
-from lidarpool.base.sealed import seal_json, unseal_json
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
+from lidarpool.identity.sealed import seal_json, unseal_json
 from lidarpool.report.campaign_output import verify
 from lidarpool.run.progress import Progress
-from lidarsim.base.errors import explained
-from lidarsim.base.storage import Storage
+from lidarsim.errors import explained
+from lidarsim.io.storage import Storage
 
 BASE = """
 sensor: {rays_per_revolution: 180, layers: 4, step_deg: 4}

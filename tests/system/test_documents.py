@@ -53,9 +53,9 @@ from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
-from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings, option_names
+from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import SensorModel, read_model
 
 ROOT = Path(__file__).parents[2]

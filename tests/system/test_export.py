@@ -13,7 +13,7 @@ from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
 from lidarpool.clouds import multi_file_format
 from lidarpool.clouds.folder import result_folder
 from lidarpool.clouds.writing import ExportSpec
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 SCENARIO = """
@@ -226,7 +226,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
 # Ends its worker at its first file of points, and never again.
 DIES = """
 import os, pathlib, signal
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 armed = pathlib.Path(os.environ["ARMED"])
 def write_and_die(storage, name, data, write=Storage.write):  # a preload may run twice
     write(storage, name, data)

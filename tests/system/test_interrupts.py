@@ -13,7 +13,7 @@ import pytest
 from tests.commands import RunningCommand
 
 from lidarpool.report.output import FILES
-from lidarsim.base import storage
+from lidarsim.io import storage
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="finds the processes of a run through /proc"
@@ -178,7 +178,7 @@ import re, subprocess, sys
 from multiprocessing import resource_tracker
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGQUIT
-from lidarsim.base.interrupts import children_spared
+from lidarsim.environment.interrupts import children_spared
 
 def blocked(process):
     mask = re.search(r"SigBlk:\\s+(\\w+)", Path(f"/proc/{process}/status").read_text())[1]
@@ -251,7 +251,7 @@ SIGNALED = {
 @pytest.mark.parametrize("where", SIGNALED)
 def test_a_signal_does_what_it_should(where):
     script, (code, out, err) = SIGNALED[where]
-    script = f"import signal, time\nfrom lidarsim.base.interrupts import *\n{script}"
+    script = f"import signal, time\nfrom lidarsim.environment.interrupts import *\n{script}"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr[: len(err)]) == (code, out, err)
 

@@ -8,7 +8,7 @@ import pytest
 from distributed import Worker, WorkerPlugin
 
 from lidarpool import LidarError, Scene, Sensor, Survey, simulate
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.tracing import trace_to
 from lidarsim.simulator.rig import Rig
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=60)

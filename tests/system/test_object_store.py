@@ -25,8 +25,8 @@ from lidarpool.columns.parts import unpack
 from lidarpool.datasets.dataset import job_file
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.run.store.run_store import RunStore
-from lidarsim.base.storage import Storage
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")

@@ -13,8 +13,8 @@ import yaml
 from tests.plugin_files import write_distribution
 
 from lidarpool import LidarError, load_sensor, read_cloud
-from lidarpool.base.software import call_with_plugins
-from lidarsim.base.plugins import Plugin, plugins_of
+from lidarpool.identity.software import call_with_plugins
+from lidarsim.environment.plugins import Plugin, plugins_of
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "tests" / "plugin_package"

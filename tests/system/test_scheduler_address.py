@@ -8,14 +8,14 @@ import pytest
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError
-from lidarpool.base import scheduler_address
-from lidarpool.base.scheduler_address import (
+from lidarpool.connection import scheduler_address
+from lidarpool.connection.scheduler_address import (
     check_address,
     check_certificates,
     is_scheduler_file,
     read_scheduler_file,
 )
-from lidarpool.base.tls_files import TlsFiles
+from lidarpool.connection.tls_files import TlsFiles
 
 
 @pytest.mark.parametrize("option", ["--scheduler", "--scheduler-file"])

@@ -17,12 +17,12 @@ from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps
-from lidarpool.base.sealed import seal_json, unseal_json
-from lidarpool.base.shard import Shard
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.job_seconds import read_seconds
+from lidarpool.identity.sealed import seal_json, unseal_json
+from lidarpool.identity.shard import Shard
 from lidarpool.report.campaign_output import verify
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 
 CAMPAIGN = """
 base: base.yaml
@@ -553,7 +553,7 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
 KILLED = """
 import json, os, signal, sys
 from lidarpool import merge
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"take": Storage, "write_table": output, "finish": output.DataSet}

@@ -15,7 +15,7 @@ from tests.clusters import thread_cluster
 from tests.shapes import room
 
 from lidarpool import LidarError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
-from lidarpool.base.shared_memory import SharedHandle
+from lidarpool.processes.shared_memory import SharedHandle
 from lidarpool.run.pipeline.casting_workers import INLINE_BYTES
 from lidarpool.run.pipeline.stage_messages import ScanRange
 from lidarpool.scenario.demo import demo_scenario

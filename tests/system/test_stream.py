@@ -21,7 +21,7 @@ from tests.drives import SCANS, TURNS, the_scene
 
 import lidarpool as lp
 from lidarpool import Campaign, Job, LidarError, Mounted, Noise, Pose, Sensor, Survey, Sweep
-from lidarpool.base.tracing import trace_to
+from lidarpool.processes.tracing import trace_to
 from lidarsim.motion.rotations import matrices
 
 SCENE = the_scene()

@@ -10,7 +10,7 @@ from distributed import Client, Security
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError
-from lidarpool.base.tls_files import TlsFiles
+from lidarpool.connection.tls_files import TlsFiles
 from lidarpool.run.cluster.connection import connected, local_cluster
 from lidarpool.run.cluster.watch import Waiting
 from poolpart import Pool

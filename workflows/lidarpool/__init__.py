@@ -9,10 +9,10 @@ from lidarsim._version import __version__
 if TYPE_CHECKING:
     from lidarscenes.robots.robot import Robot
     from lidarscenes.robots.urdf import load_robot
-    from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
     from lidarsim.columns.sweep import Sweep
     from lidarsim.columns.table import Column
+    from lidarsim.errors import LidarError
     from lidarsim.media.materials import Material
     from lidarsim.motion.navigation import Gnss, Imu, Navigation
     from lidarsim.motion.trajectory import Pose, Track
@@ -41,17 +41,17 @@ if TYPE_CHECKING:
     from .comparing.fit import Fit, fit
     from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
-    from .places.building import Twin, twin
+    from .pages.scanner_page import show
     from .plan import Plan, Planning
+    from .playback.live import play
+    from .reconstruction.building import Twin, twin
     from .recordings.opening import open_recording
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scenario.job import Job
-    from .showing.pages.scanner_page import show
-    from .showing.playback.live import play
-    from .showing.viewers.scanner_view import Foxglove, Rerun
+    from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [
     "Actor",

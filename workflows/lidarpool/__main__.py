@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from typing import NoReturn, TextIO, cast
 
-from lidarsim.base.interrupts import end_on_signals
+from lidarsim.environment.interrupts import end_on_signals
 
 
 def main() -> NoReturn:
     """Run the command (`cli.main`)."""
     end_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
-    from .base import rare_collections  # noqa: F401
-    from .base.streams import TolerantStream
     from .cli.commands import main as command
+    from .processes import rare_collections  # noqa: F401
+    from .processes.streams import TolerantStream
 
     if sys.stdout is not None:  # `lidarpool run … | head -3` runs to its end
         sys.stdout = cast(TextIO, TolerantStream(sys.stdout, BrokenPipeError))

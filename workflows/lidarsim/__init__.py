@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__
 
 if TYPE_CHECKING:
-    from .base.errors import LidarError
     from .columns.cloud import Cloud
     from .columns.table import Column
+    from .errors import LidarError
     from .media.materials import Material
     from .motion.navigation import Gnss, Imu, Navigation
     from .motion.trajectory import Pose, Track

@@ -1,12 +1,12 @@
 """The imports of plug-ins of mesh files and packets, with examples in docs/how-to/plugins.md."""
 
-from .base.declared import about
 from .packets.encoders import Datagrams, PacketEncoder, PacketSource
 from .packets.service import Destination, Service
 from .packets.shots import CarryOver, Shots
 from .scene.files.mesh_formats import MeshFormat
 from .scene.files.scene_graph import Content, MeshFileError, ReadOptions
 from .scene.scene_mesh import SceneMesh
+from .schema.declared import about
 
 __all__ = [
     "CarryOver",

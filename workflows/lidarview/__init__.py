@@ -1,6 +1,6 @@
 """Draw pictures and films of scenes and point clouds, and serve them as browser pages."""
 
-from lidarsim.base.notebook import draw_with
+from lidarsim.environment.notebook import draw_with
 
 # Notebooks show these objects with a picture. The drawing code is imported for the first picture.
 draw_with(

@@ -13,15 +13,15 @@ import numpy as np
 from matplotlib.colors import Normalize
 from PIL import Image
 
-from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.notebook import PICTURE_SIZE
-from lidarsim.base.words import plural
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.table import Z
+from lidarsim.environment.notebook import PICTURE_SIZE
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Survey
+from lidarsim.words import plural
 
 from .picture_file import SensorPositions, sensor_positions
 from .render import theme

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.archives import open_archive, packed
-from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
-from lidarsim.base.words import plural, rounded
 from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
+from lidarsim.io.archives import open_archive, packed
 from lidarsim.media.materials import MaterialTable
 from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
+from lidarsim.numerics.arrays import AnyArray, Floats, Floats32, Ints32
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.animation import Animation
 from lidarsim.scene.colors import Colors
@@ -24,6 +23,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import numbered_places
+from lidarsim.words import plural, rounded
 
 PICTURE_FILE = "pictures.npz"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from lidarsim.base.checks import check_type
 from lidarsim.columns.cloud import need_packages
+from lidarsim.schema.checks import check_type
 
 from ..columns.parts import StoredCloud, read_part
 

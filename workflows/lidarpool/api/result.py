@@ -12,9 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.base.checks import check_fits, check_list
-from lidarsim.base.notebook import PICTURE_SIZE, cell_display, image_of, table_of
-from lidarsim.base.words import plural, scans_in_words
+from lidarsim.environment.notebook import PICTURE_SIZE, cell_display, image_of, table_of
+from lidarsim.schema.checks import check_fits, check_list
+from lidarsim.words import plural, scans_in_words
 
 from ..clouds.writing import save_cloud
 from ..run.run_result import RunResult
@@ -139,7 +139,7 @@ class Result(RunResult):
         from lidarview.viewer.result_views import result_page, wait_for_interrupt
         from lidarview.viewer.view import View
 
-        from ..showing.pages.downloads import downloads
+        from ..pages.downloads import downloads
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.extra_columns)

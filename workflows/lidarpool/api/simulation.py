@@ -6,17 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Unpack
 
-from lidarsim.base.checks import check_number
-from lidarsim.base.declared import declared
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import did_you_mean
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.checks import check_number
+from lidarsim.schema.declared import declared
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.survey.survey import Survey
+from lidarsim.words import did_you_mean
 
-from ..base.shard import Shard
 from ..clouds.folder import output_destination
+from ..identity.shard import Shard
+from ..pages import page_of
 from ..plan import Planning
 from ..report.campaign_output import run_campaign
 from ..run.job_source import OneJob
@@ -29,7 +30,6 @@ from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.job import Job
-from ..showing.pages import page_of
 from .result import Result
 
 # Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its

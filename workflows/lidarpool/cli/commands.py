@@ -17,21 +17,21 @@ import click
 from click.shell_completion import CompletionItem
 
 from lidarsim._version import __version__
-from lidarsim.base.errors import LidarError
-from lidarsim.base.interrupts import (
+from lidarsim.environment.interrupts import (
     INTERRUPTED,
     STOPPED,
     UNTOUCHED,
     deferred_interrupts,
     interrupt_on_signals,
 )
-from lidarsim.base.plugins import find_plugin, plugins_of
-from lidarsim.base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
-from lidarsim.base.words import plural
+from lidarsim.environment.plugins import find_plugin, plugins_of
+from lidarsim.errors import LidarError
+from lidarsim.schema.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
+from lidarsim.words import plural
 
-from ..base.logs import set_logs
-from ..base.shard import ALL
-from ..showing.viewers.viewer_table import PAGE, VIEWERS
+from ..identity.shard import ALL
+from ..processes.logs import set_logs
+from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
 from .first_step import begin
@@ -44,7 +44,7 @@ from .twin_command import twin
 if TYPE_CHECKING:
     from poolpart import WorkerInfo
 
-    from ..base.tls_files import TlsFiles
+    from ..connection.tls_files import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
 
@@ -128,8 +128,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             raise click.UsageError("`--pace` requires `--live`.")
         settings["extent"] = "pictures" if pictures else "cloud" if cloud_only else None
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
-        from ..base import timeline as steps
-        from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
+        from ..processes import timeline as steps
+        from ..processes.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
         if timeline is not None:
             steps.timeline.show_at_exit(timeline)
@@ -328,7 +328,7 @@ def run(
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
-    from lidarsim.base.storage import Storage
+    from lidarsim.io.storage import Storage
 
     from ..report.campaign_output import verify
     from ..run.store.run_store import RUN_FOLDER

@@ -12,13 +12,13 @@ from contextlib import suppress
 import click
 from click.shell_completion import CompletionItem
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
+from lidarsim.errors import LidarError
+from lidarsim.schema.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
 from lidarsim.sensor_files.format_table import FORMATS
 
 from ..clouds.format_table import EXPORTS, GROUP
-from ..showing.playback.bridge_table import BRIDGES
-from ..showing.viewers.viewer_table import PAGE, VIEWERS
+from ..playback.bridge_table import BRIDGES
+from ..viewers.viewer_table import PAGE, VIEWERS
 
 Items = list[CompletionItem]
 
@@ -31,7 +31,7 @@ def starting_with(incomplete: str, names: Iterable[str]) -> Items:
 def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
     """Complete the name of a sensor model, with or without its manufacturer, or a file name."""
     del ctx, param
-    from lidarsim.base.model_names import model_names, plugin_model_names
+    from lidarsim.schema.model_names import model_names, plugin_model_names
 
     names = model_names()
     matches = starting_with(incomplete, names)
@@ -114,6 +114,6 @@ def _in_list(incomplete: str, names: Iterable[str]) -> Items:
 
 def _plugin_formats() -> Iterator[str]:
     """Yield the formats of plug-ins."""
-    from lidarsim.base.plugins import plugins_of
+    from lidarsim.environment.plugins import plugins_of
 
     yield from plugins_of(GROUP)

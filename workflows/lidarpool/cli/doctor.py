@@ -16,15 +16,15 @@ from dask.system import CPU_COUNT
 from distributed.system import MEMORY_LIMIT
 from packaging.requirements import Requirement
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import CHECKOUT
+from lidarsim.environment.extras import CHECKOUT
+from lidarsim.errors import LidarError
 from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 from raybeam.compiled import HAS_CACHE
 from raybeam.installation import install_command
 
-from ..base.open3d_module import load_open3d
+from ..open3d_access.open3d_module import load_open3d
 from ..report.report import versions
 from ..run.cluster.checks import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR

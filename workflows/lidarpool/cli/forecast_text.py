@@ -12,11 +12,11 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import listed, plural, rounded, scans_in_words
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.words import listed, plural, rounded, scans_in_words
 
-from ..base.job_errors import summarize_errors
+from ..identity.job_errors import summarize_errors
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
 from ..run.job_source import OneJob

@@ -9,10 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidarscenes.files.lenient_xml import parse_lenient_xml
-from lidarsim.base.errors import LidarError
-from lidarsim.base.input_files import read_input
-from lidarsim.base.plugins import Plugin, find_plugin
-from lidarsim.base.words import printable
+from lidarsim.environment.plugins import Plugin, find_plugin
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input
+from lidarsim.words import printable
 
 # Names are tags of the outermost elements of XML files, without namespaces, or endings of other
 # files.

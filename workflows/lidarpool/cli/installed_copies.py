@@ -11,9 +11,9 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-from lidarsim.base.extras import install_command
+from lidarsim.environment.extras import install_command
 
-from ..base.software import PACKAGES
+from ..identity.software import PACKAGES
 
 _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 

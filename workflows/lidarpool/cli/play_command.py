@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 
 from ..clouds.format_table import LAYOUTS
 from . import completion
@@ -108,11 +108,11 @@ def play(
     begin("reading the source")
     from lidarsim.packets.capture import ENDINGS
 
-    from ..base.fork_server import keep_freed_memory
-    from ..showing.playback.bridge import BridgeOptions, bridge_class
-    from ..showing.playback.player import play_sweeps
-    from ..showing.playback.schedule import Schedule
-    from ..showing.playback.sources import open_source
+    from ..playback.bridge import BridgeOptions, bridge_class
+    from ..playback.player import play_sweeps
+    from ..playback.schedule import Schedule
+    from ..playback.sources import open_source
+    from ..processes.fork_server import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -151,8 +151,8 @@ def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
     """Play a recording of packets."""
-    from ..showing.playback.pcap_recording import PcapRecording, play_recording, recorded_streams
-    from ..showing.playback.transmitter import Transmitter
+    from ..playback.pcap_recording import PcapRecording, play_recording, recorded_streams
+    from ..playback.transmitter import Transmitter
     from .terminal import Terminal
 
     terminal = Terminal()

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.vocabulary import PICTURES, UNITS_M
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.schema.vocabulary import PICTURES, UNITS_M
 
 from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
 from . import completion
@@ -84,8 +84,8 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     """  # noqa: D301 - click wants the character, not its name
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-    from ..base.fork_server import keep_freed_memory
     from ..clouds.folder import local_folder, local_result, upload
+    from ..processes.fork_server import keep_freed_memory
     from ..report.output import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
@@ -310,7 +310,7 @@ def view(
     from lidarview.viewer.view import CLOUD
 
     from ..clouds.folder import local_result
-    from ..showing.pages.opened import growing_view, is_data_set, open_views
+    from ..pages.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
         raise LidarError("`--film` and `--export` require a single input.")
@@ -321,7 +321,7 @@ def view(
                 "`--film` and `--export`."
             )
         options.refuse_mesh_options(of_mesh, data_sets[0])
-        from ..showing.pages.job_list import JobList, show_jobs
+        from ..pages.job_list import JobList, show_jobs
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
@@ -421,8 +421,8 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
       lidarpool compare scan.laz earlier.laz --distance 0.05
       lidarpool compare scan.laz model.ply --unit-b ft
     """  # noqa: D301 - click wants the character, not its name
-    from ..base.fork_server import keep_freed_memory
     from ..comparing.two_clouds import compare as compared
+    from ..processes.fork_server import keep_freed_memory
 
     keep_freed_memory()
     comparison = compared(a, b, **settings)
@@ -472,8 +472,8 @@ def fit(
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
       lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
     """  # noqa: D301 - click wants the character, not its name
-    from ..base.fork_server import keep_freed_memory
     from ..comparing.fit import fit as fitted
+    from ..processes.fork_server import keep_freed_memory
 
     keep_freed_memory()
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)

@@ -13,17 +13,18 @@ from typing import Any
 
 import click
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural, scans_in_words
 from lidarsim.columns.table import NO_SURFACE
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
 from lidarsim.simulator.casting.scene_caster import check_backend_here
+from lidarsim.words import plural, scans_in_words
 
-from ..base import timeline
-from ..base.shard import Shard, describe_shard
 from ..clouds.folder import local_result, output_destination, result_folder
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
+from ..identity.shard import Shard, describe_shard
+from ..pages import page_of
+from ..processes import timeline
 from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
 from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import CLOUD, SurveyOutput, run_survey
@@ -39,7 +40,6 @@ from ..scenario.job import Job
 from ..scenario.plausibility import implausibilities
 from ..scenario.prepare import Prepared, prepare
 from ..scenario.scenario import Scenario
-from ..showing.pages import page_of
 from .shared_options import show
 from .terminal import Terminal
 

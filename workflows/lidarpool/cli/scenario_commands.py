@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import plural
+from lidarsim.errors import LidarError
+from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.sensor_files.format_table import FORMATS
+from lidarsim.words import plural
 
 from . import completion
 from . import shared_options as options
@@ -23,12 +23,12 @@ from .first_step import begin
 from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
-    from lidarsim.base.storage import Storage
+    from lidarsim.io.storage import Storage
     from lidarsim.scene.scene import Scene
     from lidarsim.sensor import Sensor
     from lidarsim.sensor.models import SensorModel
 
-    from ..base.tls_files import TlsFiles
+    from ..connection.tls_files import TlsFiles
 
 MAX_COPIED_TRIANGLES = 20_000_000  # limit for files that cannot share triangles
 _SENSOR_FORMATS = "File format: " + ", ".join(row.name for row in FORMATS) + "."
@@ -275,7 +275,7 @@ def _failed_jobs(figures: dict[str, Any]) -> str:
 
 def _free_target(target: Path | Storage) -> str:
     """Return the name of a free target beside a target that holds another result."""
-    from lidarsim.base.storage import Storage
+    from lidarsim.io.storage import Storage
 
     names = (f"{str(target).rstrip('/')}-{number}" for number in count(2))
     return next(name for name in names if not Storage.at(name).entries())
@@ -560,9 +560,7 @@ def sensors(
         return
     if seconds is not None or revolutions is not None:
         raise click.UsageError("`--seconds` and `--revolutions` cannot be used with a .png file.")
-    from lidarview.render.pattern_picture import (
-        draw_pattern,  # imports Matplotlib, which figures do not need
-    )
+    from lidarview.render.pattern_picture import draw_pattern
 
     draw_pattern(out, sensor)
     click.echo(click.format_filename(out))
@@ -590,7 +588,7 @@ def _write_sensor(
 
 def _list_models() -> None:
     """Print the models with their main figures."""
-    from lidarsim.base.model_names import model_names, plugin_model_names
+    from lidarsim.schema.model_names import model_names, plugin_model_names
 
     heads = ("model", "channels", "field of view", "range", "rate (Hz)", "points/s")
     rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
@@ -601,7 +599,7 @@ def _list_models() -> None:
 
 def _show_model(name: str) -> None:
     """Print the figures of a model and their sources."""
-    from lidarsim.base.model_names import model_names, plugin_model_names
+    from lidarsim.schema.model_names import model_names, plugin_model_names
     from lidarsim.sensor.models import read_model, shown_noise
 
     described = read_model(name)

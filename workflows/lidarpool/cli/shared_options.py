@@ -11,18 +11,18 @@ from typing import Any
 
 import click
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage, is_url
-from lidarsim.base.vocabulary import BACKENDS, UNITS_M
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage, is_url
+from lidarsim.schema.vocabulary import BACKENDS, UNITS_M
 
-from ..base.scheduler_address import (
+from ..connection.scheduler_address import (
     check_address,
     check_certificates,
     is_scheduler_file,
     read_scheduler_file,
 )
-from ..base.shard import Shard
-from ..base.tls_files import TlsFiles
+from ..connection.tls_files import TlsFiles
+from ..identity.shard import Shard
 from . import completion
 
 Command = Callable[..., None]
@@ -242,7 +242,7 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
 
     Raises LidarError if a file of a certificate cannot be read.
     """
-    from lidarsim.base.input_files import input_size
+    from lidarsim.io.input_files import input_size
 
     if settings["scheduler"] is not None and file is not None:
         raise click.UsageError("`--scheduler` and `--scheduler-file` cannot be combined.")

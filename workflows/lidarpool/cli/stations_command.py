@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.words import joined, plural, printable
+from lidarsim.errors import LidarError
+from lidarsim.words import joined, plural, printable
 
 from . import completion
 from . import shared_options as options
@@ -23,7 +23,7 @@ from .first_step import begin
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
-    from lidarsim.base.arrays import Floats
+    from lidarsim.numerics.arrays import Floats
 
     from ..plan.stations import StationPlan, SurveyCoverage
     from ..scenario.prepare import Prepared
@@ -198,7 +198,7 @@ def _scenario_model(scenario: Scenario) -> str | None:
 
 def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
     """Choose stations, write them as a scenario and a picture, and print them."""
-    from lidarsim.base.model_names import full_name
+    from lidarsim.schema.model_names import full_name
     from lidarsim.sensor.models import load_sensor
 
     from ..plan.stations import plan_stations, sensor_elevations

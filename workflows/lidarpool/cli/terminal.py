@@ -14,11 +14,11 @@ import click
 from distributed import Client
 from rich.console import Console
 
-from lidarsim.base.words import plural
-from lidarsim.base.writing_progress import WritingProgress
+from lidarsim.io.writing_progress import WritingProgress
+from lidarsim.words import plural
 
-from ..base.logs import set_logs
-from ..base.streams import TolerantStream
+from ..processes.logs import set_logs
+from ..processes.streams import TolerantStream
 from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED
 

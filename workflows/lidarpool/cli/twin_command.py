@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
 
 from . import completion
 from . import shared_options as options
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
-    from ..base.tls_files import TlsFiles
+    from ..connection.tls_files import TlsFiles
 
 
 @click.command()
@@ -74,10 +74,10 @@ def twin(
       lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - click wants the character, not its name
-    from ..base.fork_server import keep_freed_memory
-    from ..places.building import SCENARIO_FILE
-    from ..places.building import twin as build
-    from ..places.finished_steps import STEPS_FOLDER, FinishedSteps
+    from ..processes.fork_server import keep_freed_memory
+    from ..reconstruction.building import SCENARIO_FILE
+    from ..reconstruction.building import twin as build
+    from ..reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps
     from ..run.cluster.connection import connected
 
     if resume and overwrite:

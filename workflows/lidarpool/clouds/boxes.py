@@ -7,10 +7,10 @@ from types import EllipsisType
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Floats32, Ints, Ints32
-from lidarsim.base.vectors import matvec
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
+from lidarsim.numerics.vectors import matvec
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from lidarsim.base.arrays import AnyArray, Floats32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CloudLike
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyArray, Floats32
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent

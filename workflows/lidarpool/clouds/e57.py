@@ -11,22 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import AnyArray, Floats
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import input_size
-from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
+from lidarsim.environment.extras import reading
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import input_size
 from lidarsim.motion.rotations import matrices
+from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.scene.files.intensity_scales import Limits, scales_of
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.words import printable
 
-from ..base.fingerprint import fingerprint
-from ..base.per_process import PerProcess
+from ..identity.fingerprint import fingerprint
+from ..processes.per_process import PerProcess
 from .cloud_format import CloudFormat
 from .gps_time import gps_start_s
 from .recording import Recording, RecordingSource

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Bytes, Floats, Indices, Ints
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
+from lidarsim.errors import LidarError
 from lidarsim.motion.straight_lines import StraightLines
+from lidarsim.numerics.arrays import Bools, Bytes, Floats, Indices, Ints
 from lidarsim.sensor.sensor import LineSensor, Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps

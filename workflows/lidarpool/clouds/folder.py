@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError, MissingFileError, as_sentence, explained
-from lidarsim.base.storage import WRITING, Storage, is_url
+from lidarsim.errors import LidarError, MissingFileError, as_sentence, explained
+from lidarsim.io.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 

@@ -15,9 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import need
-from lidarsim.base.plugins import Plugin, PluginTable, plugins_of
+from lidarsim.environment.extras import need
+from lidarsim.environment.plugins import Plugin, PluginTable, plugins_of
+from lidarsim.errors import LidarError
 
 if TYPE_CHECKING:  # NumPy
     from .cloud_format import CloudFormat

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.archives import open_archive, packed
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import read_input
-from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.archives import open_archive, packed
+from lidarsim.io.input_files import read_input
+from lidarsim.io.numbered_files import sort_by_number
+from lidarsim.numerics.arrays import AnyArray
 from lidarsim.sweeps.ray_image import Image, fired_of
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyArray
 from lidarsim.sweeps.sweeps import Sweeps
 
 from .cloud_format import Entry, PointColumns

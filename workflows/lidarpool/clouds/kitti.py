@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import read_input, read_input_text
-from lidarsim.base.numbered_files import (
+from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input, read_input_text
+from lidarsim.io.numbered_files import (
     frames_in_words,
     frames_without_file,
     rows_of_frames,
     sort_by_number,
 )
-from lidarsim.base.time_units import seconds_of
-from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.columns.sweep import Sweep
+from lidarsim.io.time_units import seconds_of
 from lidarsim.motion.rotations import matrices
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, plain_names

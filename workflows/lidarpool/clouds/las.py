@@ -15,14 +15,14 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.errors import CutShortError, LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
+from lidarsim.environment.extras import reading
+from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.errors import CutShortError, LidarError
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 from .cloud_format import CloudFormat

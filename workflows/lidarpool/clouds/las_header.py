@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.errors import CutShortError
-from lidarsim.base.input_files import open_input
+from lidarsim.errors import CutShortError
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import open_input
 from lidarsim.scene.files.noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSES
 from lidarsim.scene.files.stated_system import StatedSystem
 

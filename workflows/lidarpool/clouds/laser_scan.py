@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.columns.cloud import Cloud
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.ray_image import Image

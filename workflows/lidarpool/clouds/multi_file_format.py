@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.errors import LidarError
-from lidarsim.base.plugins import Plugin
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.environment.plugins import Plugin
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyArray
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 from .cloud_format import CloudFormat

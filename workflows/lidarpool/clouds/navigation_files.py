@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
 from lidarsim.motion.navigation import fixes, geodetic, imu_samples
+from lidarsim.numerics.arrays import Floats
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 

@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import Bools, Bytes, Floats, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import read_input
-from lidarsim.base.named_files import check_name, file_below
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input
+from lidarsim.io.named_files import check_name, file_below
+from lidarsim.io.storage import Storage
 from lidarsim.motion.rotations import matrices
+from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from ..base.fingerprint import fingerprint
+from ..identity.fingerprint import fingerprint
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 
-from ..base.open3d_module import load_open3d
+from ..open3d_access.open3d_module import load_open3d
 
 
 def to_open3d(cloud: Cloud) -> Any:

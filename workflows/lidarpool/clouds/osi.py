@@ -17,10 +17,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.elementary import arctan2
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints
+from lidarsim.numerics.elementary import arctan2
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .boxes import Boxes, SweepBoxes

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import input_size
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, TABLE
+from lidarsim.environment.extras import reading
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import input_size
+from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
 from .cloud_format import Entry, PointColumns

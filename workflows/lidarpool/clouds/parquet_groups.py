@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lidarsim.base.allowance import Allowance
+from lidarsim.io.allowance import Allowance
 
 _ADVICE = "write fewer points, or smaller row groups"
 

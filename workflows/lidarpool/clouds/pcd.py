@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import open_input
-from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
+from lidarsim.environment.extras import reading
+from lidarsim.io.input_files import open_input
+from lidarsim.io.numbered_files import sort_by_number
+from lidarsim.numerics.arrays import AnyArray
 from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation

@@ -12,22 +12,22 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, AnyFloats
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import read_input
-from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input
+from lidarsim.numerics.arrays import AnyArray, AnyFloats
 from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
+from lidarsim.words import printable
 
-from ..base.open3d_module import load_open3d
+from ..open3d_access.open3d_module import load_open3d
 from .cloud_format import CloudFormat, PointColumns
 from .job_reader import JobReader
 from .recording import Recording, RecordingSource, open_cloud, sweep_from_columns

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints32
 from lidarsim.columns.part_columns import decimals_of
 from lidarsim.columns.ply_format import as_file_type
 from lidarsim.columns.table import AXES, Column
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints32
 
 from ..columns.part_blocks import BlockMemory
 from .ply_loops import TILE_ROWS, make_rows

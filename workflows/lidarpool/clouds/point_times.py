@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Columns
+from lidarsim.numerics.arrays import Floats
 
 _TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 _MAX_OUTSIDE = 0.5  # sweeps by which a timestamp may lie before the first or after the last point

@@ -18,21 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import CutShortError, LidarError
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.extras import reading
-from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.column_names import STRENGTHS, with_standard_names
 from lidarsim.columns.sweep import Columns, Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import CutShortError, LidarError
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, OmittedPoints, usable_points
 from lidarsim.scene.files.pcd import unpacked_colors
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.words import did_you_mean, joined, plural
 
-from ..base.fingerprint import fingerprint
-from ..base.per_process import PerProcess
+from ..identity.fingerprint import fingerprint
+from ..processes.per_process import PerProcess
 from .point_times import PointTimes
 from .rings import Rings
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
 _MAX_RINGS = 512

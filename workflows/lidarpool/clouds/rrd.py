@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32
 from lidarsim.columns.table import COLORS
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Floats32
 from lidarsim.packets.encoders import START_NS
 from lidarview.render.coloring import TURBO
 

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32, Ints32
 from lidarsim.columns.cloud import Cloud
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Floats32, Ints32
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified

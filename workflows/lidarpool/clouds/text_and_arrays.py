@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lidarsim.base.extras import reading
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.ptx import read_ptx
 

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.archives import open_archive, packed, read_npy
-from lidarsim.base.arrays import AnyArray, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import input_size
-from lidarsim.base.numbered_files import sort_by_number
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.archives import open_archive, packed, read_npy
+from lidarsim.io.input_files import input_size
+from lidarsim.io.numbered_files import sort_by_number
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyArray, Ints
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .boxes import Boxes, SweepBoxes

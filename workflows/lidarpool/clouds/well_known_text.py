@@ -6,8 +6,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import NamedTuple
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError
 
 
 class _Geodetic(NamedTuple):

@@ -11,16 +11,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from lidarsim.base.checks import check_fields
-from lidarsim.base.declared import FileSection, about
-from lidarsim.base.errors import LidarError, MissingFileError, explained
-from lidarsim.base.extras import install_command
-from lidarsim.base.storage import Storage, flush
-from lidarsim.base.value_texts import one_line
-from lidarsim.base.words import alternatives, joined
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.io.storage import Storage, flush
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.declared import FileSection, about
+from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.words import alternatives, joined
 from lidarview.picture_file import PictureContent
 
 from ..columns.parts import StoredCloud

@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.archives import StoredArray, stored_arrays
-from lidarsim.base.arrays import AnyArray, Bytes, Ints
-from lidarsim.base.checksum import crc32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.input_files import open_input
-from lidarsim.base.storage import Storage
 from lidarsim.columns.table import SCAN, Column
+from lidarsim.errors import LidarError
+from lidarsim.io.archives import StoredArray, stored_arrays
+from lidarsim.io.checksum import crc32
+from lidarsim.io.input_files import open_input
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyArray, Bytes, Ints
 
 from .block_loops import write_scans
 from .parts import reading_part

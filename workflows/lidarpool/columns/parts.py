@@ -27,16 +27,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from lidarsim.base.archives import Piece, read_arrays, read_npy, stored_pieces
-from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.input_files import open_input
-from lidarsim.base.storage import Storage, target_of
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudDisplay
 from lidarsim.columns.part_columns import PartColumns, positions_of
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.errors import LidarError
+from lidarsim.io.archives import Piece, read_arrays, read_npy, stored_pieces
+from lidarsim.io.input_files import open_input
+from lidarsim.io.storage import Storage, target_of
+from lidarsim.numerics.arrays import AnyArray, Floats, Integers, Ints, Ints32
+from lidarsim.numerics.even_samples import even_indices
 
 # Names of a run's files in the folder of parts. Each name starts with the mark of the run.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsim.base.arrays import Ints
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.sweep import Columns, Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Ints
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
 from ..clouds.recording import Recording

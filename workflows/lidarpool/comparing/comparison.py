@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.base.arrays import AnyArray, Floats
-from lidarsim.base.errors import explained
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import plural
+from lidarsim.errors import explained
+from lidarsim.numerics.arrays import AnyArray, Floats
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.words import plural
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Indices, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
-from lidarsim.base.words import plural
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
+from lidarsim.words import plural
 
 from .compared_sweep import RAY_KEY
 

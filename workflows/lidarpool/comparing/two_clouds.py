@@ -12,18 +12,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from lidarsim._version import __version__
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.checks import check_choice, check_number
-from lidarsim.base.errors import LidarError
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.schema.checks import check_choice, check_number
+from lidarsim.words import plural
 
-from ..base.neighbors import nearest_neighbors
 from ..clouds.recording import Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
+from ..open3d_access.neighbors import nearest_neighbors
 from ..recordings.opening import open_recording
 from .compared_sweep import compared_in_world, compared_sweep, rings_note
 from .comparison import CELLS, RESIDUALS, Comparison

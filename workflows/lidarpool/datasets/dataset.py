@@ -21,22 +21,22 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from lidarsim._version import __version__
-from lidarsim.base.archives import packed
-from lidarsim.base.checks import check_fields
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.named_files import leads_outside
-from lidarsim.base.storage import Storage
-from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import CloudLike
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.archives import packed
+from lidarsim.io.named_files import leads_outside
+from lidarsim.io.storage import Storage
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.value_texts import one_line
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
-from ..base.sealed import SealedWriter
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import CloudFormat, Entry
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, LAYOUTS, load_format
 from ..clouds.multi_file_format import MultiFileFormat
 from ..clouds.writing import ExportSpec
+from ..identity.sealed import SealedWriter
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
-from lidarsim.base.words import shortened, without_common_prefix
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.words import shortened, without_common_prefix
 
 from .job_table import JobRow
 

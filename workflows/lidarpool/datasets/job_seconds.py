@@ -10,8 +10,8 @@ import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping
 
-from lidarsim.base.errors import LidarError, message_of
-from lidarsim.base.storage import Storage
+from lidarsim.errors import LidarError, message_of
+from lidarsim.io.storage import Storage
 
 from .job_table import JobRow
 

@@ -28,12 +28,12 @@ from typing import IO, Any
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError, as_sentence, explained
-from lidarsim.base.input_files import open_input
-from lidarsim.base.named_files import is_plain
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import joined, printable
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.errors import LidarError, as_sentence, explained
+from lidarsim.io.input_files import open_input
+from lidarsim.io.named_files import is_plain
+from lidarsim.io.storage import Storage
+from lidarsim.words import joined, printable
 
 Value = bool | int | float | str
 

@@ -19,21 +19,21 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.archives import open_archive
-from lidarsim.base.checks import check_list, check_number
-from lidarsim.base.errors import LidarError, as_sentence
-from lidarsim.base.extras import install_command
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError, as_sentence
+from lidarsim.io.archives import open_archive
+from lidarsim.io.storage import Storage
+from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarsim.words import did_you_mean, joined, plural
 
-from ..base.sealed import unseal_json
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import Entry
 from ..clouds.folder import check_exists
 from ..clouds.format_table import DATA_SETS
 from ..clouds.job_reader import JobReader
+from ..identity.sealed import unseal_json
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import sweep_of_job

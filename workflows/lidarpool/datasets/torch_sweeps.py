@@ -15,8 +15,8 @@ import torch
 import torch.distributed
 import torch.utils.data
 
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
 
 
 class ReadSweeps(Protocol):

@@ -13,7 +13,7 @@ import itertools
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.numerics.arrays import Floats, Floats32
 
 # Discs are enlarged by this fraction of their distance and size, which is about 30 rounding errors
 # in single precision. A path that is collision-free here also passes the exact check.

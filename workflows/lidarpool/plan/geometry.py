@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 
 
 def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:

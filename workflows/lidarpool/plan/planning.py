@@ -10,11 +10,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.checks import check_fields
-from lidarsim.base.declared import Seed, about
-from lidarsim.base.errors import LidarError
-from lidarsim.base.value_texts import one_line
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.declared import Seed, about
+from lidarsim.schema.value_texts import one_line
 
 from .geometry import segment_distances
 

@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarscenes.procedural.floor import SLAB_M
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.checks import check_list, check_number
-from lidarsim.base.errors import LidarError
-from lidarsim.base.words import name_hint
+from lidarsim.errors import LidarError
 from lidarsim.media.materials import rows_named
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.scene.simplified import SimplifiedScene
+from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sensor import Sensor, Spin
+from lidarsim.words import name_hint
 from raybeam import RayCaster
 
-from ..base.neighbors import nearest_neighbors
+from ..open3d_access.neighbors import nearest_neighbors
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # minimum fraction of the reachable area per station by default

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Floats32
+from lidarsim.numerics.arrays import Floats, Floats32
 
 from .cost import PathCost
 

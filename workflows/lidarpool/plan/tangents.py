@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats, Indices
+from lidarsim.numerics.arrays import Floats, Indices
 
 from .geometry import PathAxes, segment_distances
 

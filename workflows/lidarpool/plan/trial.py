@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
-from lidarsim.base.value_texts import one_line
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
+from lidarsim.schema.value_texts import one_line
 
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances

@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from lidarsim.base.checks import check_choice
-from lidarsim.base.errors import LidarError, MissingFileError
-from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
+from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
+from lidarsim.schema.checks import check_choice
+from lidarsim.schema.vocabulary import UNITS_M
+from lidarsim.words import joined
 
 from ..clouds.format_table import format_of_path
 from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud

@@ -12,21 +12,21 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from lidarsim.base.errors import LidarError, explained, message_of
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import listed, plural
+from lidarsim.errors import LidarError, explained, message_of
+from lidarsim.io.storage import Storage
+from lidarsim.words import listed, plural
 
-from ..base.field_words import describe_changes
-from ..base.job_errors import summarize_errors
-from ..base.sealed import seal_json, unseal_json
-from ..base.shard import ALL, Shard, describe_shard
-from ..base.software import describe_difference, software
 from ..clouds.folder import LAST_FILE, check_exists, result_folder
 from ..clouds.format_table import DATA_SETS, load_format
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
 from ..datasets.loader import read_index, sweeps
+from ..identity.field_words import describe_changes
+from ..identity.job_errors import summarize_errors
+from ..identity.sealed import seal_json, unseal_json
+from ..identity.shard import ALL, Shard, describe_shard
+from ..identity.software import describe_difference, software
 from ..run.cluster.cluster import ClusterConnection
 from ..run.committed import Committed
 from ..run.listener import Listener

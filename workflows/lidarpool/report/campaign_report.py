@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
 from lidarview.render.picture_page import Page
 
 from ..clouds.folder import LAST_FILE

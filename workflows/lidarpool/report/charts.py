@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from lidarsim.base.arrays import Bools, Floats, Indices
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import plural, rounded, shortened
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, value_names
+from lidarsim.numerics.arrays import Bools, Floats, Indices
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.words import plural, rounded, shortened
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms

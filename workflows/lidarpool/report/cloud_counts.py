@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints, Ints32
 from lidarsim.columns.part_columns import positions_of
 from lidarsim.columns.table import Column
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
 from .count_loops import SHIFT, count_cells, count_labels
 

@@ -11,21 +11,21 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from lidarsim.base.checks import check_list, check_type
-from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import listed
+from lidarsim.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
+from lidarsim.io.storage import Storage
+from lidarsim.schema.checks import check_list, check_type
+from lidarsim.words import listed
 
-from ..base.field_words import describe_changes
-from ..base.fingerprint import fingerprint
-from ..base.open3d_module import load_open3d
-from ..base.shard import ALL, Shard
-from ..base.software import software
 from ..clouds.folder import LAST_FILE, check_exists, output_destination, result_folder
 from ..columns.parts import part_name
 from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
 from ..datasets.job_seconds import known_seconds, read_seconds
 from ..datasets.job_table import JobRow
+from ..identity.field_words import describe_changes
+from ..identity.fingerprint import fingerprint
+from ..identity.shard import ALL, Shard
+from ..identity.software import software
+from ..open3d_access.open3d_module import load_open3d
 from ..plan import Trial
 from ..run.committed import Committed
 from ..run.job_source import OneJob

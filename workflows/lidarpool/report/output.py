@@ -11,25 +11,25 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.interrupts import deferred_interrupts
-from lidarsim.base.storage import Storage, flush
-from lidarsim.base.vocabulary import PICTURES
-from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.table import optional_columns
+from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage, flush
+from lidarsim.io.writing_progress import WritingProgress
+from lidarsim.schema.vocabulary import PICTURES
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
-from ..base import timeline
-from ..base.field_words import describe_changes
-from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
 from ..clouds.format_table import FORMATS, format_row, plugin_formats
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
+from ..identity.field_words import describe_changes
+from ..open3d_access.open3d_module import load_open3d
+from ..processes import timeline
 from ..run.cluster.cluster import Cluster, ClusterConnection
 from ..run.job_source import OneJob
 from ..run.listener import Listener

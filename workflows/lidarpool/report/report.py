@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from lidarsim._version import __version__
-from lidarsim.base.declared import declared
-from lidarsim.base.storage import Storage
 from lidarsim.columns.table import NO_SURFACE
+from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.declared import declared
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 

@@ -16,15 +16,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.vocabulary import PICTURES
-from lidarsim.base.words import alternatives, did_you_mean, plural
-from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.writing_progress import WritingProgress
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.schema.vocabulary import PICTURES
+from lidarsim.words import alternatives, did_you_mean, plural
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.coloring import add_composed_columns

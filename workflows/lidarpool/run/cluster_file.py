@@ -12,12 +12,12 @@ from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-from lidarsim.base.error_sentences import sentences
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
-from lidarsim.base.interrupts import deferred_interrupts
-from lidarsim.base.words import did_you_mean, plural
-from lidarsim.base.yamlfile import read_yaml
+from lidarsim.environment.extras import install_command
+from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.errors import LidarError
+from lidarsim.io.yamlfile import read_yaml
+from lidarsim.schema.error_sentences import sentences
+from lidarsim.words import did_you_mean, plural
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFO_MARK
 

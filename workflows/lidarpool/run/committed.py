@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..base.shard import ALL
+from ..identity.shard import ALL
 from ..plan import best
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from .pipeline.task_book import StageTotals

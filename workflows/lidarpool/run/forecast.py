@@ -16,10 +16,9 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
-from lidarsim.base.errors import LidarError, Mistakes
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import joined
 from lidarsim.columns.cloud import CHUNK_POINTS
+from lidarsim.errors import LidarError, Mistakes
+from lidarsim.io.storage import Storage
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.sensor.noise import Noise
 from lidarsim.sensor.optics import Returns
@@ -35,6 +34,7 @@ from lidarsim.simulator.memory import (
 )
 from lidarsim.simulator.sampling import sample_survey
 from lidarsim.survey.survey import Survey
+from lidarsim.words import joined
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends

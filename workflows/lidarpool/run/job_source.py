@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.declared import declared
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.declared import declared
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
-from ..base.field_words import describe_fields
-from ..base.fingerprint import fingerprint
-from ..base.shard import ALL, Shard
 from ..datasets.job_table import JobRow, Value
+from ..identity.field_words import describe_fields
+from ..identity.fingerprint import fingerprint
+from ..identity.shard import ALL, Shard
 from ..plan import Planning
 from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job

@@ -11,15 +11,15 @@ from typing import Annotated, Any, Literal, TypedDict
 from distributed import Client
 from pydantic import Field
 
-from lidarsim.base.checks import check_fields
-from lidarsim.base.declared import declared
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.value_texts import one_line
-from lidarsim.base.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
-from lidarsim.base.words import did_you_mean
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.declared import declared
+from lidarsim.schema.value_texts import one_line
+from lidarsim.schema.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
+from lidarsim.words import did_you_mean
 
-from ..base.tls_files import TlsFiles
+from ..connection.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .store.database import FILE

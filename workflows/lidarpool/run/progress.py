@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
-from lidarsim.base.notebook import cell_display
-from lidarsim.base.words import plural
-from lidarsim.base.writing_progress import WritingProgress
+from lidarsim.environment.notebook import cell_display
+from lidarsim.io.writing_progress import WritingProgress
+from lidarsim.words import plural
 
 # Lines of progress: label, name of the count, and of the total, which is the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (

@@ -16,14 +16,14 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import Any
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.words import listed, plural
+from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
+from lidarsim.words import listed, plural
 
-from ..base import timeline
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..plan import Planning, Trial
+from ..processes import timeline
 from ..scenario.job import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch

@@ -1,4 +1,4 @@
-"""Interface of a run to its live page (`lidarpool.showing.pages.live_page`)."""
+"""Interface of a run to its live page (`lidarpool.pages.live_page`)."""
 
 from __future__ import annotations
 

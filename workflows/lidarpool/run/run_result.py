@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from lidarsim.base.arrays import Floats32, Ints
-from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
+from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 
 from ..columns.parts import StoredCloud

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from typing import Any
 
-from ..base.shard import ALL
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
+from ..identity.shard import ALL
 from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
 from .committed import Committed

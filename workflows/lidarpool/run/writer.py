@@ -13,18 +13,18 @@ from typing import NamedTuple
 
 from distributed import Reschedule
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import TEMPORARY, Storage
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import TEMPORARY, Storage
 from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
-from ..base.software import plugin_versions
 from ..clouds.multi_file_format import PieceRange, RangeWriter
 from ..clouds.multi_file_format import WrittenRange as Range
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
+from ..identity.software import plugin_versions
 from .cluster.cluster import Cluster
 from .cluster.tasks import Tasks
 from .pipeline.casting_workers import share

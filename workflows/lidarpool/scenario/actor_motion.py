@@ -9,18 +9,8 @@ import numpy as np
 from pydantic import BeforeValidator, Strict, model_validator
 
 from lidarscenes.files.formats import ROBOTS
-from lidarsim.base.arrays import Floats
-from lidarsim.base.declared import (
-    Several,
-    Text,
-    TextOrTexts,
-    about,
-    by_text,
-    declared,
-    one_of,
-)
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.time_units import TimeUnit, seconds_of
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.time_units import TimeUnit, seconds_of
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import CLOCK_S, Beyond, InstrumentPose, Pose, Track
 from lidarsim.motion.trajectory_files import (
@@ -32,6 +22,8 @@ from lidarsim.motion.trajectory_files import (
     TrajectoryFormat,
     load_trajectory,
 )
+from lidarsim.numerics.arrays import Floats
+from lidarsim.schema.declared import Several, Text, TextOrTexts, about, by_text, declared, one_of
 from lidarsim.survey.survey import Mounted, StepCount
 
 from .ground import StandingSurfaces, follow_surfaces

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.words import as_scenario, listed, plural, rounded
 from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
@@ -23,6 +22,7 @@ from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
+from lidarsim.words import as_scenario, listed, plural, rounded
 
 from .georeference import missing_system
 from .prepare import Prepared

@@ -15,17 +15,17 @@ from typing import Any, Self
 
 import numpy as np
 
-from lidarsim.base.checks import check_list, check_number
-from lidarsim.base.error_sentences import sentences
-from lidarsim.base.errors import LidarError, Mistakes
-from lidarsim.base.input_files import not_found, read_input_text
-from lidarsim.base.yamlfile import read_yaml
+from lidarsim.errors import LidarError, Mistakes
+from lidarsim.io.input_files import not_found, read_input_text
+from lidarsim.io.yamlfile import read_yaml
+from lidarsim.schema.checks import check_list, check_number
+from lidarsim.schema.error_sentences import sentences
 
-from ..base.field_words import describe_fields
-from ..base.fingerprint import fingerprint
-from ..base.shard import ALL, Shard
 from ..clouds.writing import with_format_columns
 from ..datasets.job_table import Value
+from ..identity.field_words import describe_fields
+from ..identity.fingerprint import fingerprint
+from ..identity.shard import ALL, Shard
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
 from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits
 from .job import Job

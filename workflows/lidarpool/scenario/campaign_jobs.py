@@ -17,27 +17,20 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from lidarsim.base.errors import LidarError, Mistakes, prefixed
-from lidarsim.base.input_files import open_input
-from lidarsim.base.section_fields import dotted
-from lidarsim.base.textfile import read_text
-from lidarsim.base.value_texts import shown
-from lidarsim.base.words import plural
+from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.io.input_files import open_input
+from lidarsim.io.textfile import read_text
 from lidarsim.scene.files.mesh_formats import plugin_of
+from lidarsim.schema.section_fields import dotted
+from lidarsim.schema.value_texts import shown
+from lidarsim.words import plural
 
-from ..base.field_words import describe_fields
-from ..base.fingerprint import fingerprint
-from ..base.software import plugin_versions
 from ..clouds.format_table import check_all_returns
 from ..datasets.job_table import Value
-from .campaign_sections import (
-    MAX_JOBS,
-    CampaignSection,
-    Choice,
-    JobRandom,
-    is_campaign,
-    read_rows,
-)
+from ..identity.field_words import describe_fields
+from ..identity.fingerprint import fingerprint
+from ..identity.software import plugin_versions
+from .campaign_sections import MAX_JOBS, CampaignSection, Choice, JobRandom, is_campaign, read_rows
 from .field_paths import FieldSteps, find_field, replace_value
 from .job import Job
 from .prepare import Prepared, prepare

@@ -29,8 +29,13 @@ from pydantic import (
     model_validator,
 )
 
-from lidarsim.base.checks import check_fields
-from lidarsim.base.declared import (
+from lidarsim.errors import LidarError, MissingFileError, Mistakes, message_of
+from lidarsim.io.input_files import not_found, read_input_text
+from lidarsim.io.tables import ignored_columns
+from lidarsim.io.textfile import read_text
+from lidarsim.io.yamlfile import load_yaml, read_yaml
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.declared import (
     FileSection,
     MinMax,
     Seed,
@@ -45,15 +50,10 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
-from lidarsim.base.error_sentences import sentences
-from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, message_of
-from lidarsim.base.input_files import not_found, read_input_text
-from lidarsim.base.section_fields import sections_in
-from lidarsim.base.tables import ignored_columns
-from lidarsim.base.textfile import read_text
-from lidarsim.base.value_texts import one_line
-from lidarsim.base.words import did_you_mean_each, in_yaml, joined, printable
-from lidarsim.base.yamlfile import load_yaml, read_yaml
+from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.section_fields import sections_in
+from lidarsim.schema.value_texts import one_line
+from lidarsim.words import did_you_mean_each, in_yaml, joined, printable
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec

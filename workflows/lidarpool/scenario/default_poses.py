@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from lidarscenes.procedural.floor import floor_and_ceiling, surface_heights, triangles_in_box
 from lidarscenes.procedural.surroundings import PlacementChecker, is_obstructed, is_open
-from lidarsim.base.arrays import Floats
-from lidarsim.base.words import plural
 from lidarsim.media.materials import rows_named
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Mounted
+from lidarsim.words import plural
 
 # Heights above a floor; and the smallest distance from the ceiling.
 _HEIGHTS_M = (1.0, 2.0, 3.0)

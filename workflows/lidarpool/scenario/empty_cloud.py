@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.words import joined, plural, rounded
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
+from lidarsim.words import joined, plural, rounded
 
 from ..datasets.job_table import JobRow
 from .default_poses import seen_from

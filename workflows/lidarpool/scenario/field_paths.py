@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.field_advice import owner_of_file, owners_by_level
-from lidarsim.base.section_fields import fields_by_name, fields_of, is_section, sections_in
-from lidarsim.base.words import did_you_mean, listed, plural, shortened
+from lidarsim.errors import LidarError
+from lidarsim.schema.field_advice import owner_of_file, owners_by_level
+from lidarsim.schema.section_fields import fields_by_name, fields_of, is_section, sections_in
+from lidarsim.words import did_you_mean, listed, plural, shortened
 
 from .scenario import Scenario
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.files.coordinate_systems import outside_system, target_problem, zone_in_area
 from lidarsim.scene.scene import Scene
 

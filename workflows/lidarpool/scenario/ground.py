@@ -8,14 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Indices, Ints32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.words import name_hint
+from lidarsim.errors import LidarError
 from lidarsim.media.materials import rows_named
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Track
+from lidarsim.numerics.arrays import Floats, Indices, Ints32
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
+from lidarsim.words import name_hint
 from raybeam import RayCaster, available_backends
 
 STEP_M = 0.5  # step of a trajectory that follows a surface

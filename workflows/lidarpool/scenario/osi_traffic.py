@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import need, reading
-from lidarsim.base.input_files import input_size
-from lidarsim.base.words import plural
 from lidarsim.columns.mcap_chunks import check_chunks
+from lidarsim.environment.extras import need, reading
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import input_size
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Track
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.words import plural
 
 from .traffic import (
     HOST,

@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarscenes.procedural.surroundings import EnclosingBody, PlacementChecker
-from lidarsim.base.arrays import Bools, Floats
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import as_scenario, printable, rounded
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses, velocities
+from lidarsim.numerics.arrays import Bools, Floats
+from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.survey.survey import Survey
+from lidarsim.words import as_scenario, printable, rounded
 
 from .default_poses import free_above, on_one_line, seen_from, surroundings_of
 from .prepare import Prepared

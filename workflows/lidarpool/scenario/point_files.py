@@ -9,24 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Floats32, Ints
-from lidarsim.base.errors import LidarError, as_sentence, explained, prefixed
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import check_input
-from lidarsim.base.words import plural, printable
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
 from lidarsim.columns.sweep import Columns, Sweep
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError, as_sentence, explained, prefixed
+from lidarsim.io.allowance import bytes_of, memory
+from lidarsim.io.input_files import check_input
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from lidarsim.scene.files.intensity_scales import from_zero
 from lidarsim.scene.files.mesh_formats import advice_on
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 from lidarsim.scene.files.pcd import unpacked_colors
-from lidarsim.scene.files.stated_system import (
-    Reprojection,
-    check_metric_format,
-    stated_meters,
-)
+from lidarsim.scene.files.stated_system import Reprojection, check_metric_format, stated_meters
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
+from lidarsim.words import plural, printable
 
 from ..clouds.format_table import format_of_path, point_suffixes
 from ..clouds.recording import METERS, Recording, RecordingSource

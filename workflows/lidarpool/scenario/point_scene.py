@@ -14,21 +14,21 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Ints
-from lidarsim.base.checks import check_choice
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import plural, rounded
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.io.allowance import bytes_of, memory
+from lidarsim.numerics.arrays import AnyArray, Bools, Bytes, Floats, Ints
 from lidarsim.scene.colors import GRAY, LINEAR, Colors, as_srgb
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.checks import check_choice
+from lidarsim.schema.vocabulary import UNITS_M
+from lidarsim.words import plural, rounded
 
-from ..base.open3d_module import load_open3d
+from ..open3d_access.open3d_module import load_open3d
 from .point_files import MIN_POINTS, NO_CLASS, POINT_BYTES, read_points, vectors
 from .surfel_gaps import expected_loss
 

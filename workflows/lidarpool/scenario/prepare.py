@@ -12,23 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarscenes.robots.robot import Robot
-from lidarsim.base.arrays import Floats
-from lidarsim.base.declared import declared
-from lidarsim.base.errors import LidarError, Mistakes, prefixed
-from lidarsim.base.words import name_hint, plural
-from lidarsim.media.materials import (
-    Material,
-    SurfaceKinds,
-    rows_named,
-    with_class,
-    with_classes,
-)
+from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.media.materials import Material, SurfaceKinds, rows_named, with_class, with_classes
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER, Pose, Track
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.declared import declared
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
+from lidarsim.words import name_hint, plural
 
 from ..clouds.format_table import check_all_returns
 from ..clouds.writing import with_format_columns

@@ -12,19 +12,19 @@ from typing import Annotated, Any
 
 from pydantic import PrivateAttr, ValidationError
 
-from lidarsim.base.declared import Several, Text, about, by_text
-from lidarsim.base.error_sentences import sentences
-from lidarsim.base.errors import LidarError, Mistakes, prefixed
-from lidarsim.base.input_files import not_found
-from lidarsim.base.section_fields import FieldPath, dotted, fields_of, is_section
-from lidarsim.base.yamlfile import read_yaml
 from lidarsim.columns.table import COLORS
+from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.io.input_files import not_found
+from lidarsim.io.yamlfile import read_yaml
 from lidarsim.media.materials import ClassNames, Material
 from lidarsim.media.weather import Weather
 from lidarsim.motion.navigation import Navigation
 from lidarsim.motion.trajectory import CENTER
 from lidarsim.motion.trajectory_files import files_of_trajectory
 from lidarsim.scene.files.mesh_formats import endings, format_of
+from lidarsim.schema.declared import Several, Text, about, by_text
+from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.section_fields import FieldPath, dotted, fields_of, is_section
 from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema, JsonRef
 
-from lidarsim.base.section_fields import fields_of, is_section, kinds_of
+from lidarsim.schema.section_fields import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
 from .default_poses import on_one_line

@@ -19,7 +19,13 @@ from pydantic import (
     model_validator,
 )
 
-from lidarsim.base.declared import (
+from lidarsim.errors import LidarError
+from lidarsim.media.materials import SemanticClass
+from lidarsim.motion.trajectory import Pose
+from lidarsim.scene.files.mesh_formats import endings, format_of, formats_with_plugins, lacking
+from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions, Opacity, UpAxis
+from lidarsim.scene.transform import Transform
+from lidarsim.schema.declared import (
     STRICT,
     AngleDeg,
     Coordinate,
@@ -39,19 +45,8 @@ from lidarsim.base.declared import (
     one_of,
     short,
 )
-from lidarsim.base.errors import LidarError
-from lidarsim.base.section_fields import fields_of
-from lidarsim.base.vocabulary import BACKENDS
-from lidarsim.media.materials import SemanticClass
-from lidarsim.motion.trajectory import Pose
-from lidarsim.scene.files.mesh_formats import (
-    endings,
-    format_of,
-    formats_with_plugins,
-    lacking,
-)
-from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions, Opacity, UpAxis
-from lidarsim.scene.transform import Transform
+from lidarsim.schema.section_fields import fields_of
+from lidarsim.schema.vocabulary import BACKENDS
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.sensor.beams import Rate, Step
 from lidarsim.sensor.models import MODEL_FILES, Sheet, load_sensor

@@ -12,13 +12,12 @@ import numpy as np
 from lidarscenes.files.formats import ROBOTS
 from lidarscenes.robots.robot import Robot
 from lidarscenes.robots.urdf import load_robot
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, Mistakes, message_of, prefixed
-from lidarsim.base.tables import NUMBERS, Quantity, read_table
-from lidarsim.base.textfile import read_text
-from lidarsim.base.words import joined, plural
+from lidarsim.errors import LidarError, Mistakes, message_of, prefixed
+from lidarsim.io.tables import NUMBERS, Quantity, read_table
+from lidarsim.io.textfile import read_text
 from lidarsim.motion.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from lidarsim.motion.rotations import rotations_of
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.mesh_formats import format_of, option_names
 from lidarsim.scene.files.meshfile import Objects, load_objects
@@ -30,6 +29,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import rolling
+from lidarsim.words import joined, plural
 
 from .ground import StandingSurfaces
 from .scenario import Scenario

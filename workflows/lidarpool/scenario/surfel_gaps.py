@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 MAX_SCANNERS = 100  # more positions are those of a moving sensor, whose rings are not known
 _SAMPLE = 2000  # points around which rays are tried

@@ -17,34 +17,23 @@ from xml.parsers import expat
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
-from lidarsim.base.declared import (
-    Several,
-    Text,
-    TextOrTexts,
-    Triple,
-    about,
-)
-from lidarsim.base.errors import LidarError, message_of, prefixed
-from lidarsim.base.input_files import input_size, open_input
-from lidarsim.base.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
-from lidarsim.base.words import fits, in_yaml, name_hint, plural, printable
-from lidarsim.base.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
+from lidarsim.errors import LidarError, message_of, prefixed
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import input_size, open_input
+from lidarsim.io.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
+from lidarsim.io.xmlfile import PIECE_BYTES, parse_pieces, refuse_entity
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Track
-from lidarsim.motion.trajectory_files import (
-    Seconds,
-)
+from lidarsim.motion.trajectory_files import Seconds
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.declared import Several, Text, TextOrTexts, Triple, about
+from lidarsim.words import fits, in_yaml, name_hint, plural, printable
 
 from .actor_motion import TimeUnitEntry, TrajectorySection
 from .ground import StandingSurfaces, follow_surfaces
-from .sections import (
-    DeformingSection,
-    Section,
-)
+from .sections import DeformingSection, Section
 
 HOST = "host"  # identity of the host vehicle of OSI, beside its number
 

@@ -19,8 +19,8 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import bytes_of
-from lidarsim.base.arrays import AnyArray
+from lidarsim.io.allowance import bytes_of
+from lidarsim.numerics.arrays import AnyArray
 
 Frame = tuple[dict[str, Any], list[AnyArray]]
 

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import message_of
-from lidarsim.base.vectors import matmul
-from lidarsim.base.words import plural
+from lidarsim.errors import message_of
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import (
     crs_of_text,
@@ -44,6 +43,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.words import plural
 
 # ASPRS LAS 1.4 classes with patterns for the names of city objects, which begin with their types.
 # Class 1 is for types without a class in LAS.

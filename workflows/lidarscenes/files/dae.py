@@ -21,10 +21,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
-from lidarsim.base.vectors import matmul, norm
-from lidarsim.base.xmlfile import xml_root
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.xmlfile import xml_root
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
+from lidarsim.numerics.vectors import matmul, norm
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.companions import image_file
 from lidarsim.scene.files.polygons import check_corners, fanned, triangulated, unrolled, with_holes

@@ -20,12 +20,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
-from lidarsim.base.arrays import AnyArray, Floats
-from lidarsim.base.declared import Several, Text, about
-from lidarsim.base.elementary import arctan2
-from lidarsim.base.extras import install_command
-from lidarsim.base.words import plural
+from lidarsim.environment.extras import install_command
+from lidarsim.io.allowance import UNPACKED_TIMES, Allowance, memory_share
+from lidarsim.numerics.arrays import AnyArray, Floats
+from lidarsim.numerics.elementary import arctan2
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
 from lidarsim.scene.files.las_units import unit_by_name
@@ -41,6 +39,8 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.declared import Several, Text, about
+from lidarsim.words import plural
 
 from .child_process import ReaderProcess
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.errors import CutShortError
+from lidarsim.errors import CutShortError
 
 MAX_ELEMENTS = 1_000_000  # public Gazebo worlds have up to 60,000
 _MAX_DEPTH = 200

@@ -20,16 +20,12 @@ from uuid import uuid4
 
 import numpy as np
 
-from lidarsim.base.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
-from lidarsim.base.arrays import AnyArray, Bools, Floats
-from lidarsim.base.checks import check_fields
-from lidarsim.base.declared import Rectangle, about
-from lidarsim.base.elementary import decade
-from lidarsim.base.errors import ArgumentError, CutShortError
-from lidarsim.base.extras import install_command
-from lidarsim.base.input_files import input_size, read_input
-from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import plural
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import ArgumentError, CutShortError
+from lidarsim.io.allowance import MIN_LIMIT_BYTES, bytes_of, memory_share
+from lidarsim.io.input_files import input_size, read_input
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats
+from lidarsim.numerics.elementary import decade
 from lidarsim.scene.files.coordinate_systems import (
     MAX_SCALE_ERROR,
     POLAR_EPSG,
@@ -58,7 +54,11 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.checks import check_fields
+from lidarsim.schema.declared import Rectangle, about
+from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.survey.survey import EpsgCode
+from lidarsim.words import plural
 
 DRIVERS = {  # {extension: GDAL driver}
     ".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".hgt": "SRTMHGT", ".img": "HFA",

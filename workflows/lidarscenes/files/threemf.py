@@ -22,11 +22,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import CutShortError, message_of
-from lidarsim.base.words import plural
-from lidarsim.base.xmlfile import AT_END, PIECE_BYTES, parse_pieces, refuse_entity
+from lidarsim.errors import CutShortError, message_of
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.xmlfile import AT_END, PIECE_BYTES, parse_pieces, refuse_entity
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import GRAY, Colors
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.scene_graph import (
@@ -39,6 +38,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_nodes,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.words import plural
 
 _UNITS_M = {
     "micron": 1e-6,

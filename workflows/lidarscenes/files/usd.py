@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance, memory_share
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.extras import install_command
-from lidarsim.base.vectors import inverse, matmul
-from lidarsim.base.words import plural
+from lidarsim.environment.extras import install_command
+from lidarsim.io.allowance import Allowance, memory_share
+from lidarsim.numerics.arrays import AnyArray
+from lidarsim.numerics.vectors import inverse, matmul
 from lidarsim.scene.actors import box
 from lidarsim.scene.animation import RATE_HZ
 from lidarsim.scene.face_materials import FaceMaterials
@@ -50,6 +49,7 @@ from lidarsim.scene.scene_instances import SceneInstance, scales_of
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
+from lidarsim.words import plural
 
 from .child_process import Frame, ReaderProcess
 from .usd_materials import MeshAppearance, UsdMaterials, material_pieces

@@ -7,9 +7,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
-from lidarsim.base.vectors import matmul
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.colors import LINEAR, Colors, as_srgb
 from lidarsim.scene.files.polygons import check_corners, triangulated
 from lidarsim.scene.files.scene_graph import Piece, ReadOptions

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Floats32
-from lidarsim.base.errors import CutShortError
-from lidarsim.base.words import plural
+from lidarsim.errors import CutShortError
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.actors import box
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, ReadOptions
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, Voxels
+from lidarsim.words import plural
 
 DENSITY = "PadBVTotal"
 # Tolerated difference, in voxels, between corners and counts. The writer in HELIOS++ causes 1.5.

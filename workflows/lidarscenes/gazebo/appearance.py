@@ -7,10 +7,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Bytes
-from lidarsim.base.errors import LidarError
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bytes
 from lidarsim.scene.colors import as_bytes, as_srgb
+from lidarsim.words import printable
 
 from .frames import child_numbers
 

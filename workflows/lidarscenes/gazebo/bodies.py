@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.input_files import read_input
-from lidarsim.base.vectors import matmul
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import read_input
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.files.scene_graph import MAX_NODES
+from lidarsim.words import printable
 
 from ..files.lenient_xml import parse_lenient_xml
 from .frames import FrameGraph, RelativePose, placement_matrix, read_pose

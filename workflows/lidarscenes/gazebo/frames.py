@@ -7,13 +7,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
-from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import matmul, norm
-from lidarsim.base.words import did_you_mean, printable
+from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import matrices, rotations_of
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.vectors import matmul, norm
 from lidarsim.scene.transform import affine, inverted
+from lidarsim.schema.value_texts import shown
+from lidarsim.words import did_you_mean, printable
 
 MAX_NUMBER = 1e8  # largest number in a file, except in poses
 _MAX_POSE = 1e12  # larger numbers in a pose are treated as infinite

@@ -12,11 +12,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError, explained, unreadable
-from lidarsim.base.input_files import read_input
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.io.input_files import read_input
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
+from lidarsim.words import printable
 
 from ..writers.lidar_scenario import write_scenario
 from .frames import child_numbers

@@ -9,9 +9,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.vectors import matmul
-from lidarsim.base.words import did_you_mean, listed, printable
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.numerics.vectors import matmul
+from lidarsim.words import did_you_mean, listed, printable
 
 from ..writers.lidar_scenario import Lidar, rounded
 from .bodies import scoped_name

@@ -10,11 +10,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.input_files import read_input
-from lidarsim.base.vectors import matmul
-from lidarsim.base.words import listed, printable
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import read_input
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.face_materials import FaceMaterials
@@ -23,6 +22,7 @@ from lidarsim.scene.files.scene_graph import ReadOptions
 from lidarsim.scene.masks import MaskError
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.words import listed, printable
 
 from ..files.dae import read_dae
 from .appearance import FULL_RETRO, Appearance, read_appearance

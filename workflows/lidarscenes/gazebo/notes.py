@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.words import listed, plural, printable
+from lidarsim.words import listed, plural, printable
 
 _MAX_NAMES = 12  # maximum number of names in a note
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.input_files import read_input
-from lidarsim.base.named_files import is_inside
-from lidarsim.base.words import natural, printable
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input
+from lidarsim.io.named_files import is_inside
+from lidarsim.words import natural, printable
 
 from ..files.lenient_xml import parse_lenient_xml
 

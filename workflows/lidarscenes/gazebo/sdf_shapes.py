@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import matmul, norm
+from lidarsim.errors import LidarError
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.vectors import matmul, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.masks import read_heights
 from lidarsim.scene.scene_mesh import SceneMesh, stacked

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.value_texts import shown
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.schema.value_texts import shown
+from lidarsim.words import printable
 
 LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # sensor types
 ALL_BITS = 0xFFFF_FFFF  # default for flags and masks

@@ -7,12 +7,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.scene_graph import PlacedNode, RigidPart
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.words import printable
 
 from .frames import child_numbers, read_matrix, read_pose
 from .link_meshes import LinkMeshes

@@ -16,12 +16,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
-from lidarsim.base.declared import about
-from lidarsim.base.errors import prefixed
-from lidarsim.base.vectors import matmul
-from lidarsim.base.words import listed, printable
+from lidarsim.errors import prefixed
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -30,6 +28,8 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
 )
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.declared import about
+from lidarsim.words import listed, printable
 
 from ..files.lenient_xml import parse_lenient_xml
 from .appearance import read_appearance

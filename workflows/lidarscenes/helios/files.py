@@ -13,13 +13,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, explained, prefixed
-from lidarsim.base.input_files import read_input
-from lidarsim.base.named_files import is_inside
-from lidarsim.base.words import did_you_mean, printable
-from lidarsim.base.xmlfile import xml_root
+from lidarsim.errors import LidarError, explained, prefixed
+from lidarsim.io.input_files import read_input
+from lidarsim.io.named_files import is_inside
+from lidarsim.io.xmlfile import xml_root
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
+from lidarsim.words import did_you_mean, printable
 
 # Folder in a checkout of HELIOS++ that contains its surveys' data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")

@@ -16,12 +16,12 @@ from xml.etree.ElementTree import Element, ParseError
 import numpy as np
 import yaml
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.input_files import read_input
-from lidarsim.base.words import did_you_mean, listed
-from lidarsim.base.xmlfile import xml_root
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input
+from lidarsim.io.xmlfile import xml_root
 from lidarsim.motion.trajectory import Pose
 from lidarsim.survey.survey import MAX_SENSORS
+from lidarsim.words import did_you_mean, listed
 
 from ..writers.lidar_scenario import SCENARIO_FILE
 from .files import Assets, read_number, rounded

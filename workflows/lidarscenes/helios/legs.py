@@ -15,10 +15,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.time_units import seconds_of
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.time_units import seconds_of
 from lidarsim.motion.rotations import quaternions_of
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
 
 from .files import Assets, read_file, read_flag, read_number, read_vector, rounded

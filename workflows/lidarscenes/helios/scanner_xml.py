@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
 
 from .files import read_number, read_rotation, read_vector, rounded

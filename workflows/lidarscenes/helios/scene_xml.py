@@ -14,10 +14,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.input_files import read_input_text
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.object_names import unique_names

@@ -18,10 +18,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefixed
 from lidarsim.media.materials import MOR_SHARE
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import rotation_about
 from lidarsim.sensor.disc import SUBRAYS

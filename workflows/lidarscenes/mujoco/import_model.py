@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.elementary import arctan2, cos, sin
-from lidarsim.base.errors import LidarError, explained, unreadable
-from lidarsim.base.input_files import read_input
-from lidarsim.base.vectors import norm, rotate
-from lidarsim.base.words import printable
+from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.io.input_files import read_input
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.elementary import arctan2, cos, sin
+from lidarsim.numerics.vectors import norm, rotate
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
+from lidarsim.words import printable
 from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, seen_geoms
 
 from ..writers.lidar_scenario import Lidar, rounded, write_scenario

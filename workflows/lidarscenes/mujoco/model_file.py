@@ -18,12 +18,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.declared import Several, Text, about
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import install_command
-from lidarsim.base.words import listed, name_hint, printable
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
     Content,
@@ -36,6 +34,8 @@ from lidarsim.scene.masks import MaskNotes
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine
+from lidarsim.schema.declared import Several, Text, about
+from lidarsim.words import listed, name_hint, printable
 from lidarsim.worlds.mujoco_bodies import (
     BodySelection,
     bodies_of,

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.input_files import check_input, read_input
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import check_input, read_input
 from lidarsim.scene.files.companions import outside
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 
 from .city_kinds import lay_down, loft, regular_polygon

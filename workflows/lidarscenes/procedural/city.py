@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.checks import check_fits, check_number
-from lidarsim.base.declared import Seed
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.schema.checks import check_fits, check_number
+from lidarsim.schema.declared import Seed
 
 from . import city_kinds
 from .city_furniture import MAX_CARS, parked_cars, street_trees

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.scene_instances import SceneInstance
 
 from .cars import all_cars

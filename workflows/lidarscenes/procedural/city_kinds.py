@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_mesh import stacked
 from lidarsim.scene.shapes import revolve
 

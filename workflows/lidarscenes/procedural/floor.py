@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Bools, Floats, Indices
+from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.scene.scene import Scene
 
 # Maximum thickness of a floor slab. Sensors stand inside thicker objects, such as a hall.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats32, Ints32
+from lidarsim.numerics.arrays import Bools, Floats32, Ints32
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.scene import Scene
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh, stacked
 

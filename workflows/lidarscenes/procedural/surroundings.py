@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Bools, Floats
+from lidarsim.numerics.arrays import Bools, Floats
 from lidarsim.scene.scene import Scene
 from raybeam import RayCaster, available_backends
 

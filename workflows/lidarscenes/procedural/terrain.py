@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.checks import check_fits, check_number
-from lidarsim.base.declared import Seed
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.checks import check_fits, check_number
+from lidarsim.schema.declared import Seed
 
 from .plants import MAX_TREES, SCALES, SPECIES, all_trees, place_instances
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 
 GAP_M = 1e-6  # starts of pieces that are closer together count as one
 HEIGHT_SHARE = 0.1  # height tolerance as a share of the tolerance in plan

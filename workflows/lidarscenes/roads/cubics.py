@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 
 from .cross_sections import RoadStations
 from .elements import read_number

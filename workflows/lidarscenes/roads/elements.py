@@ -7,8 +7,8 @@ from collections.abc import Collection
 from math import isfinite
 from xml.etree.ElementTree import Element
 
-from lidarsim.base.words import plural
 from lidarsim.scene.files.scene_graph import MeshFileError
+from lidarsim.words import plural
 
 MAX_SHOWN = 40  # maximum number of characters of a value in an error message
 # Elements without geometry, which may occur anywhere.

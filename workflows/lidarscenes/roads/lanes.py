@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.files.scene_graph import MeshFileError
 
 from .cross_sections import (

@@ -15,21 +15,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats
-from lidarsim.base.declared import about
-from lidarsim.base.xmlfile import xml_root
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.xmlfile import xml_root
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
-from lidarsim.scene.files.scene_graph import (
-    Content,
-    MeshFileError,
-    Piece,
-    ReadOptions,
-    join_pieces,
-)
+from lidarsim.scene.files.scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.declared import about
 
 from .elements import UnreadElements, read_number
 from .lanes import Lane, SectionSurface, lane_sections, section_surfaces

@@ -16,10 +16,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import hypot
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.elementary import sin_cos
+from lidarsim.numerics.vectors import hypot
 from lidarsim.scene.files.scene_graph import MeshFileError
 
 from .elements import read_non_negative, read_number

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
 
 from .cross_sections import GAP_M
 from .elements import UnreadElements, read_non_negative, read_number

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from lidarsim.base.arrays import Bytes
+from lidarsim.numerics.arrays import Bytes
 from lidarsim.scene.colors import as_srgb
 from lidarsim.scene.files.scene_graph import ObjectClass
 

@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.elementary import arctan2
-from lidarsim.base.vectors import norm
+from lidarsim.io.allowance import Allowance
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.elementary import arctan2
+from lidarsim.numerics.vectors import norm
 from lidarsim.scene.files.scene_graph import Piece
 
 from .cross_sections import (

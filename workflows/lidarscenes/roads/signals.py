@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.elementary import arctan2
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.elementary import arctan2
 from lidarsim.scene.files.scene_graph import Piece
 
 from .cross_sections import RoadStations

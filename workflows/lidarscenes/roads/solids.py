@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.elementary import sin_cos
-from lidarsim.base.vectors import matmul, matvec, norm
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.elementary import sin_cos
+from lidarsim.numerics.vectors import matmul, matvec, norm
 from lidarsim.scene.files.polygons import with_holes
 from lidarsim.scene.files.scene_graph import Piece
 

@@ -12,15 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.checks import as_array, check_fits, check_list
-from lidarsim.base.elementary import interp, sin_cos
-from lidarsim.base.errors import LidarError, message_of
-from lidarsim.base.tables import METERS, RADIANS, Quantity, read_table
-from lidarsim.base.textfile import read_text
-from lidarsim.base.time_units import TimeUnit
-from lidarsim.base.vectors import matmul, matvec
-from lidarsim.base.words import name_hint, plural
+from lidarsim.errors import LidarError, message_of
+from lidarsim.io.tables import METERS, RADIANS, Quantity, read_table
+from lidarsim.io.textfile import read_text
+from lidarsim.io.time_units import TimeUnit
 from lidarsim.motion.pose_columns import TIME
 from lidarsim.motion.trajectory import (
     Pose,
@@ -30,9 +25,14 @@ from lidarsim.motion.trajectory import (
     presence_ns,
     velocities,
 )
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.elementary import interp, sin_cos
+from lidarsim.numerics.vectors import matmul, matvec
 from lidarsim.scene.actors import AT_ZERO, Actor, join_meshes
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import rotation_about
+from lidarsim.schema.checks import as_array, check_fits, check_list
+from lidarsim.words import name_hint, plural
 
 _LATE_S = 1e-3  # some beams of the last firing are fired slightly after the survey's end
 MOVING = ("revolute", "continuous", "prismatic")

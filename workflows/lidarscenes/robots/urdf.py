@@ -16,17 +16,14 @@ from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance
-from lidarsim.base.arrays import Bytes, Floats
-from lidarsim.base.checks import check_fits
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.input_files import read_input
-from lidarsim.base.named_files import is_inside
-from lidarsim.base.value_texts import shown
-from lidarsim.base.vectors import norm
-from lidarsim.base.words import printable
-from lidarsim.base.xmlfile import xml_root
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.io.allowance import Allowance
+from lidarsim.io.input_files import read_input
+from lidarsim.io.named_files import is_inside
+from lidarsim.io.xmlfile import xml_root
 from lidarsim.motion.rotations import rotations_of
+from lidarsim.numerics.arrays import Bytes, Floats
+from lidarsim.numerics.vectors import norm
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
@@ -36,6 +33,9 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule
 from lidarsim.scene.transform import affine
+from lidarsim.schema.checks import check_fits
+from lidarsim.schema.value_texts import shown
+from lidarsim.words import printable
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot

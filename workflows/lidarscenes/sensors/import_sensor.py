@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from lidarsim.base.errors import LidarError, converted
+from lidarsim.errors import LidarError, converted
 from lidarsim.sensor_files import ray_npz
 from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.sensor_files.format_table import read_rays

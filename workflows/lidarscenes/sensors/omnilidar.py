@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.allowance import Allowance, memory_share
-from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.errors import LidarError, converted
-from lidarsim.base.extras import install_command
-from lidarsim.base.input_files import check_input
-from lidarsim.base.words import listed, printable
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError, converted
+from lidarsim.io.allowance import Allowance, memory_share
+from lidarsim.io.input_files import check_input
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.sensor.optics import Optics
 from lidarsim.sensor_files.fired_rays import RayList, directions_of
+from lidarsim.words import listed, printable
 
 from ..files.child_process import ReaderProcess
 from ..files.usd import USD_CORE_BYTES

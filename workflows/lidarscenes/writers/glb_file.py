@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import matmul, matvec, rotate
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Indices, Ints32
+from lidarsim.numerics.vectors import matmul, matvec, rotate
 from lidarsim.scene.colors import LINEAR
 from lidarsim.scene.files.scene_graph import GENERATOR
 from lidarsim.scene.scene import Scene

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.errors import LidarError
-from lidarsim.base.vectors import matmul
+from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.transform import inverted
 from lidarsim.survey.survey import MAX_SENSORS
 

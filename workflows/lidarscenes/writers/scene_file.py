@@ -11,8 +11,8 @@ import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from lidarsim.base.errors import LidarError, MissingFileError, explained
-from lidarsim.base.storage import Storage
+from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.io.storage import Storage
 from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance

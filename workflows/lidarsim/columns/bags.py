@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray
-from ..base.errors import CutShortError, LidarError
-from ..base.extras import need, reading
-from ..base.input_files import input_size
-from ..base.words import distinct, printable
+from ..environment.extras import need, reading
+from ..errors import CutShortError, LidarError
+from ..io.input_files import input_size
+from ..numerics.arrays import AnyArray
+from ..words import distinct, printable
 from .mcap_chunks import check_chunks, check_packed
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from ..base.arrays import AnyArray, AnyFloats
-from ..base.checks import as_array, check_choice, check_fields
-from ..base.errors import LidarError
-from ..base.extras import install_command
-from ..base.notebook import picture_of
-from ..base.value_texts import shown
+from ..environment.extras import install_command
+from ..environment.notebook import picture_of
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, AnyFloats
+from ..schema.checks import as_array, check_choice, check_fields
+from ..schema.value_texts import shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 

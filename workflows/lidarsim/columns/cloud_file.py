@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, AnyFloats, Ints, Records
-from ..base.even_samples import even_indices
+from ..numerics.arrays import AnyArray, AnyFloats, Ints, Records
+from ..numerics.even_samples import even_indices
 from .cloud import CHUNK_POINTS, Cloud
 from .ply_format import AXES, mapped_rows
 from .table import TABLE, Column

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 
-from ..base.arrays import AnyArray
-from ..base.words import distinct
+from ..numerics.arrays import AnyArray
+from ..words import distinct
 
 AXES = ("x", "y", "z")
 COLORS = ("red", "green", "blue")

@@ -12,8 +12,8 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import Struct
 
-from ..base.allowance import Allowance
-from ..base.input_files import input_size, open_input
+from ..io.allowance import Allowance
+from ..io.input_files import input_size, open_input
 
 _MAGIC_BYTES = 8
 _CHUNK = 0x06

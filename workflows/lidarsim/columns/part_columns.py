@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
-from ..base.elementary import decade
+from ..numerics.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..numerics.elementary import decade
 from .cloud import Cloud
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM

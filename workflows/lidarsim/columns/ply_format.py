@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Records
-from ..base.errors import LidarError, explained
-from ..base.input_files import open_input
+from ..errors import LidarError, explained
+from ..io.input_files import open_input
+from ..numerics.arrays import AnyArray, Records
 from .table import Column
 
 AXES = ("x", "y", "z")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Indices, Ints32
+from ..numerics.arrays import AnyArray, Bools, Floats, Indices, Ints32
 from .column_names import STRENGTHS
 
 Columns = Mapping[str, AnyArray]

@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..base.arrays import AnyArray
-from ..base.checks import check_fields
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
-from ..base.words import did_you_mean
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray
+from ..schema.checks import check_fields
+from ..schema.value_texts import one_line
+from ..words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
 Kind = Literal["number", "label"]  # a color scale, or a color for each value

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats, Records
+from ..numerics.arrays import AnyArray, Floats, Records
 
 WAVEFORM = "waveform"  # name of the column in parts; of cloud files, only LAS holds waveforms
 ZERO = 2048  # digitized value of 0; noise is also negative

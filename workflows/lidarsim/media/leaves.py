@@ -12,9 +12,9 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Floats
-from ..base.declared import allowed
-from ..base.elementary import arccos, arcsin, cos, interp, log, sin, sin_cos
+from ..numerics.arrays import Floats
+from ..numerics.elementary import arccos, arcsin, cos, interp, log, sin, sin_cos
+from ..schema.declared import allowed
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WrapValidator
 
-from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.checks import check_fields
-from ..base.declared import FileSection, TextOrTexts, UnitShare, about, allowed, written_as
-from ..base.elementary import exp, power
-from ..base.errors import LidarError
-from ..base.value_texts import one_line, shown
-from ..base.words import did_you_mean, name_hint
+from ..errors import LidarError
+from ..numerics.arrays import Bools, Floats, Indices, Integers
+from ..numerics.elementary import exp, power
+from ..schema.checks import check_fields
+from ..schema.declared import FileSection, TextOrTexts, UnitShare, about, allowed, written_as
+from ..schema.value_texts import one_line, shown
+from ..words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
 REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here

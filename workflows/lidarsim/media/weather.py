@@ -13,13 +13,13 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.checks import check_fields
-from ..base.declared import FileSection, UnitShare, about
-from ..base.elementary import exp, geomspace, power
-from ..base.elementary_scalars import exp_of
-from ..base.value_texts import one_line
-from ..base.vectors import hypot
+from ..numerics.arrays import Floats
+from ..numerics.elementary import exp, geomspace, power
+from ..numerics.elementary_scalars import exp_of
+from ..numerics.vectors import hypot
+from ..schema.checks import check_fields
+from ..schema.declared import FileSection, UnitShare, about
+from ..schema.value_texts import one_line
 from .materials import REFERENCE_M, WATER_INDEX, extinction
 
 RAIN_LARGEST_MM = 6.0  # larger drops break up (Pruppacher and Klett 1997)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
-from ..base.errors import LidarError
-from ..base.vectors import matmul, matvec
-from ..base.words import did_you_mean, joined, plural
 from ..columns.bags import messages_of, opened_bag
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.vectors import matmul, matvec
+from ..words import did_you_mean, joined, plural
 from .navigation import local_positions
 from .rotations import quaternions_of
 from .trajectory import Track

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Indices
-from ..base.elementary import arctan2, interp, sin_cos
-from ..base.vectors import hypot
+from ..numerics.arrays import Bools, Floats, Indices
+from ..numerics.elementary import arctan2, interp, sin_cos
+from ..numerics.vectors import hypot
 from .spline import on_curve, rests
 
 # A carrier turns within this distance before and after a corner, or from the middle of one leg to

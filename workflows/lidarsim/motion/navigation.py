@@ -23,16 +23,16 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, Strict
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import check_fields, check_order
-from ..base.declared import FileSection, MinMax, Seed, Several, UnitShare, about
-from ..base.elementary import arctan2, exp, sin_cos
-from ..base.elementary_scalars import exp_of, sin_cos_of
-from ..base.errors import LidarError
-from ..base.extras import install_command
-from ..base.random_numbers import Purpose, named_seed, normal
-from ..base.value_texts import one_line
-from ..base.vectors import hypot, matmul, matvec, norm, rotate, rotate_into_frames
+from ..environment.extras import install_command
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import arctan2, exp, sin_cos
+from ..numerics.elementary_scalars import exp_of, sin_cos_of
+from ..numerics.random_numbers import Purpose, named_seed, normal
+from ..numerics.vectors import hypot, matmul, matvec, norm, rotate, rotate_into_frames
+from ..schema.checks import check_fields, check_order
+from ..schema.declared import FileSection, MinMax, Seed, Several, UnitShare, about
+from ..schema.value_texts import one_line
 from .rotations import rotation_sines
 from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
 

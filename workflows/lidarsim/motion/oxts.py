@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.elementary import log, sin_cos
-from ..base.elementary_scalars import sin_cos_of
-from ..base.input_files import read_input_text
-from ..base.numbered_files import rows_of_frames, sort_by_number
+from ..io.input_files import read_input_text
+from ..io.numbered_files import rows_of_frames, sort_by_number
+from ..numerics.arrays import Floats
+from ..numerics.elementary import log, sin_cos
+from ..numerics.elementary_scalars import sin_cos_of
 from .rotations import quaternions_of, rotations_of
 
 WIDTH = 30  # numbers of a row

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, TableFormat
-from ..base.time_units import SECONDS
+from ..io.tables import DEGREES, METERS, NUMBERS, Quantity, TableFormat
+from ..io.time_units import SECONDS
+from ..numerics.arrays import Floats
 
 # Prefixes that programs write before x, y and z of a position, and before the letters of a
 # quaternion.

@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.elementary import arctan2, sin_cos
-from ..base.errors import LidarError
-from ..base.vectors import (
-    cross,
-    determinant,
-    dot,
-    matmul_of_components,
-    norm,
-)
+from ..errors import LidarError
+from ..numerics.arrays import Floats
+from ..numerics.elementary import arctan2, sin_cos
+from ..numerics.vectors import cross, determinant, dot, matmul_of_components, norm
 
 _ROUNDS = 8  # rounds of the power iteration: rotations are rounded by 2e-3 at most
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Indices
+from ..numerics.arrays import Bools, Floats, Indices
 
 _PAD = 32  # empty equations before the first and after the last: the last distance of reduction
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats
-from ..base.elementary import arctan2, interp
-from ..base.vectors import norm
+from ..numerics.arrays import Bools, Floats
+from ..numerics.elementary import arctan2, interp
+from ..numerics.vectors import norm
 
 _STEP_S = 0.1  # positions are resampled to this interval, so that jitter does not count as turning
 _MAX_STEPS = 1_000_000

@@ -10,20 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Floats, Indices
-from ..base.checks import as_array, check_fields
-from ..base.declared import AngleDeg, FileSection, Triple, about, short, written_as
-from ..base.elementary import arctan2, sin_cos
-from ..base.errors import ArgumentError, LidarError
-from ..base.value_texts import one_line, shown
-from ..base.vectors import (
-    hypot,
-    matmul,
-    matmul_of_components,
-    matvec,
-    norm,
-)
-from ..base.words import joined, rounded
+from ..errors import ArgumentError, LidarError
+from ..numerics.arrays import Bools, Floats, Indices
+from ..numerics.elementary import arctan2, sin_cos
+from ..numerics.vectors import hypot, matmul, matmul_of_components, matvec, norm
+from ..schema.checks import as_array, check_fields
+from ..schema.declared import AngleDeg, FileSection, Triple, about, short, written_as
+from ..schema.value_texts import one_line, shown
+from ..words import joined, rounded
 from .headings import CurveHeadings, Heading, headed_poses
 from .rotations import (
     check_rotations,

@@ -10,14 +10,14 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Floats
-from ..base.checks import check_fits, check_list
-from ..base.errors import LidarError, message_of
-from ..base.tables import column_name, find_header, read_table
-from ..base.textfile import read_text
-from ..base.time_units import TimeUnit, seconds_of
-from ..base.vectors import rotate
 from ..columns.bags import is_bag
+from ..errors import LidarError, message_of
+from ..io.tables import column_name, find_header, read_table
+from ..io.textfile import read_text
+from ..io.time_units import TimeUnit, seconds_of
+from ..numerics.arrays import Floats
+from ..numerics.vectors import rotate
+from ..schema.checks import check_fits, check_list
 from .bag_trajectories import read_bag
 from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
 from .pose_columns import (

@@ -14,8 +14,8 @@ from pathlib import Path
 from struct import Struct, error, unpack_from
 from typing import BinaryIO, NamedTuple
 
-from ..base.errors import LidarError, explained
-from ..base.input_files import open_input
+from ..errors import LidarError, explained
+from ..io.input_files import open_input
 
 ENDINGS = (".pcap", ".pcapng")
 _SECOND_NS = 1_000_000_000

@@ -11,14 +11,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Bytes, Floats, Ints
-from ..base.errors import LidarError
-from ..base.plugins import Plugin, PluginTable
-from ..base.words import did_you_mean
+from ..environment.plugins import Plugin, PluginTable
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, Bools, Bytes, Floats, Ints
 from ..sensor import Sensor
 from ..sensor.packet_settings import Identifier, PacketSettings
 from ..sweeps.instruments import Instruments
 from ..sweeps.sweeps import Sweeps
+from ..words import did_you_mean
 from .capture import ENDINGS, Capture
 from .service import Destination, Service
 from .shots import Shots, settings_of

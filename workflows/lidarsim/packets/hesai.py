@@ -10,10 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bytes, Ints, Records
-from ..base.errors import LidarError
-from ..base.words import did_you_mean
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, Bytes, Ints, Records
 from ..sensor.beams import Mirror, Spin
+from ..words import did_you_mean
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
 from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, HesaiPacketLayout

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..numerics.arrays import Floats
 from ..sensor import Sensor
 from .hesai_layouts import HesaiPacketLayout
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import Ints
+from ..numerics.arrays import Ints
 
 _STRONGEST_OR_LAST = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _FIRST = {"first": 0x33}

@@ -19,7 +19,7 @@ from ipaddress import AddressValueError, IPv4Address
 from typing import Any, Self
 from urllib.parse import SplitResult, urlsplit
 
-from ..base.other_sites import names_of_machine, refusal
+from ..environment.other_sites import names_of_machine, refusal
 from .service import is_single_receiver
 from .tcp_service import TcpService
 

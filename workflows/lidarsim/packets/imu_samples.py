@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
+from ..numerics.arrays import Floats, Ints
 from ..sweeps.instruments import IMU_FILE
 from .encoders import PacketSource
 from .shots import Shots

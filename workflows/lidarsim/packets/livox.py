@@ -13,9 +13,9 @@ from zlib import crc32
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
-from ..base.vectors import inverse, matmul, matvec
 from ..motion.rotations import matrices
+from ..numerics.arrays import AnyArray, Bytes, Floats, Ints, Records
+from ..numerics.vectors import inverse, matmul, matvec
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, PacketImuSamples
 from .service import Destination, Service

@@ -20,7 +20,7 @@ from ipaddress import AddressValueError, IPv4Address
 from struct import Struct
 from typing import Self
 
-from ..base.errors import LidarError
+from ..errors import LidarError
 from .livox_commands import (
     MAX_FRAME_BYTES,
     Code,

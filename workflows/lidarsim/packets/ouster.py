@@ -21,13 +21,13 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
-from ..base.elementary import sin_cos
-from ..base.errors import LidarError
-from ..base.extras import reading
-from ..base.input_files import input_size
-from ..base.vectors import inverse, matmul, matvec
+from ..environment.extras import reading
+from ..errors import LidarError
+from ..io.input_files import input_size
 from ..motion.rotations import matrices
+from ..numerics.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Ints
+from ..numerics.elementary import sin_cos
+from ..numerics.vectors import inverse, matmul, matvec
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
 from .capture import ENDINGS, Capture

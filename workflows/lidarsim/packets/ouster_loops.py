@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import compiled
 
-from ..base.arrays import UInts64
+from ..numerics.arrays import UInts64
 
 # Layouts of a pixel in 32-bit words, lowest bits first; sizes in bits are in brackets.
 SINGLE, DUAL, LOW_RATE = range(3)

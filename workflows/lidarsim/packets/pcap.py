@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..base.arrays import Bytes, Indices, Ints
+from ..numerics.arrays import Bytes, Indices, Ints
 from .capture import CapturedDatagram
 from .encoders import Datagrams
 

@@ -16,7 +16,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
+from ..numerics.arrays import AnyArray, Bytes, Floats, Ints, Records
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .shots import CarryOver, Shots
 

@@ -17,10 +17,10 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from ..base.arrays import Bytes, Ints
-from ..base.errors import LidarError
-from ..base.ports import port_number
-from ..base.words import shortened
+from ..environment.ports import port_number
+from ..errors import LidarError
+from ..numerics.arrays import Bytes, Ints
+from ..words import shortened
 from .encoders import Datagrams
 from .sender_process import DATAGRAM, END, HEADER, ROUTE
 from .service import Destination, is_single_receiver

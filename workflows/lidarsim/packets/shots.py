@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Floats32, Ints
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..sensor import Sensor
 from ..sensor.packet_settings import PacketSettings
 from ..sweeps.ray_image import Image, fired_of
@@ -207,7 +207,7 @@ class CarryOver:
 
 def with_packets() -> tuple[str, ...]:
     """Return the names of the built-in models that have a packet format, in order."""
-    from ..base.model_names import model_names
+    from ..schema.model_names import model_names
     from ..sensor.models import read_model
 
     return tuple(name for name in model_names() if read_model(name).packets is not None)

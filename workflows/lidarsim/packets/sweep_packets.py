@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..base.checks import check_fits
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud
+from ..errors import LidarError
 from ..motion.trajectory import CENTER
+from ..schema.checks import check_fits
 from ..sensor import Returns, Sensor
 from ..sensor.optics import TWO_RETURNS
 from ..simulator import Scanner

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Self
 
-from ..base.errors import LidarError
+from ..errors import LidarError
 from .service import Destination, Service
 
 _BACKLOG = 128  # number of connections that can wait to be accepted

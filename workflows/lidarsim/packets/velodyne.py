@@ -15,8 +15,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import yaml
 
-from ..base.arrays import AnyArray, Ints
-from ..base.extras import need
+from ..environment.extras import need
+from ..numerics.arrays import AnyArray, Ints
 from .capture import Capture, CapturedDatagram
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .service import Destination, Service

@@ -13,7 +13,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl
 
-from ..base.ports import port_number
+from ..environment.ports import port_number
 from .http_service import (
     Answer,
     HttpService,

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bytes, Floats, Ints, Records
-from ..base.elementary import arctan2, cos
-from ..base.vectors import hypot
+from ..numerics.arrays import Bytes, Floats, Ints, Records
+from ..numerics.elementary import arctan2, cos
+from ..numerics.vectors import hypot
 from ..sweeps.instruments import GNSS_FILE
 from .encoders import Datagrams, PacketSource
 

@@ -9,12 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Indices
-from ..base.checks import check_fields, check_fits
-from ..base.elementary import interp
-from ..base.errors import LidarError, prefixed
-from ..base.value_texts import one_line
-from ..base.vectors import dot, norm, rotate
+from ..errors import LidarError, prefixed
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
     CENTER,
@@ -26,6 +21,11 @@ from ..motion.trajectory import (
     full_poses,
     presence_ns,
 )
+from ..numerics.arrays import Floats, Indices
+from ..numerics.elementary import interp
+from ..numerics.vectors import dot, norm, rotate
+from ..schema.checks import check_fields, check_fits
+from ..schema.value_texts import one_line
 from . import face_materials
 from .colors import join_colors
 from .scene_instances import SceneInstance, parts_of

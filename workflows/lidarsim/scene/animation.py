@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ..base.arrays import Floats, Indices
-from ..base.checks import as_array, check_fields
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
-from ..base.vectors import rotate
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Indices
+from ..numerics.vectors import rotate
+from ..schema.checks import as_array, check_fields
+from ..schema.value_texts import one_line
 
 RATE_HZ = 60.0  # least rate of baked poses
 # Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.

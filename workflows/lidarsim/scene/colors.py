@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
-from ..base.elementary import power
-from ..base.errors import LidarError
-from ..base.vectors import matmul
-from ..base.words import plural
+from ..errors import LidarError
+from ..numerics.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..numerics.elementary import power
+from ..numerics.vectors import matmul
+from ..words import plural
 
 # Faces without a color are gray, of half of the light, as the default reflectance is.
 GRAY = np.full((1, 1, 3), 188, np.uint8)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import Integers, Ints32
-from ..base.errors import LidarError
+from ..errors import LidarError
+from ..numerics.arrays import Integers, Ints32
 from .colors import are_indices
 
 

@@ -13,10 +13,10 @@ from typing import Literal, TypeVar
 import numpy as np
 from PIL import Image
 
-from ..base.allowance import Allowance
-from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
-from ..base.input_files import InputFileError, open_input
-from ..base.words import printable
+from ..io.allowance import Allowance
+from ..io.input_files import InputFileError, open_input
+from ..numerics.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
+from ..words import printable
 from .colors import Colors
 from .scene_mesh import MAX_UV, Cutout
 

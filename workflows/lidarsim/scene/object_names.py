@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from ..base.words import plural
+from ..words import plural
 from .actors import join_meshes
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh

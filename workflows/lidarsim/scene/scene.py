@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Floats, Indices, Ints32
-from ..base.checks import as_array, check_fields, check_list
-from ..base.errors import LidarError
-from ..base.notebook import picture_of, table_of
-from ..base.value_texts import shown
-from ..base.vectors import hypot
-from ..base.words import listed, plural
+from ..environment.notebook import picture_of, table_of
+from ..errors import LidarError
 from ..media.materials import SurfaceKinds
 from ..motion.trajectory import Track
+from ..numerics.arrays import Bools, Floats, Indices, Ints32
+from ..numerics.vectors import hypot
+from ..schema.checks import as_array, check_fields, check_list
+from ..schema.value_texts import shown
+from ..words import listed, plural
 from .actors import Actor
 from .colors import GRAY, Colors, are_indices, join_colors
 from .face_materials import ObjectMaterials

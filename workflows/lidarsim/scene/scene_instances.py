@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32
-from ..base.checks import check_fields
-from ..base.elementary import decade
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
-from ..base.vectors import determinant, inverse, matmul, matvec, rank
+from ..errors import LidarError
 from ..motion.trajectory import Pose
+from ..numerics.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32
+from ..numerics.elementary import decade
+from ..numerics.vectors import determinant, inverse, matmul, matvec, rank
+from ..schema.checks import check_fields
+from ..schema.value_texts import one_line
 from .colors import Colors
 from .face_materials import FaceMaterials
 from .scene_mesh import Cutout, SceneMesh, Voxels, compacted

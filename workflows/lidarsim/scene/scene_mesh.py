@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
-from ..base.checks import as_array, check_fields
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
-from ..base.vectors import determinant, matmul, norm, rank, rotate
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
+from ..numerics.vectors import determinant, matmul, norm, rank, rotate
+from ..schema.checks import as_array, check_fields
+from ..schema.value_texts import one_line
 from .animation import Animation
 from .colors import Colors
 from .face_materials import FaceMaterials

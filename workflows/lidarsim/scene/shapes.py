@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats, Ints
-from ..base.elementary import cos, interp, sin, sin_cos
-from ..base.vectors import norm
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import cos, interp, sin, sin_cos
+from ..numerics.vectors import norm
 from .scene_mesh import SceneMesh
 
 SEED_RADIUS_M = 2.0

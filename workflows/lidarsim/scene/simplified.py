@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Floats, Indices, Ints, Ints32
+from ..numerics.arrays import AnyArray, Floats, Indices, Ints, Ints32
 from .colors import Colors, join_colors
 from .face_materials import ObjectMaterials
 from .scene import Scene

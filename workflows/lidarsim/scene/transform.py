@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats
-from ..base.checks import as_array
-from ..base.elementary_scalars import sin_cos_of
-from ..base.errors import LidarError
-from ..base.vectors import matmul, matvec, norm, rank
+from ..errors import LidarError
 from ..motion.trajectory import Pose
+from ..numerics.arrays import Floats
+from ..numerics.elementary_scalars import sin_cos_of
+from ..numerics.vectors import matmul, matvec, norm, rank
+from ..schema.checks import as_array
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
 # rotating large coordinates loses no digit.

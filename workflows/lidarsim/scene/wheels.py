@@ -8,10 +8,10 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.elementary import sin_cos
-from ..base.errors import LidarError
-from ..base.words import name_hint
+from ..errors import LidarError
+from ..numerics.arrays import Floats
+from ..numerics.elementary import sin_cos
+from ..words import name_hint
 from .animation import Animation
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import as_array, check_fields, check_number
-from ..base.declared import about
-from ..base.elementary import cos, sin_cos
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import cos, sin_cos
+from ..schema.checks import as_array, check_fields, check_number
+from ..schema.declared import about
+from ..schema.value_texts import one_line
 
 MAX_CHANNELS = 65_535  # limit of the type of the column
 

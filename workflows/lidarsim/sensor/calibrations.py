@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.elementary import sin_cos
-from ..base.errors import converted
-from ..base.textfile import read_text
-from ..base.words import did_you_mean_each, joined, printable
-from ..base.yamlfile import load_yaml
+from ..errors import converted
+from ..io.textfile import read_text
+from ..io.yamlfile import load_yaml
+from ..numerics.arrays import Floats
+from ..numerics.elementary import sin_cos
 from ..sensor_files.comma_rows import parse_rows
 from ..sensor_files.fired_rays import RayList
 from ..sensor_files.format_table import read_rays
 from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
+from ..words import did_you_mean_each, joined, printable
 from .beams import Beams
 
 

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.arrays import Floats, Indices
-from ..base.elementary import log1p, sin_cos
+from ..numerics.arrays import Floats, Indices
+from ..numerics.elementary import log1p, sin_cos
 
 # {number of sub-rays: distances from the middle, as a share of the radius, and angles in degrees,
 # of a sixth of the sub-rays}; the next sixths are rotated by multiples of 60 degrees, and one

@@ -8,12 +8,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Ints
-from ..base.checks import check_fits, check_type
-from ..base.errors import LidarError, MissingFileError
-from ..base.words import rounded
+from ..errors import LidarError, MissingFileError
+from ..numerics.arrays import Ints
+from ..schema.checks import check_fits, check_type
 from ..sensor_files.fired_rays import FRAME_HZ, Light, RayList
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
+from ..words import rounded
 from .optics import Optics
 from .ray_sensors import PrismSensor
 from .sensor import Sensor

@@ -18,10 +18,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..base.arrays import Floats
-from ..base.errors import LidarError
-from ..base.words import rounded
+from ..errors import LidarError
+from ..numerics.arrays import Floats
 from ..sensor_files.complete_files import write_complete_text, xml_comment
+from ..words import rounded
 from .beams import Beams, Mirror, Spin
 from .noise import Noise
 from .ray_sensors import ListedSensor, PrismSensor

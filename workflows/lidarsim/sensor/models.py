@@ -14,17 +14,17 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import check_fits
-from ..base.declared import UnitShare
-from ..base.elementary import log1p, sin_cos
-from ..base.error_sentences import sentences
-from ..base.errors import LidarError, converted
-from ..base.input_files import read_input_text
-from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
-from ..base.plugins import Plugin, find_plugin
-from ..base.words import did_you_mean
-from ..base.yamlfile import load_yaml
+from ..environment.plugins import Plugin, find_plugin
+from ..errors import LidarError, converted
+from ..io.input_files import read_input_text
+from ..io.yamlfile import load_yaml
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import log1p, sin_cos
+from ..schema.checks import check_fits
+from ..schema.declared import UnitShare
+from ..schema.error_sentences import sentences
+from ..schema.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
+from ..words import did_you_mean
 from .beams import Beams, Duty, Mirror, MirrorMotion, Spin, Width
 from .calibrations import Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise

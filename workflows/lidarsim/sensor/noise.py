@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..base.checks import check_fields
-from ..base.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
-from ..base.errors import LidarError
-from ..base.random_numbers import named_seed
-from ..base.value_texts import one_line
+from ..errors import LidarError
 from ..media.materials import at_right_angles
+from ..numerics.random_numbers import named_seed
+from ..schema.checks import check_fields
+from ..schema.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
+from ..schema.value_texts import one_line
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0

@@ -10,13 +10,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from ..base.checks import check_fields
-from ..base.declared import FileSection, about, allowed
-from ..base.elementary_scalars import log_of
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
-from ..base.vectors import hypot
-from ..base.words import rounded
+from ..errors import LidarError
+from ..numerics.elementary_scalars import log_of
+from ..numerics.vectors import hypot
+from ..schema.checks import check_fields
+from ..schema.declared import FileSection, about, allowed
+from ..schema.value_texts import one_line
+from ..words import rounded
 from .disc import SUBRAYS, Beam, Profile
 from .reflectivity import SCALES
 

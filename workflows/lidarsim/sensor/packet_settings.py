@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Ints
+from ..numerics.arrays import Ints
 
 Identifier = int | float | str
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray
+from ..numerics.arrays import AnyArray
 from .beams import Beams, Mirror, Spin
 from .packet_settings import PacketSettings
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror

@@ -10,12 +10,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import check_fields
-from ..base.elementary import sin_cos
-from ..base.elementary_scalars import sin_cos_of
-from ..base.errors import LidarError
-from ..base.value_texts import one_line
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import sin_cos
+from ..numerics.elementary_scalars import sin_cos_of
+from ..schema.checks import check_fields
+from ..schema.value_texts import one_line
 from .beams import Beams
 from .sensor import Sensor
 

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bytes, Floats
-from ..base.elementary import exp, log
-from ..base.elementary_scalars import log_of
 from ..media.materials import RETRO_GAIN
+from ..numerics.arrays import Bytes, Floats
+from ..numerics.elementary import exp, log
+from ..numerics.elementary_scalars import log_of
 
 _BEST = 8 * RETRO_GAIN  # reflectance of the best retro-reflective sheets
 

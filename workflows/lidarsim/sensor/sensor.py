@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import check_fields, check_fits
-from ..base.declared import about
-from ..base.elementary import arcsin, arctan2, sin_cos
-from ..base.errors import LidarError
-from ..base.notebook import picture_of, table_of
-from ..base.value_texts import one_line
-from ..base.vectors import rotate
-from ..base.words import rounded
+from ..environment.notebook import picture_of, table_of
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import arcsin, arctan2, sin_cos
+from ..numerics.vectors import rotate
+from ..schema.checks import check_fields, check_fits
+from ..schema.declared import about
+from ..schema.value_texts import one_line
+from ..words import rounded
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Spin
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
@@ -62,8 +62,8 @@ class Sensor:
 
     To define another kind of sensor, use other beams or another head, or write a subclass that
     overrides `directions`, `origins` or `begins_ns`. No other code has to be changed. A sensor is
-    identified by its fields (see `lidarpool.base.fingerprint`), so any data that affects the rays
-    must be stored in fields.
+    identified by its fields (see `lidarpool.identity.fingerprint`), so any data that affects the
+    rays must be stored in fields.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..numerics.arrays import Floats
 
 
 def parse_rows(text: str, skip: int, columns: int) -> Floats:

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from ..base.errors import explained
-from ..base.storage import Storage
+from ..errors import explained
+from ..io.storage import Storage
 
 
 @contextmanager

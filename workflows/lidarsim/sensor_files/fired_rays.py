@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
-from ..base.elementary import arctan2, sin_cos
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import arctan2, sin_cos
 
 # Conventions for rays, which are stated in file headers.
 AXES = "x forward, y left, z up"

@@ -11,9 +11,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..base.errors import LidarError
-from ..base.extras import need
-from ..base.words import did_you_mean
+from ..environment.extras import need
+from ..errors import LidarError
+from ..words import did_you_mean
 
 if TYPE_CHECKING:
     from .fired_rays import RayList

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.textfile import read_text
+from ..io.textfile import read_text
 from .comma_rows import parse_rows
 from .complete_files import write_complete_text
 from .fired_rays import RayList, directions_of

@@ -11,8 +11,8 @@ from math import isfinite
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from ..base.arrays import Floats
-from ..base.errors import LidarError
+from ..errors import LidarError
+from ..numerics.arrays import Floats
 from .complete_files import write_complete_text, xml_comment
 from .fired_rays import AXES, RayList
 

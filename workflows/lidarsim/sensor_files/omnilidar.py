@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Ints
-from ..base.errors import LidarError
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, Ints
 from .complete_files import write_complete_text
 from .fired_rays import AXES, RayList
 

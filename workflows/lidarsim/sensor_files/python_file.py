@@ -10,7 +10,7 @@ from math import isfinite
 
 import numpy as np
 
-from ..base.arrays import AnyArray
+from ..numerics.arrays import AnyArray
 from .fired_rays import RayList
 
 _WIDTH = 96  # characters per line of packed numbers

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
-from ..base.textfile import read_text
-from ..base.time_units import SECONDS
 from ..columns.column_names import ALIASES, TIMES
+from ..io.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
+from ..io.textfile import read_text
+from ..io.time_units import SECONDS
 from .complete_files import write_complete_text
 from .fired_rays import RayList
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
-from ..base.errors import reason_of
-from ..base.words import printable
+from ..errors import reason_of
+from ..numerics.arrays import Floats, Ints
+from ..words import printable
 from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, RayList, directions_of
 
 KIND = "rays of a sensor"

@@ -10,8 +10,8 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from ..base.allowance import Allowance
-from ..base.input_files import check_input
+from ..io.allowance import Allowance
+from ..io.input_files import check_input
 from .complete_files import open_complete
 from .fired_rays import RayList
 from .ray_header import (

@@ -9,9 +9,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..base.allowance import Allowance
-from ..base.errors import message_of
-from ..base.input_files import check_input, open_input
+from ..errors import message_of
+from ..io.allowance import Allowance
+from ..io.input_files import check_input, open_input
 from .complete_files import open_complete
 from .fired_rays import RayList
 from .ray_header import (

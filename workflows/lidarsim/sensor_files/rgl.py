@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arrays import Floats
+from ..numerics.arrays import Floats
 from .complete_files import open_complete
 from .fired_rays import AXES, RayList
 from .ray_header import DIRECTION, ORIGIN, TIME_COLUMN, check_names, rays_of

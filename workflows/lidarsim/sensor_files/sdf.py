@@ -13,8 +13,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
-from ..base.errors import LidarError
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
 from .complete_files import write_complete_text, xml_comment
 from .fired_rays import AXES, RayList
 

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Floats
-from ..base.errors import LidarError, prefixed
-from ..base.value_texts import shown
+from ..errors import LidarError, prefixed
 from ..motion.rotations import check_rotations
 from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, pose_of
+from ..numerics.arrays import Bools, Floats
+from ..schema.value_texts import shown
 
 ROW_SLACK = 1e-8  # tolerance for the last row of a pose matrix
 

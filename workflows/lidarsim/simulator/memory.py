@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..base.elementary import exp
+from ..numerics.elementary import exp
 from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor.optics import TWO_RETURNS

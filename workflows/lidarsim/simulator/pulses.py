@@ -36,7 +36,7 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Ints, owned
+from ..numerics.arrays import Ints, owned
 from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings

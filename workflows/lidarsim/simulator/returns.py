@@ -8,7 +8,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..base.arrays import (
+from ..columns.table import CAUSES
+from ..numerics.arrays import (
     AnyArray,
     Bools,
     Bytes,
@@ -20,7 +21,6 @@ from ..base.arrays import (
     Records,
     UInts32,
 )
-from ..columns.table import CAUSES
 from ..scene.colors import GRAY, packed
 
 T = TypeVar("T")

@@ -11,10 +11,10 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Floats32, Integers
-from ..base.errors import LidarError
-from ..base.vectors import rotate
+from ..errors import LidarError
 from ..motion.trajectory import Trajectory
+from ..numerics.arrays import Floats, Floats32, Integers
+from ..numerics.vectors import rotate
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Sensor

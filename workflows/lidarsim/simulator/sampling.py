@@ -10,11 +10,11 @@ import numpy as np
 
 from raybeam import available_backends
 
-from ..base.arrays import Floats, Ints
-from ..base.declared import declared
-from ..base.even_samples import even_indices
 from ..media.weather import Weather
+from ..numerics.arrays import Floats, Ints
+from ..numerics.even_samples import even_indices
 from ..scene.scene import Scene
+from ..schema.declared import declared
 from ..sensor import Noise, Returns, Sensor
 from ..sensor.beams import Beams
 from ..survey.survey import Mounted, Survey

@@ -15,21 +15,21 @@ from pydantic import Field
 
 from raybeam.poses import check_poses
 
-from ..base.arrays import Floats, Floats32, Indices
-from ..base.checks import check_fits, check_type
-from ..base.declared import Names
-from ..base.errors import LidarError
-from ..base.value_texts import shown
-from ..base.words import name_hint
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
+from ..errors import LidarError
 from ..media.materials import Material
 from ..media.weather import FOG_LIDAR_RATIO_SR
 from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, pose_of
+from ..numerics.arrays import Floats, Floats32, Indices
 from ..scene.actors import Actor
 from ..scene.scene import Scene
+from ..schema.checks import check_fits, check_type
+from ..schema.declared import Names
+from ..schema.value_texts import shown
 from ..sensor import Noise, Returns, Sensor
 from ..survey.survey import Mounted, ScanSpec, Survey
+from ..words import name_hint
 from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
 from .casting.motion import check_trajectory
 from .casting.scene_caster import check_backend_here

@@ -10,14 +10,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Bools, Floats, Ints
-from ..base.checks import check_fields, check_order
-from ..base.declared import AngleDeg, FileSection, MinMax, Several, Text, Two, UnitShare, about
-from ..base.errors import LidarError, prefixed
-from ..base.random_numbers import Purpose, uniform
-from ..base.value_texts import one_line
-from ..base.words import did_you_mean, joined
+from ..errors import LidarError, prefixed
+from ..numerics.arrays import Bools, Floats, Ints
+from ..numerics.random_numbers import Purpose, uniform
+from ..schema.checks import check_fields, check_order
+from ..schema.declared import AngleDeg, FileSection, MinMax, Several, Text, Two, UnitShare, about
+from ..schema.value_texts import one_line
 from ..sensor.sensor import Sensor
+from ..words import did_you_mean, joined
 
 PACKET = Purpose(61, "whether a packet is lost")
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]

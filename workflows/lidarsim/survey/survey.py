@@ -14,14 +14,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
-from ..base.arrays import Floats, Ints
-from ..base.checks import check_fields, check_type
-from ..base.declared import FILLED_IN, FileSection, Names, Several, about, written_as
-from ..base.errors import ArgumentError, LidarError
-from ..base.notebook import picture_of, table_of
-from ..base.value_texts import one_line, shown
-from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
-from ..base.words import joined, listed, plural, rounded, scans_in_words
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -31,13 +23,21 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
+from ..environment.notebook import picture_of, table_of
+from ..errors import ArgumentError, LidarError
 from ..media.materials import ClassNames, Material, class_names_problem
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
 from ..motion.navigation import Navigation, check_navigation
 from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, check_trajectory_type, pose_of
+from ..numerics.arrays import Floats, Ints
+from ..schema.checks import check_fields, check_type
+from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, written_as
+from ..schema.value_texts import one_line, shown
+from ..schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..sensor.noise import MAX_ALARMS, Noise
 from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
 from ..sensor.sensor import Sensor
+from ..words import joined, listed, plural, rounded, scans_in_words
 from .faults import Fault, FaultKind, check_faults
 
 STEPS = 36  # default at each pose: one revolution of most sensors

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Floats32, Ints32
-from ..base.vectors import cross, matvec
 from ..motion.trajectory import CLOCK_S, full_poses, presence_ns, velocities
+from ..numerics.arrays import Bools, Floats, Floats32, Ints32
+from ..numerics.vectors import cross, matvec
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from .sweep_motion import STILL, knots_in, relative_knots

@@ -8,7 +8,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from ..base.input_files import open_input
+from ..io.input_files import open_input
 from ..motion.rotations import quaternions_of
 from ..motion.trajectory import Pose
 from ..survey.survey import Survey

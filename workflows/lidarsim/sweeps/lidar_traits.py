@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
+from ..numerics.arrays import Floats, Ints
 from ..sensor import Sensor
 from ..sensor.beams import Mirror, Spin
 from ..sensor.sensor import LineSensor

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Ints, Ints32, owned
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud
+from ..errors import LidarError
+from ..numerics.arrays import AnyArray, Ints, Ints32, owned
 from ..sensor import Sensor
 from .sweeps import MIXED_UP, FiredRays, Sweeps
 

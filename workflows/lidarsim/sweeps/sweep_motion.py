@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats, Floats32, Ints
 from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import Pose, Trajectory, full_poses
+from ..numerics.arrays import Floats, Floats32, Ints
 from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
 

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
+from ..errors import LidarError
+from ..io.archives import open_archive, packed
 from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import full_poses
+from ..numerics.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Sensor

@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Floats, Floats32
-from ..base.checks import check_items
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud
+from ..errors import LidarError
 from ..motion.trajectory import StaticPose, Track
+from ..numerics.arrays import Floats, Floats32
 from ..scene.actors import Actor
 from ..scene.object_names import unique_names
 from ..scene.scene import Scene
 from ..scene.scene_instances import SceneInstance
 from ..scene.scene_mesh import SceneMesh
+from ..schema.checks import check_items
 from ..sensor import Sensor
 from ..simulator.scanner import Scanner
 from ..survey.survey import Mounted

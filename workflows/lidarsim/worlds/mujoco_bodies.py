@@ -8,14 +8,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bytes, Floats
-from ..base.errors import LidarError
-from ..base.vectors import matmul, matvec, norm, rotate
-from ..base.words import name_hint, plural
+from ..errors import LidarError
 from ..motion.rotations import matrices as rotations_of_quaternions
+from ..numerics.arrays import Bytes, Floats
+from ..numerics.vectors import matmul, matvec, norm, rotate
 from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked
+from ..words import name_hint, plural
 from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
 
 _TEXTURE_OF_COLORS = 1  # mjTEXROLE_RGB, column of mat_texid

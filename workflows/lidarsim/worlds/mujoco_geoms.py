@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Floats, Ints
-from ..base.elementary import arctan2
-from ..base.errors import LidarError
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import arctan2
 from ..scene.actors import box
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import capsule, cylinder

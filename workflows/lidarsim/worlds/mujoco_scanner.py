@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import Floats, Floats32, Indices
-from ..base.errors import LidarError
 from ..columns.cloud import Cloud
+from ..errors import LidarError
+from ..numerics.arrays import Floats, Floats32, Indices
 from ..sensor import Sensor
 from ..survey.survey import Mounted
 from .follower import Follower

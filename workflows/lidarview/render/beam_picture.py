@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.colors import Normalize
 
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 from lidarsim.sensor import LineSensor, Sensor
 
 from .picture_page import Page

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import AnyArray, Floats
+from lidarsim.numerics.arrays import AnyArray, Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from raybeam import RayCaster

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.colors import packed, unpacked
 
 from .theme import apply_colormap, object_colors

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .surface import RenderMesh, dot, golden_spiral
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lidarsim.base.arrays import AnyFloats, Bools, Bytes, Floats
+from lidarsim.numerics.arrays import AnyFloats, Bools, Bytes, Floats
 from lidarsim.scene.actors import Actor
 from raybeam import RayCaster
 

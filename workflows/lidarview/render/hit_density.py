@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 

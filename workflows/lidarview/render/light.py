@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
 from .camera import Camera
 from .cutaway import Cutaway, is_blocked

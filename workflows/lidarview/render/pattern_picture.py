@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_rgb
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.words import listed
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.sensor import LineSensor, Sensor
 from lidarsim.sensor.ray_sensors import PrismSensor
+from lidarsim.words import listed
 
 from . import theme
 from .beam_picture import COLORS, beam_page

@@ -22,10 +22,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from lidarsim.base.arrays import AnyFloats, Floats
-from lidarsim.base.errors import explained
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import shortened
+from lidarsim.errors import explained
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import AnyFloats, Floats
+from lidarsim.words import shortened
 
 from . import theme
 from .shot import SurfaceView

@@ -8,11 +8,11 @@ from textwrap import fill
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
-from lidarsim.base.words import plural, without_common_prefix
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, Column, Z
+from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
 from lidarsim.scene.scene import Scene
+from lidarsim.words import plural, without_common_prefix
 
 from . import theme
 from .coloring import TURBO, column_values, make_coloring

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
-from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
-from lidarsim.base.words import plural
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.scene.scene import Scene
+from lidarsim.words import plural
 from raybeam import RayCaster
 
 from . import theme

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 
 # Coordinates with more digits are hard to read, so they are labeled relative to an offset.
 MAX_DIGITS = 5

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyFloats, Floats, Integers, Ints
+from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
 from lidarsim.scene.scene import Scene
 from raybeam import RayCaster
 

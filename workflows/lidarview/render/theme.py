@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import ArrayLike
 
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 
 PAGE = "#ffffff"
 GROUND = "#f1f3f5"

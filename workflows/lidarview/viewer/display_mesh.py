@@ -6,17 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from lidarsim.columns.table import OBJECT, TABLE
+from lidarsim.numerics.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from lidarsim.scene.colors import as_bytes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import simplified
 
-from ..render.coloring import (
-    NORMALS,
-    make_coloring,
-    normal_colors,
-)
+from ..render.coloring import NORMALS, make_coloring, normal_colors
 from ..render.hit_density import density_label, hit_colors, hits_title
 from ..render.surface import separate_objects
 from ..render.theme import apply_colormap

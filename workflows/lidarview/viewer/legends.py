@@ -7,16 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
-from lidarsim.base.words import rounded
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import as_bytes
+from lidarsim.words import rounded
 
-from ..render.coloring import (
-    NORMALS,
-    RGB,
-    TURBO,
-    Coloring,
-)
+from ..render.coloring import NORMALS, RGB, TURBO, Coloring
 
 MAX_LABELS = 1000  # maximum number of labels in a legend
 

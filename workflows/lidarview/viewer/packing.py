@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
+from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 
 _LEVELS = 4095  # levels of a floating-point column, in addition to NaN
 _LOGARITHMIC_RATIO = 100.0  # levels are logarithmic above this ratio of the largest to the smallest

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, AnyFloats, Bools, Floats, Ints
-from lidarsim.base.even_samples import even_indices
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import Column
+from lidarsim.numerics.arrays import AnyArray, AnyFloats, Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 
 RESULT = Column("result", "uint8", "", "result that contains the point", kind="label")
 STATION = Column("station", "int64", "", "station from which the point was scanned", kind="label")

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lidarsim.base.arrays import Bytes, Floats, Ints
+from lidarsim.numerics.arrays import Bytes, Floats, Ints
 from lidarsim.scene.colors import as_bytes
 
 from ..render.theme import RANGE_COLORS, apply_colormap

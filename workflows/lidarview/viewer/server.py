@@ -33,9 +33,9 @@ from tornado.httputil import HTTPHeaders, RequestStartLine
 from tornado.iostream import StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
-from lidarsim.base.arrays import AnyArray
-from lidarsim.base.notebook import cell_display
-from lidarsim.base.other_sites import names_of_machine, refusal
+from lidarsim.environment.notebook import cell_display
+from lidarsim.environment.other_sites import names_of_machine, refusal
+from lidarsim.numerics.arrays import AnyArray
 
 from .guarded_server import Refusal, guarded_server
 from .point_selection import ClientDisconnected

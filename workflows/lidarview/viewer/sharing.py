@@ -20,10 +20,10 @@ import click
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage
-from lidarsim.base.writing_progress import WritingProgress
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
+from lidarsim.io.writing_progress import WritingProgress
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 

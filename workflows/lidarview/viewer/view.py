@@ -15,24 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Floats32
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
+from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import presence_ns
+from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 from raybeam import RayCaster
 
-from ..picture_file import (
-    MAX_POSITIONS,
-    PictureContent,
-    SensorPositions,
-    moving_positions,
-)
+from ..picture_file import MAX_POSITIONS, PictureContent, SensorPositions, moving_positions
 from ..render.closeup import floor_and_cut_heights, surrounding_box
 from ..render.coloring import (
     MAX_UNNAMED_LABELS,

@@ -13,11 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Floats32
-from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import read_input_text
-from lidarsim.base.words import joined
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -30,12 +25,17 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.mcap_chunks import read_metadata
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, SURFACE_COLUMNS
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError
+from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
+from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, states_compensation
+from lidarsim.words import joined
 
-from ...base.per_process import PerProcess
+from ...processes.per_process import PerProcess
 from .. import laser_scan
 from ..cloud_format import CloudFormat, PointColumns
 from ..frame_names import survey_start_ns

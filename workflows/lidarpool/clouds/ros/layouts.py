@@ -9,10 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Ints, Records
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, SURFACE_COLUMNS, VELOCITY
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Records
 from lidarsim.scene.colors import as_float
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS

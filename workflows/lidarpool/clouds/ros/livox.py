@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from rosbags.typesys.store import Typestore
 
-from lidarsim.base.arrays import AnyArray, Records
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.bags import LIVOX_PADDING, LIVOX_POINT
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import AnyArray, Records
 
 CUSTOM_MSG = "livox_ros_driver2/msg/CustomMsg"
 CUSTOM_DEFINITION = f"""std_msgs/Header header

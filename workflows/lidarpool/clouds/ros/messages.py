@@ -11,9 +11,9 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from lidarsim.base.arrays import Floats32, Ints, Records
 from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.numerics.arrays import Floats32, Ints, Records
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps

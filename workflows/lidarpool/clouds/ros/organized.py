@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarsim.base.arrays import Records
 from lidarsim.columns.cloud import Cloud
+from lidarsim.numerics.arrays import Records
 from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats, Ints
 
 MIN_RAYS = 30  # minimum number of rays for an estimate or a point of a curve
 _CONFIDENCE = 0.95  # confidence level of intervals

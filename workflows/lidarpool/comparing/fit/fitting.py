@@ -14,15 +14,15 @@ import numpy as np
 import yaml
 
 from lidarsim._version import __version__
-from lidarsim.base.checks import check_number
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.extras import need
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
+from lidarsim.environment.extras import need
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.checks import check_number
 from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
+from lidarsim.words import plural
 
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud

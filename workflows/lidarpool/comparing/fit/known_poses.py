@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import plural
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import check_rotations
 from lidarsim.motion.trajectory import Pose, pose_of
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweep_motion import FiringPoses
+from lidarsim.words import plural
 
 from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, with_compared_columns

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor

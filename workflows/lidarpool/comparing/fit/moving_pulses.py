@@ -12,12 +12,12 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Indices, Ints
-from lidarsim.base.even_samples import even_indices
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
+from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor

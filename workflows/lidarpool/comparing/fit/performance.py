@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.sensor.noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS
 
 from .estimates import MIN_RAYS, Estimate, sandwich

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.even_samples import even_indices
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 
 from .estimates import MIN_RAYS, sandwich
 from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, SmoothSurfaces, find_surfaces

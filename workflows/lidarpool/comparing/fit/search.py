@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats
+from lidarsim.numerics.arrays import Floats
 
 from .planes import ARM_M, RangeChanges
 from .stack import SweepStack

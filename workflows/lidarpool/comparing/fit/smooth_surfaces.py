@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Indices, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 
 from .stack import MAX_KINK_M, SweepStack, finite_median
 

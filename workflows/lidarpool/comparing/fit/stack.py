@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
-from lidarsim.base.errors import LidarError, prefixed
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import rounded
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError, prefixed
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.words import rounded
 
 from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, rings_note

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import rounded
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.words import rounded
 
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.even_samples import even_indices
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
 
 from .stack import SweepStack
 

@@ -20,14 +20,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.base.arrays import Ints
-from lidarsim.base.declared import declared
-from lidarsim.base.errors import explained
-from lidarsim.base.even_samples import even_indices
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import natural, plural, shortened, without_common_prefix
+from lidarsim.errors import explained
+from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
+from lidarsim.numerics.arrays import Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.schema.declared import declared
 from lidarsim.sensor import Noise, Returns
+from lidarsim.words import natural, plural, shortened, without_common_prefix
 from lidarview.render.stage import nice_step
 
 from ...clouds.format_table import data_set_title

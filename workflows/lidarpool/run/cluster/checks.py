@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from distributed import Client
 
 from lidarsim._version import __version__
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from lidarsim.simulator.memory import MB, cast_bytes
 from poolpart import Pool, PoolError, WorkerInfo
@@ -21,8 +21,8 @@ from poolpart.task_locations import take_snapshot
 from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
-from ...base.software import describe_difference, software, software_query
 from ...clouds.writing import ExportSpec
+from ...identity.software import describe_difference, software, software_query
 from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError

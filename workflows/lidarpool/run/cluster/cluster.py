@@ -11,12 +11,12 @@ from distributed import Client, get_worker
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from poolpart.task_context import own_client
 
-from ...base import timeline
+from ...processes import timeline
 from ...scenario.job import Job
 from ..job_source import Jobs
 from ..options import RunOptions
@@ -24,13 +24,7 @@ from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
 from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
-from .connection import (
-    StartedAhead,
-    check_starts_workers,
-    connected,
-    local_client,
-    started_client,
-)
+from .connection import StartedAhead, check_starts_workers, connected, local_client, started_client
 from .tasks import Tasks
 from .watch import Waiting, Watch
 

@@ -24,15 +24,15 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner
 
 import poolpart.deploy
-from lidarsim.base.errors import LidarError
-from lidarsim.base.interrupts import children_spared, deferred_interrupts
+from lidarsim.environment.interrupts import children_spared, deferred_interrupts
+from lidarsim.errors import LidarError
 from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
-from ...base.fork_server import start_fork_server
-from ...base.scheduler_address import check_address
-from ...base.tls_files import TlsFiles
+from ...connection.scheduler_address import check_address
+from ...connection.tls_files import TlsFiles
+from ...processes.fork_server import start_fork_server
 from ..cluster_file import ClusterFile
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError

@@ -7,12 +7,12 @@ from typing import Any, Generic, TypeVar
 
 from distributed import Future
 
-from lidarsim.base.plugins import Plugin
+from lidarsim.environment.plugins import Plugin
 from poolpart import Partition
 from poolpart.fetch import fetch_available
 from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
-from ...base.software import call_with_plugins, call_with_same_sources
+from ...identity.software import call_with_plugins, call_with_same_sources
 from ..pipeline.task_book import TaskBook
 
 T = TypeVar("T")

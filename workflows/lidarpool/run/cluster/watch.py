@@ -10,9 +10,9 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from lidarsim.base.errors import LidarError, as_sentence
-from lidarsim.base.vocabulary import PATIENCE_S
-from lidarsim.base.words import plural
+from lidarsim.errors import LidarError, as_sentence
+from lidarsim.schema.vocabulary import PATIENCE_S
+from lidarsim.words import plural
 from poolpart.task_locations import take_snapshot
 from poolpart.workers import worker_identities
 

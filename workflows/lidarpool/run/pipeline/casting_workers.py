@@ -15,7 +15,7 @@ import cloudpickle
 from distributed import Future
 from distributed.utils import get_ip
 
-from lidarsim.base.errors import LidarError, message_of
+from lidarsim.errors import LidarError, message_of
 from lidarsim.scene.scene import Scene
 from lidarsim.survey.survey import Survey
 from poolpart import Partition
@@ -23,8 +23,8 @@ from poolpart.fetch import fetch_available
 from poolpart.task_locations import PartitionSnapshot, take_snapshot
 from poolpart.workers import worker_identities
 
-from ...base.shared_memory import Pickled, SharedHandle, SharedValue
-from ...base.software import describe_difference, software_query
+from ...identity.software import describe_difference, software_query
+from ...processes.shared_memory import Pickled, SharedHandle, SharedValue
 from .batches import Outcome
 from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
 from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect

@@ -8,7 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from lidarsim.base.arrays import Ints
+from lidarsim.numerics.arrays import Ints
 
 from ...plan import Trial
 from .stage_messages import Receipt

@@ -7,8 +7,8 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
 from poolpart.task_context import WorkerLeavingError
 
 from .stage_messages import scans_in_words

@@ -19,9 +19,9 @@ import tornado.platform.asyncio  # noqa: F401
 
 import poolpart.deploy.local  # noqa: F401
 
-from ...base import logs, software  # noqa: F401
-from ...base.fork_server import keep_freed_memory
+from ...identity import software
 from ...plan import trial  # noqa: F401
+from ...processes.fork_server import keep_freed_memory
 from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()
@@ -29,7 +29,7 @@ keep_freed_memory()
 # would log each missing folder as an error.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # a check says why the module cannot be loaded
-    from lidarsim.base import elementary_loops  # noqa: F401
+    from lidarsim.numerics import elementary_loops  # noqa: F401
     from raybeam import moving_loops, tile_casts  # noqa: F401
 
     if tile_casts.COMPILED:

@@ -16,7 +16,7 @@ from itertools import chain
 
 from distributed import Client, secede
 
-from lidarsim.base.storage import Storage
+from lidarsim.io.storage import Storage
 from lidarsim.survey.survey import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart.fetch import fetch_available, hold_bytes

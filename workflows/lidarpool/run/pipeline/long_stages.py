@@ -25,16 +25,16 @@ from typing import Any
 
 from distributed import Future, Lock
 
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.words import plural
 from poolpart import Partition, Pipe, PipeFailed
 from poolpart.fetch import fetch_available, fetch_held_bytes
 from poolpart.pipe import delete_pipes, exchange_items, set_advice
 from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
-from ...base.software import call_with_same_sources
 from ...columns.parts import probe_name
+from ...identity.software import call_with_same_sources
 from .failures import memory_clause, raise_if_failed, storing, was_killed
 from .long_stage_tasks import collect, generate, sort_frames
 from .stage_messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries

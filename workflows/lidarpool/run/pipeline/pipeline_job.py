@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from ...base.tracing import trace
+from ...processes.tracing import trace
 from .committed_results import CommittedResults
 
 

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from distributed import get_worker
 
-from lidarsim.base.arrays import Floats32
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.numerics.arrays import Floats32
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.batch_points import BatchPoints
@@ -33,8 +33,8 @@ from lidarsim.survey.survey import Survey
 from poolpart import own_device, own_device_share
 from raybeam.registry import choose_backend
 
-from ...base.shared_memory import Pickled, SharedHandle
-from ...base.tracing import trace
+from ...processes.shared_memory import Pickled, SharedHandle
+from ...processes.tracing import trace
 from .failures import DeviceLost, ScanError, naming_scans
 from .stage_messages import BatchRange, samples_of_scan
 from .stage_names import GPU, INTERSECT

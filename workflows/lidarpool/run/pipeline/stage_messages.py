@@ -11,15 +11,15 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats32, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats32, Ints
+from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 
-from ...base.tracing import trace
+from ...processes.tracing import trace
 from .task_records import TaskRecord
 
 BatchRange = tuple[int, int]  # the first scan of a batch, and its end

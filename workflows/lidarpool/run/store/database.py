@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError
+from lidarsim.errors import LidarError
 
 from ...columns.parts import part_name
 from ...datasets.job_table import MAX_JOBS

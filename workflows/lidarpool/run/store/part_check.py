@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from operator import attrgetter
 
-from lidarsim.base.words import listed
+from lidarsim.words import listed
 
 from ..pipeline.stage_messages import Receipt, scans_in_words
 from .database import RunDatabase

@@ -12,8 +12,8 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
 
 from .database import FILE, RunDatabase
 

@@ -14,18 +14,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import Storage
-from lidarsim.base.words import rounded
+from lidarsim.errors import LidarError, explained
+from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
+from lidarsim.words import rounded
 
-from ...base.field_words import describe_changes
-from ...base.fingerprint import fingerprint
-from ...base.shard import describe_shard
-from ...base.software import software
 from ...columns.parts import deletable_files, mark_name, scans_of
 from ...datasets.job_table import JobRow
+from ...identity.field_words import describe_changes
+from ...identity.fingerprint import fingerprint
+from ...identity.shard import describe_shard
+from ...identity.software import software
 from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, identity_of
 from ..pipeline.committed_results import CommittedResults

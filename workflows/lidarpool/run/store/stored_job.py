@@ -9,10 +9,10 @@ from functools import partial
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats32, Ints
-from lidarsim.base.errors import LidarError
-from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ...columns.parts import StoredCloud, read_part, read_tally, unpack

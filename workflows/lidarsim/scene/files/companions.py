@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
-from ...base.allowance import Allowance
+from ...io.allowance import Allowance
 from ..masks import MaskError
 from .scene_graph import MeshFileError, ReadOptions
 

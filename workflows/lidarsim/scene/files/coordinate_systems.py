@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.elementary import sin_cos
-from ...base.errors import LidarError
-from ...base.extras import install_command
-from ...base.vectors import rotate
-from ...base.vocabulary import OF_THE_WORLD, WORLD_EPSG
+from ...environment.extras import install_command
+from ...errors import LidarError
+from ...numerics.arrays import Floats
+from ...numerics.elementary import sin_cos
+from ...numerics.vectors import rotate
+from ...schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 

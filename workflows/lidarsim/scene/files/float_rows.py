@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base.arrays import AnyArray
-from ...base.input_files import read_input
 from ...columns.sweep import Sweep
+from ...io.input_files import read_input
+from ...numerics.arrays import AnyArray
 
 # Columns of the formats.
 KITTI = ("x", "y", "z", "intensity")

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ...base.allowance import Allowance
-from ...base.arrays import Floats
-from ...base.vectors import matmul, matvec, norm
-from ...base.words import listed, plural, printable
+from ...io.allowance import Allowance
 from ...motion.rotations import matrices
+from ...numerics.arrays import Floats
+from ...numerics.vectors import matmul, matvec, norm
+from ...words import listed, plural, printable
 from ..animation import RATE_HZ
 from ..scene_mesh import SceneMesh
 from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keys_of, sample_channels

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Floats
-from ...base.elementary import arctan2, sin
-from ...base.vectors import norm
-from ...base.words import did_you_mean
+from ...numerics.arrays import AnyArray, Floats
+from ...numerics.elementary import arctan2, sin
+from ...numerics.vectors import norm
+from ...words import did_you_mean
 from .scene_graph import MeshFileError
 
 # {path of a target: numbers of its value}; further paths are weights.

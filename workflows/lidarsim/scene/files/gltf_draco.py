@@ -6,7 +6,7 @@ import re
 import struct
 from typing import Any
 
-from ...base.allowance import Allowance
+from ...io.allowance import Allowance
 from .scene_graph import MeshFileError
 
 DRACO = "KHR_draco_mesh_compression"

@@ -14,10 +14,10 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from ...base.allowance import Allowance
-from ...base.arrays import AnyArray
-from ...base.input_files import read_input
-from ...base.words import listed, printable
+from ...io.allowance import Allowance
+from ...io.input_files import read_input
+from ...numerics.arrays import AnyArray
+from ...words import listed, printable
 from .companions import image_file, named_file
 from .gltf_draco import DRACO
 from .scene_graph import MeshFileError, ReadOptions

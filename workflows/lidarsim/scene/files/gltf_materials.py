@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Bytes, Ints
-from ...base.elementary_scalars import sin_cos_of
-from ...base.vectors import matmul
+from ...numerics.arrays import AnyArray, Bytes, Ints
+from ...numerics.elementary_scalars import sin_cos_of
+from ...numerics.vectors import matmul
 from ..colors import LINEAR, Colors, as_srgb
 from ..masks import (
     FACE_BYTES,

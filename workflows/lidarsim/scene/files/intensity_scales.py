@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import AnyArray
+from ...numerics.arrays import AnyArray
 
 LEICA_LOWEST = -2048  # Leica's scale ends at 2047
 _LEICA_HIGHEST = 2047

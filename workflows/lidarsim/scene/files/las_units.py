@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from ...base.errors import CutShortError, LidarError
-from ...base.extras import install_command
-from ...base.vocabulary import UNITS_M
+from ...environment.extras import install_command
+from ...errors import CutShortError, LidarError
+from ...schema.vocabulary import UNITS_M
 from .coordinate_systems import UTM_EPSG, crs_of_code, has_registry
 
 # Records of LASF_Projection, by ASPRS LAS 1.4, and tags of TIFF.

@@ -18,10 +18,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from ...base.checks import check_fields
-from ...base.errors import LidarError, prefixed
-from ...base.plugins import Plugin, find_plugin, plugins_of
-from ...base.words import did_you_mean, joined
+from ...environment.plugins import Plugin, find_plugin, plugins_of
+from ...errors import LidarError, prefixed
+from ...schema.checks import check_fields
+from ...words import did_you_mean, joined
 from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions
 

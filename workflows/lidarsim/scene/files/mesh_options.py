@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ...base.declared import about
+from ...schema.declared import about
 from ..transform import Transform
 
 LengthUnit = Annotated[

@@ -14,23 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.elementary import cbrt
-from ...base.errors import (
-    CutShortError,
-    LidarError,
-    MissingFileError,
-    as_sentence,
-    prefixed,
-    unreadable,
-)
-from ...base.extras import install_command
-from ...base.input_files import not_found, open_input, read_input
-from ...base.vectors import determinant, matmul, rotate
-from ...base.vocabulary import UNITS_M
-from ...base.words import as_python, listed, plural, printable, rounded
+from ...environment.extras import install_command
+from ...errors import CutShortError, LidarError, MissingFileError, as_sentence, prefixed, unreadable
+from ...io.input_files import not_found, open_input, read_input
 from ...motion.rotations import quaternions_of
 from ...motion.trajectory import Track
+from ...numerics.arrays import Floats
+from ...numerics.elementary import cbrt
+from ...numerics.vectors import determinant, matmul, rotate
+from ...schema.vocabulary import UNITS_M
+from ...words import as_python, listed, plural, printable, rounded
 from ..actors import Actor, join_meshes
 from ..colors import colors_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance

@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from ...base.allowance import Allowance
-from ...base.arrays import Bytes, Floats, Ints
-from ...base.input_files import InputFileError, read_input
-from ...base.words import as_text
+from ...io.allowance import Allowance
+from ...io.input_files import InputFileError, read_input
+from ...numerics.arrays import Bytes, Floats, Ints
+from ...words import as_text
 from ..colors import Colors, as_bytes
 from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colors, read_opacity, remembered
 from ..scene_mesh import Cutout

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Bools
-from ...base.words import plural
+from ...numerics.arrays import AnyArray, Bools
+from ...words import plural
 
 NOISE_CLASSES = (7, 18)
 LEGACY_NOISE_CLASSES = (7,)  # classes of point formats 0 to 5

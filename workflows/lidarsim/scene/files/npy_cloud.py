@@ -8,12 +8,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...base.arrays import AnyArray
-from ...base.errors import CutShortError
-from ...base.input_files import check_input, open_input
-from ...base.words import printable
 from ...columns.column_names import with_standard_names
 from ...columns.sweep import Sweep
+from ...errors import CutShortError
+from ...io.input_files import check_input, open_input
+from ...numerics.arrays import AnyArray
+from ...words import printable
 
 _EXPECTED = (
     "Expected an array (n, k) with at least three columns, or records with the fields x, y and z"

@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.allowance import Allowance
-from ...base.arrays import AnyArray, Bytes, Floats
-from ...base.errors import CutShortError
-from ...base.input_files import read_input
-from ...base.words import printable
 from ...columns.column_names import COLORS, standard_names
 from ...columns.sweep import Sweep
+from ...errors import CutShortError
+from ...io.allowance import Allowance
+from ...io.input_files import read_input
 from ...motion.rotations import matrices
+from ...numerics.arrays import AnyArray, Bytes, Floats
+from ...words import printable
 from ..transform import affine
 from .text_rows import RowReader
 

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Bytes, Floats, Ints
-from ...base.errors import CutShortError
-from ...base.words import as_text
+from ...errors import CutShortError
+from ...numerics.arrays import AnyArray, Bytes, Floats, Ints
+from ...words import as_text
 from ..colors import Colors, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials

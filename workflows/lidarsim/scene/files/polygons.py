@@ -5,8 +5,8 @@ from __future__ import annotations
 import mapbox_earcut
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Ints
-from ...base.vectors import matvec, norm, rotate
+from ...numerics.arrays import Bools, Floats, Ints
+from ...numerics.vectors import matvec, norm, rotate
 
 # For an outline that crosses itself everywhere, the clipper's time grows with the cube of the
 # corners: 20 s for this number. Larger outlines are probably broken files.

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Floats
-from ...base.errors import CutShortError
-from ...base.input_files import check_input, open_input
-from ...base.words import plural, printable
 from ...columns.sweep import Sweep
+from ...errors import CutShortError
+from ...io.input_files import check_input, open_input
+from ...numerics.arrays import AnyArray, Floats
+from ...words import plural, printable
 from .intensity_scales import LEICA_LOWEST
 from .text_rows import RowReader
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import CutShortError
-from ...base.input_files import check_input, open_input
-from ...base.vectors import matmul
-from ...base.words import plural, printable
 from ...columns.sweep import Sweep
+from ...errors import CutShortError
+from ...io.input_files import check_input, open_input
+from ...numerics.arrays import Floats
+from ...numerics.vectors import matmul
+from ...words import plural, printable
 from ..transform import affine
 from .pts import COLORS, names_of_cells, next_line, point_columns
 from .text_rows import RowReader

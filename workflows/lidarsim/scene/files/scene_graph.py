@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.allowance import Allowance, bytes_of, memory_share
-from ...base.arrays import AnyArray, Floats, Ints
-from ...base.named_files import is_inside
-from ...base.vectors import matmul, rank
+from ...io.allowance import Allowance, bytes_of, memory_share
+from ...io.named_files import is_inside
+from ...numerics.arrays import AnyArray, Floats, Ints
+from ...numerics.vectors import matmul, rank
 from .. import colors, face_materials
 from ..animation import Animation
 from ..colors import Colors

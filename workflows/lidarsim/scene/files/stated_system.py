@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.errors import LidarError
-from ...base.extras import install_command
-from ...base.vocabulary import UNITS_M, WORLD_EPSG
-from ...base.words import printable
+from ...environment.extras import install_command
+from ...errors import LidarError
+from ...numerics.arrays import Floats
+from ...schema.vocabulary import UNITS_M, WORLD_EPSG
+from ...words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
     UNNAMED,

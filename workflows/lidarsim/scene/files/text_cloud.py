@@ -16,13 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import AnyArray, Floats
-from ...base.errors import CutShortError
-from ...base.input_files import check_input, open_input, read_input
-from ...base.tables import column_name
-from ...base.vocabulary import UNITS_M
-from ...base.words import distinct, plural, printable
 from ...columns.sweep import Sweep
+from ...errors import CutShortError
+from ...io.input_files import check_input, open_input, read_input
+from ...io.tables import column_name
+from ...numerics.arrays import AnyArray, Floats
+from ...schema.vocabulary import UNITS_M
+from ...words import distinct, plural, printable
 from .text_rows import REMARKS, RowReader, cells_of
 
 _SEPARATORS = (";", "\t", ",", None)

@@ -15,8 +15,8 @@ from itertools import islice
 
 import numpy as np
 
-from ...base.arrays import Floats
-from ...base.words import plural, printable
+from ...numerics.arrays import Floats
+from ...words import plural, printable
 
 REMARKS = ("#", "//", "%")  # starts of lines that hold no points
 _BLOCK = 1 << 16  # lines that are read at once

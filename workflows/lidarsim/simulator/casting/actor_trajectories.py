@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Floats, Indices, Integers, Ints, owned
 from ...motion.trajectory import (
     ALWAYS,
     StaticPose,
@@ -19,6 +18,7 @@ from ...motion.trajectory import (
     batch_of,
     presence_ns,
 )
+from ...numerics.arrays import Floats, Indices, Integers, Ints, owned
 from ...scene.actors import Actor
 
 if TYPE_CHECKING:

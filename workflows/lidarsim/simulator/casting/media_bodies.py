@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Integers
-from ...base.vectors import inverse, matvec, norm
 from ...media.materials import MaterialTable
+from ...numerics.arrays import Bools, Floats, Integers
+from ...numerics.vectors import inverse, matvec, norm
 from ...scene.scene import Scene
 from .triangle_kinds import TriangleKinds
 

@@ -12,9 +12,9 @@ import numpy as np
 import raybeam.poses
 from raybeam import Pattern, PoseMotion, pattern_rays
 
-from ...base.arrays import Floats, Indices, Integers, Ints, owned
-from ...base.vectors import matmul, rotate_into_frames
 from ...motion.trajectory import Trajectory, velocities
+from ...numerics.arrays import Floats, Indices, Integers, Ints, owned
+from ...numerics.vectors import matmul, rotate_into_frames
 from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories

@@ -16,7 +16,7 @@ import numpy as np
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
 from raybeam.registry import choose_backend
 
-from ...base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
+from ...numerics.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ...scene.scene import Scene
 from ...scene.scene_instances import Instances, MeshPart
 from ...survey.survey import Survey

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...base.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
-from ...base.vectors import inverse, norm
+from ...numerics.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
+from ...numerics.vectors import inverse, norm
 from ...scene.actors import distinct_meshes
 from ...scene.colors import Colors
 from ...scene.scene import Scene

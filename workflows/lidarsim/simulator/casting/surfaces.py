@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
-from ...base.vectors import rotate_into_frames
 from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
+from ...numerics.vectors import rotate_into_frames
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
 from ...scene.scene import Scene
 from ...sensor import Sensor

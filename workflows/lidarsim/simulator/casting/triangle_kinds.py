@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...base.arrays import Indices, Integers, Ints32
 from ...media.materials import Material, SurfaceKinds, first_matches
+from ...numerics.arrays import Indices, Integers, Ints32
 from ...scene.face_materials import FaceMaterials
 from ...scene.scene import Scene
 from .stored_triangles import StoredTriangles

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...base.arrays import Bools
 from ...media.materials import matching_rows
+from ...numerics.arrays import Bools
 from ...scene.scene import Scene
 from ...survey.survey import Survey
 

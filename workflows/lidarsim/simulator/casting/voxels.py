@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Indices
-from ...base.vectors import inverse, matmul, matvec
+from ...numerics.arrays import Bools, Floats, Indices
+from ...numerics.vectors import inverse, matmul, matvec
 from ...scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # number of rays that are followed at a time, to fit a cache

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ...base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
-from ...base.elementary import arccos, arcsin, arctan2
-from ...base.errors import LidarError
-from ...base.random_numbers import normal
-from ...base.vectors import dot, rotate
 from ...columns.table import Column
 from ...columns.waveforms import column_type
+from ...errors import LidarError
 from ...media.materials import at_right_angles
+from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ...numerics.elementary import arccos, arcsin, arctan2
+from ...numerics.random_numbers import normal
+from ...numerics.vectors import dot, rotate
 from ...scene.colors import unpacked
 from ...scene.scene import Scene
 from ...sensor.optics import LIGHT_M_NS

@@ -29,9 +29,9 @@ from raybeam.device import (
 )
 from raybeam.scan import Scan, check_scan
 
-from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ...media.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from ...numerics.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ...scene.scene import Scene
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses

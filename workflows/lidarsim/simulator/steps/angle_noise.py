@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...base.arrays import Floats, Integers
-from ...base.elementary import sin_cos
-from ...base.random_numbers import Purpose, normal
-from ...base.vectors import hypot
+from ...numerics.arrays import Floats, Integers
+from ...numerics.elementary import sin_cos
+from ...numerics.random_numbers import Purpose, normal
+from ...numerics.vectors import hypot
 from ...sensor.noise import Noise
 from ..returns import PulseReturns
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
-from ...base.random_numbers import Purpose, raw
-from ...base.vectors import dot, rotate_into_frames
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
+from ...numerics.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
+from ...numerics.random_numbers import Purpose, raw
+from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, FiringClock, order_along_rings

@@ -10,13 +10,13 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ...base.arrays import Floats, Indices, Ints, Ints32, owned
-from ...base.elementary import arccos, exp
-from ...base.elementary_scalars import sin_cos_of
-from ...base.random_numbers import Purpose
-from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import at_right_angles
+from ...numerics.arrays import Floats, Indices, Ints, Ints32, owned
+from ...numerics.elementary import arccos, exp
+from ...numerics.elementary_scalars import sin_cos_of
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import dot, norm, rotate, rotate_into_frames
 from ...sensor import Sensor
 from ...sensor.optics import LIGHT_M_NS
 from ...survey.survey import ScanSpec, Survey, firing_start_ns

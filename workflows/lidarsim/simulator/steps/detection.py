@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...base.arrays import Bools, Floats, Integers
-from ...base.random_numbers import Purpose, normal, uniform
+from ...numerics.arrays import Bools, Floats, Integers
+from ...numerics.random_numbers import Purpose, normal, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..returns import PulseReturns, number_within_ray
 from .step import PulseBatch, PulseStep, Role, Setup

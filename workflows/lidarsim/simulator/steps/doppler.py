@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...base.arrays import Floats, Integers, Ints, Ints32
-from ...base.random_numbers import Purpose
-from ...base.vectors import dot
+from ...numerics.arrays import Floats, Integers, Ints, Ints32
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import dot
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
 from ..casting.surfaces import SceneSurfaces

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Floats, Indices, Integers
-from ...base.elementary import exp, log
-from ...base.random_numbers import Purpose, uniform
 from ...columns.table import CAUSES
+from ...numerics.arrays import Floats, Indices, Integers
+from ...numerics.elementary import exp, log
+from ...numerics.random_numbers import Purpose, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import LIGHT_M_NS
 from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface

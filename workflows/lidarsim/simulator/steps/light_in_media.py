@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 from raybeam.sub_rays import perpendicular_axes
 
-from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
-from ...base.elementary import exp, log
-from ...base.elementary_scalars import log_of
-from ...base.errors import LidarError
-from ...base.random_numbers import Purpose
-from ...base.vectors import dot, matvec
+from ...errors import LidarError
 from ...media.leaves import brightness, projection
 from ...media.materials import MaterialTable, fresnel
+from ...numerics.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
+from ...numerics.elementary import exp, log
+from ...numerics.elementary_scalars import log_of
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import dot, matvec
 from ...scene.scene import Scene
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, FiringClock

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, owned
-from ...base.elementary import sin_cos
-from ...base.vectors import hypot
+from ...numerics.arrays import Bools, Floats, owned
+from ...numerics.elementary import sin_cos
+from ...numerics.vectors import hypot
 from ...survey.faults import PACKET, Fault
 from ..returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup

@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined
 
-from ...base.arrays import Floats
+from ...numerics.arrays import Floats
 from .pulse_loops import scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 

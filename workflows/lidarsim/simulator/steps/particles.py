@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Indices, Ints, owned
-from ...base.elementary import exp, expm1, geomspace, interp, log1p
-from ...base.elementary_scalars import exp_of
-from ...base.random_numbers import Purpose, named_seed, starts
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ...media.weather import reach as reach_of
+from ...numerics.arrays import Bools, Floats, Indices, Ints, owned
+from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
+from ...numerics.elementary_scalars import exp_of
+from ...numerics.random_numbers import Purpose, named_seed, starts
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces

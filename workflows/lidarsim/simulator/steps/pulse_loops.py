@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from raybeam.compiled import compiled, inlined, noinline
 
-from ...base.arrays import Bools, Floats, Ints
+from ...numerics.arrays import Bools, Floats, Ints
 
 SLOPE = 0.5  # largest gap between planes of one surface, relative to the distance of the hits
 

@@ -1,4 +1,4 @@
-"""Random numbers for compiled loops, identical to those of `lidarsim.base.random_numbers`."""
+"""Random numbers for compiled loops, identical to those of `lidarsim.numerics.random_numbers`."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import inlined
 
-from ...base.arrays import AnyArray, Ints
+from ...numerics.arrays import AnyArray, Ints
 
 SHIFT_TO_INDEX = np.uint64(48)  # keeps the upper 16 of 64 bits as an index below 65,536
 

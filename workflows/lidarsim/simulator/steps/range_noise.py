@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...base.arrays import Floats, Integers, Ints
-from ...base.elementary import exp, log
-from ...base.random_numbers import Purpose, normal
+from ...numerics.arrays import Floats, Integers, Ints
+from ...numerics.elementary import exp, log
+from ...numerics.random_numbers import Purpose, normal
 from ...sensor.noise import Noise
 from ..returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...base.arrays import owned
-from ...base.elementary import log
-from ...base.elementary_scalars import log_of
+from ...numerics.arrays import owned
+from ...numerics.elementary import log
+from ...numerics.elementary_scalars import log_of
 from ...sensor.optics import FWHM, LIGHT_M_NS
 from ..returns import PulseReturns, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from raybeam.compiled import compiled
 
-from ...base.arrays import Bools, Floats, Ints
+from ...numerics.arrays import Bools, Floats, Ints
 
 
 class PulseExtents(NamedTuple):

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, owned
-from ...base.random_numbers import quantiles, starts
+from ...numerics.arrays import Bools, owned
+from ...numerics.random_numbers import quantiles, starts
 from ...scene.colors import GRAY, packed
 from ...sensor.disc import neighbors
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise

@@ -11,7 +11,7 @@ import numpy as np
 from raybeam.cast_record import float64s, int64s, uint8s
 from raybeam.compiled import compiled, inlined, noinline
 
-from ...base.arrays import Bools, Floats, Ints
+from ...numerics.arrays import Bools, Floats, Ints
 from .pulse_loops import PulseHits, SurfaceMarks, beam_of, continue_surfaces, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 

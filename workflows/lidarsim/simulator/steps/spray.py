@@ -14,11 +14,11 @@ import numpy as np
 
 from raybeam.moving import pair_cells_with_boxes
 
-from ...base.arrays import Floats, Ints, owned
-from ...base.random_numbers import Purpose
-from ...base.vectors import norm, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.weather import FAINTEST, LARGE, reach, spray
+from ...numerics.arrays import Floats, Ints, owned
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import norm, rotate_into_frames
 from ...scene.actors import check_spray
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import order_along_rings

@@ -10,8 +10,8 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined, noinline
 
-from ...base.arrays import Floats, Ints
-from ...base.elementary_loops import exp
+from ...numerics.arrays import Floats, Ints
+from ...numerics.elementary_loops import exp
 from .particle_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform

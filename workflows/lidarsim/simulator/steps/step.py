@@ -18,10 +18,10 @@ import numpy as np
 
 from raybeam import Pattern, SubRays
 
-from ...base.arrays import Floats, Indices, Ints
-from ...base.random_numbers import Purpose
-from ...base.vectors import rotate
 from ...columns.table import VELOCITY
+from ...numerics.arrays import Floats, Indices, Ints
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import rotate
 from ...scene.scene import Scene
 from ...sensor import Noise, Returns, Sensor
 from ...survey.faults import Fault, FaultKind

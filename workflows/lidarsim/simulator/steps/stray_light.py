@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
-from ...base.random_numbers import Purpose
-from ...base.vectors import dot, norm, rotate, rotate_into_frames
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
+from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, owned
+from ...numerics.random_numbers import Purpose
+from ...numerics.vectors import dot, norm, rotate, rotate_into_frames
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces, sensor_light_of

@@ -12,8 +12,8 @@ import numpy as np
 from raybeam.compiled import compiled, inlined, noinline
 from raybeam.ray_loops import perpendicular_axes
 
-from ...base.arrays import Bools, Floats, Ints
-from ...base.elementary_loops import arctan2, sin_cos
+from ...numerics.arrays import Bools, Floats, Ints
+from ...numerics.elementary_loops import arctan2, sin_cos
 from ...sensor.optics import LIGHT_M_NS
 from ..casting.surface_loops import at_right_angles
 

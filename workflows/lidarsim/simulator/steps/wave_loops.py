@@ -11,8 +11,8 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined, noinline
 
-from ...base.arrays import Bools, Floats, Ints
-from ...base.elementary_loops import exp, log
+from ...numerics.arrays import Bools, Floats, Ints
+from ...numerics.elementary_loops import exp, log
 from ...sensor.optics import CUT
 from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 

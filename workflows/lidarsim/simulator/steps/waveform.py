@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...base.arrays import Floats, Ints, owned
+from ...numerics.arrays import Floats, Ints, owned
 from ...sensor.optics import CUT, FWHM, LIGHT_M_NS
 from ..returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, required
 from .separation import neighbors_of

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...base.arrays import Floats, Ints
-from ...base.elementary import exp
-from ...base.random_numbers import Purpose, normal, raw
 from ...columns.waveforms import FAINTEST, ZERO, record
+from ...numerics.arrays import Floats, Ints
+from ...numerics.elementary import exp
+from ...numerics.random_numbers import Purpose, normal, raw
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
 from ..returns import Keys, PulseReturns, number_within_ray, required

@@ -1,1 +1,0 @@
-"""Helpers that all packages of lidarpool use, such as fingerprints, shards and the timeline."""

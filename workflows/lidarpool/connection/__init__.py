@@ -1,0 +1,1 @@
+"""Addresses and certificates for connections to a Dask cluster."""

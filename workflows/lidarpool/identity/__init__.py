@@ -1,0 +1,1 @@
+"""Identity of runs and results: content fingerprints, software versions, checksums and shards."""

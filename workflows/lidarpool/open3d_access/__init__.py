@@ -1,0 +1,1 @@
+"""Open3D, imported without its viewers, and its neighbor search."""

@@ -1,0 +1,14 @@
+"""Formats of the points that the pages of results offer."""
+
+from __future__ import annotations
+
+from lidarview.viewer.view import DownloadFormats
+
+from ..clouds.writing import ExportSpec, save_cloud
+
+DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
+
+
+def downloads() -> DownloadFormats:
+    """Return the formats of a download whose packages are installed, and their writer."""
+    return DownloadFormats([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)

@@ -1,0 +1,82 @@
+"""Lists of the jobs of a run: jobs under way, jobs that were done last, and failed jobs."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Container, Mapping, Sequence
+from typing import Any
+
+from lidarsim.words import rounded
+
+from ..datasets.job_table import JobRow, Value
+
+LIST_EVERY_S = 0.5  # jobs under way
+# rows of the table
+MAX_ENDED = 10
+MAX_FAILED = 6
+MAX_UNDER_WAY = 12
+
+
+class ListedJobs:
+    """Jobs of a run, few of each kind, and sums over all that have ended.
+
+    `names` are the names of the values that the jobs vary, in the order of the table's columns.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self.sums = Counter(done=0, failed=0, points=0, rays=0)
+        self.under_way: Sequence[Mapping[str, Any]] = ()
+        self._list_at = 0.0
+        self._ended: deque[dict[str, Any]] = deque(maxlen=MAX_ENDED)
+        self._failures: deque[dict[str, Any]] = deque(maxlen=MAX_FAILED)
+
+    def update(self, under_way: Callable[[], Sequence[Mapping[str, Any]]], is_last: bool) -> None:
+        """List the jobs under way, if the last list is old or the update the last one."""
+        time_s = time.monotonic()
+        if time_s >= self._list_at or is_last:
+            self._list_at = time_s + LIST_EVERY_S
+            self.under_way = under_way()
+
+    def end(self, row: JobRow, opens: bool) -> None:
+        """Count a job, and move its entry from the jobs under way to the last jobs.
+
+        `opens` says whether a user of the page can open the job.
+        """
+        self.under_way = [job for job in self.under_way if job["name"] != row.name]
+        entry = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
+        entry |= {"number": row.number, "opens": opens, "values": self._words(row.values)}
+        (self._ended if row.done else self._failures).append(entry)
+        ended = "done" if row.done else "failed"
+        self.sums.update({ended: 1, "points": row.points, "rays": row.rays})
+
+    def name_of(self, number: int) -> str:
+        """Return the name of a job that was done last, else KeyError."""
+        names = {job["number"]: job["name"] for job in list(self._ended)}
+        return str(names[number])
+
+    def news(self, readable: Container[int]) -> dict[str, Any]:
+        """Return the lists, for JSON.
+
+        Jobs with `readable` numbers can be opened as well.
+        """
+        under_way = self.under_way
+        return dict(self.sums) | {
+            "names": list(self._names),
+            "busy": len(under_way),
+            "under_way": [
+                {**job, "values": self._words(job["values"])} for job in under_way[:MAX_UNDER_WAY]
+            ],
+            "failures": [*reversed(list(self._failures))],
+            "ended": [
+                job | {"opens": job["opens"] or job["number"] in readable}
+                for job in reversed(list(self._ended))
+            ],
+        }
+
+    def _words(self, values: Mapping[str, Value | None]) -> list[str]:
+        """Return values in the order of the table's columns, "" for a missing value."""
+        shown = ("" if (value := values.get(name)) is None else value for name in self._names)
+        words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
+        return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -1,0 +1,190 @@
+"""Opens files that lidarpool reads or writes for the viewer, and offers points as files.
+
+Results, clouds, recordings and exports of lidarpool and other programs, meshes and scenarios are a
+view each; a data set is a list of jobs with a view each (`job_list.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from lidarscenes.files.formats import ROBOTS
+from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.io.input_files import open_input
+from lidarsim.io.storage import Storage
+from lidarsim.scene.files.mesh_formats import format_of
+from lidarsim.scene.files.text_cloud import is_text_raster
+from lidarview.viewer.result_views import join_views, open_result
+from lidarview.viewer.view import CLOUD, ProgressiveView, View
+
+from ..datasets.dataset import INDEX_FILE
+from .downloads import downloads
+
+if TYPE_CHECKING:  # recordings are imported when one is opened
+    from .recorded import OnPart
+
+_TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
+_TRAJECTORY_ADVICE = "set `trajectory: FILE` in a scenario"
+_HEADER_BYTES = 1 << 16  # bytes of a .ply that name its elements
+
+
+def is_data_set(place: Path | Storage) -> bool:
+    """Return True if a folder or URL has a data set of many jobs, finished or not."""
+    if isinstance(place, Storage):
+        with explained(f"{place.url} cannot be read"):
+            return INDEX_FILE in place.entries()
+    return not (place / CLOUD).exists() and (
+        (place / INDEX_FILE).exists() or (place / ".jobs").is_dir()
+    )
+
+
+def open_views(paths: Sequence[Path], **options: Any) -> View:
+    """Open files and folders of the same place as a view of all their points.
+
+    The options are as in `open_view`.
+
+    LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
+    others.
+    """
+    return join_views(paths, [open_view(path, **options) for path in paths])
+
+
+def open_view(
+    path: Path,
+    *,
+    keep_noise: bool = False,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+    on_part: OnPart = lambda *_: None,
+) -> View:
+    """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
+
+    Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
+    `of_mesh` are the unit and up axis of a mesh; `tell` is called with each note on a scene,
+    and `on_part` with each part of a cloud of another program.
+
+    LidarError if the path has an unfinished run, or nothing that is read.
+    """
+    if not path.exists():
+        raise MissingFileError(
+            f"{path} does not exist. Specify a result, a cloud, a mesh or a scenario."
+        )
+    title = f"{path.resolve().name} - lidarpool"
+    if _is_previewed(path):
+        return _preview(path, of_mesh, tell)
+    if of_mesh:
+        raise LidarError(
+            f"{path} is not a mesh. Remove `--{next(iter(of_mesh)).replace('_', '-')}`, which "
+            "can only be used with meshes."
+        )
+    if path.is_dir():
+        if (path / CLOUD).exists():
+            return open_result(path, downloads())
+        refuse_unfinished(path)
+        return _recorded(path, title, keep_noise, on_part)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        try:
+            view = open_result(path, downloads())
+        except LidarError:  # text, or of another program
+            return _recorded(path, title, keep_noise, on_part)
+        if not len(view.points):
+            raise LidarError(f"{path} contains no points.")
+        return view
+    return _recorded(path, title, keep_noise, on_part)
+
+
+def _is_previewed(path: Path) -> bool:
+    """Return True for a scenario or a mesh.
+
+    Raises LidarError if its file cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return False
+    if suffix in (".yaml", ".yml", *ROBOTS):
+        return True
+    if suffix == ".ply":
+        return _has_faces(path)
+    with explained(f"{path} cannot be read"):
+        if suffix == ".asc" and not is_text_raster(path):
+            return False
+    mesh_format = format_of(path)
+    return mesh_format is not None and not mesh_format.advice
+
+
+# Modules of recordings, scenarios and runs are imported only when they are needed: the first points
+# of a result are shown two seconds earlier.
+
+
+def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
+    """Return the view of a recording."""
+    from ..recordings.opening import UnknownFormatError, open_sensors
+    from .recorded import recorded_view
+
+    may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
+    try:
+        sensors = open_sensors(path, keep_noise=keep_noise)
+        return recorded_view(sensors, title, downloads(), on_part)
+    except UnknownFormatError as error:
+        advice = f"{error.advice} " if error.advice else ""
+        if may_be_trajectory:
+            advice = f"If it is a trajectory, {_TRAJECTORY_ADVICE}. "
+        raise LidarError(
+            f"The format of {path} is not supported. {advice}Specify a result, data set, "
+            "cloud, recording, scenario or mesh in a format that `lidarpool view --help` "
+            "lists."
+        ) from error
+    except LidarError as error:
+        if not may_be_trajectory:
+            raise
+        raise LidarError(f"{error} If it is a trajectory, {_TRAJECTORY_ADVICE}.") from error
+
+
+def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | None:
+    """Return the view of a large .las or .laz, which shows more points while they are read.
+
+    None for other files and folders. LidarError if the file cannot be read.
+    """
+    if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
+        return None
+    from ..recordings.opening import open_recording
+    from . import recorded
+
+    recording = open_recording(path, keep_noise=keep_noise)
+    if recording.sample is None or (recording.point_count or 0) < recorded.LARGE_POINTS:
+        return None
+    title = f"{path.resolve().name} - lidarpool"
+    return recorded.growing_view(
+        recording, title, lambda on_part: open_view(path, keep_noise=keep_noise, on_part=on_part)
+    )
+
+
+def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
+    """Return the view of a scenario or mesh before its run."""
+    from .preview import scenario_view
+
+    return scenario_view(path, of_mesh, tell)
+
+
+def _has_faces(path: Path) -> bool:
+    """Return True if the header of a .ply file names faces, so that the file is a mesh."""
+    with open_input(path) as file:
+        header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
+    lines = (line.split() for line in header.splitlines())
+    return any(line[:2] == [b"element", b"face"] and line[2:] != [b"0"] for line in lines)
+
+
+def refuse_unfinished(path: Path) -> None:
+    """Raise a LidarError if a folder holds an unfinished run and no cloud."""
+    from ..run.store.database import FILE
+    from ..run.store.run_store import RUN_FOLDER
+
+    if not (path / CLOUD).exists() and (path / RUN_FOLDER / FILE).exists():
+        raise LidarError(
+            f"{path} contains an unfinished run. Continue it with `lidarpool run --resume`, "
+            "and use `--live` to show its points."
+        )

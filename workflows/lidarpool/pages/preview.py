@@ -1,0 +1,90 @@
+"""Views of scenarios and meshes before a run: scene, sensors, trajectories and first sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import AXES, SCAN, TABLE
+from lidarsim.errors import LidarError
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarview.picture_file import PictureContent
+from lidarview.viewer.point_selection import ScanOrderedPoints
+from lidarview.viewer.view import View
+
+from ..report.picture_content import planning_picture
+from ..scenario.advice import advice
+from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_sections import is_campaign
+from ..scenario.job import Job
+from ..scenario.prepare import prepare
+from ..scenario.scenario import Scenario
+
+MATERIAL = TABLE["material"]
+_PREVIEW = "This preview was simulated before the run and shows the first sweep of each sensor."
+
+
+def scenario_view(
+    path: Path,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> View:
+    """Return the preview of a scenario, of the first job of a campaign, or of a mesh file.
+
+    A mesh is scanned as `lidarpool run` scans it, with the options `of_mesh` of `mesh_data`. `tell`
+    is called with each note on the scene. LidarError if a file cannot be read, or fields of
+    the scenario contradict each other.
+    """
+    is_mesh = path.suffix.lower() not in (".yaml", ".yml")
+    note = _PREVIEW
+    if not is_mesh and not of_mesh and is_campaign(path):
+        campaign = CampaignSpec.load(path)
+        job = campaign.job(0)
+        note = f"This is job {job.name} of {campaign.count:,} in the campaign. {_PREVIEW}"
+    else:
+        prepared = prepare(_with_materials(Scenario.load(path, of_mesh)))
+        for line in advice(prepared):
+            tell(line)
+        job = prepared.job
+    return preview_of(job, note, f"{path.resolve().name} - lidarpool")
+
+
+def _with_materials(scenario: Scenario) -> Scenario:
+    """Return a scenario whose points, and so the faces of its scene, have their materials."""
+    columns = (*scenario.cloud.columns, MATERIAL.name)
+    return scenario.model_copy(update={"cloud": replace(scenario.cloud, columns=columns)})
+
+
+def preview_of(job: Job, note: str, title: str) -> View:
+    """Return the view of a job before its run."""
+    planning = planning_picture(job.planning)
+    content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
+    cloud = Cloud.joined([*first_sweeps(job)])
+    if not job.scene.material_names:
+        columns = {name: values for name, values in cloud.columns.items() if name != MATERIAL.name}
+        cloud = replace(cloud, columns=columns)
+    sweeps = job.sweeps
+    return View(ScanOrderedPoints(cloud), content, sweeps, note, title, preview=True)
+
+
+def first_sweeps(job: Job) -> Iterator[Cloud]:
+    """Cast the first sweep of each sensor of a job in this process, in the order of their scans."""
+    sweeps = job.sweeps
+    survey = job.survey
+    if not len(sweeps):
+        raise LidarError("The survey has no sweeps. Set `poses`, or a longer trajectory.")
+    rig = Rig(job.scene, survey)
+    table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
+    origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
+    for sensor in range(len(sweeps.sensors)):
+        first = int(np.flatnonzero(sweeps.sensor == sensor)[0])
+        start, stop = sweeps.scans[first : first + 2].tolist()
+        part = columns_of([*rig.cast(start, stop)])
+        yield part.cloud(table, survey.precision_m, origin)

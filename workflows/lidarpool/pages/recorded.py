@@ -1,0 +1,293 @@
+"""Views of recordings and clouds of other programs, held in memory."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.column_names import COLORS, with_standard_names
+from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.table import TABLE, Column, Kind, Scale
+from lidarsim.errors import LidarError
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.numerics.arrays import AnyArray, Floats
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
+from lidarsim.words import plural
+from lidarview.viewer.point_selection import STATION, InMemoryPoints, Points, ScanOrderedPoints
+from lidarview.viewer.view import DownloadFormats, ProgressiveView, View
+
+from ..clouds.recording import Recording
+
+MAX_POINTS = 20_000_000  # points of a recording, in memory
+LARGE_POINTS = 2_000_000  # a larger cloud is shown by a sample while it is read
+_SAMPLE_POINTS = 200_000
+_GROWING_POINTS = 1_000_000  # points that are shown before all are read, beside the sample
+# Receives a part of a cloud, and the share of the cloud that has been read.
+OnPart = Callable[[Sweep, float], None]
+_SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
+_GRAY = 188  # byte of a color that is unknown: half of the light
+# Classes of ASPRS LAS 1.4 by their numbers.
+ASPRS_CLASSES = (
+    "never classified", "unassigned", "ground", "low vegetation", "medium vegetation",
+    "high vegetation", "building", "low point", "", "water", "rail", "road surface", "",
+    "wire guard", "wire conductor", "transmission tower", "wire connector", "bridge deck",
+    "high noise",
+)  # fmt: skip
+
+
+def shown(sweep: Sweep) -> Sweep:
+    """Return the points at finite positions, with the columns of one number per point."""
+    arrays = {name: np.asarray(values) for name, values in sweep.columns.items()}
+    columns = {
+        name: values
+        for name, values in arrays.items()
+        if values.shape == (len(sweep),) and values.dtype.kind in "biuf"
+    }
+    numbers = sweep.with_columns(**columns)
+    finite = np.asarray(np.isfinite(sweep.points).all(axis=1))
+    return numbers if finite.all() else numbers.select(finite)
+
+
+def joined_cloud(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
+    """Join the points of `shown` sweeps with the columns that all of them have.
+
+    Columns that are zero throughout are omitted. Sweeps without points may lack columns. `further`
+    are additional columns of all points.
+    """
+    if not sweeps:
+        return Cloud(np.zeros((0, 3)), further)
+    filled = [sweep for sweep in sweeps if len(sweep)] or sweeps
+    shared = set.intersection(*({*sweep.columns} for sweep in filled))
+    columns: dict[str, AnyArray] = {}
+    for name in filled[0].columns:
+        parts = [sweep.columns[name] for sweep in filled if name in shared]
+        identifier = re.sub(r"\W", "_", name)
+        identifier = identifier if identifier.isidentifier() else f"_{identifier}"
+        is_new = identifier == name or identifier not in shared
+        if is_new and identifier.lower() not in "xyz" and any(part.any() for part in parts):
+            columns[identifier] = _plain(name, np.concatenate(parts))
+    # A standard name whose column is omitted goes to the next column with an alias.
+    columns = with_standard_names(columns) | further
+    custom = tuple(_described(name, array) for name, array in columns.items())
+    return Cloud(np.concatenate([sweep.points for sweep in sweeps]), columns, custom)
+
+
+def _plain(name: str, values: AnyArray) -> AnyArray:
+    """Return values in native byte order, with bytes for colors and truth values."""
+    if name in COLORS and values.dtype.kind == "f" and np.isnan(values).any():
+        return np.nan_to_num(values, nan=_GRAY).astype(np.uint8)
+    kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
+    return values.astype(kind.newbyteorder("="), copy=False)
+
+
+def _described(name: str, values: AnyArray) -> Column:
+    """Return the description of a column, of the table if it has values of that type."""
+    known = TABLE.get(name)
+    if known is not None and np.dtype(known.dtype) == values.dtype:
+        return known
+    is_label = known is not None and known.kind == "label" and values.dtype.kind in "iu"
+    scale: Scale = "linear" if known is None else known.scale
+    kind: Kind = "label" if is_label else "number"
+    return Column(name, values.dtype.name, "", "", kind=kind, scale=scale)
+
+
+def recorded_view(
+    sensors: Mapping[str, Recording],
+    title: str,
+    downloads: DownloadFormats | None,
+    on_part: OnPart = lambda *_: None,
+) -> View:
+    """Return the view of the sensors of a recording, {name: recording}, with a player of sweeps.
+
+    `on_part` is called with each part of a cloud that was read.
+
+    LidarError if a recording is damaged, or has no points.
+    """
+    first = next(iter(sensors.values()))
+    notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
+    if first.is_cloud:
+        cloud = _cloud_of(first, on_part)
+        sweeps = None
+    else:
+        cloud, sweeps, further_notes = _sweeps_of(sensors)
+        notes += further_notes
+    notes += [note for recording in sensors.values() for note in recording.omission_notes]
+    if not len(cloud):
+        left_out = "".join(f" {note}." for note in first.omission_notes)
+        raise LidarError(f"{first.name} contains no points.{left_out}")
+    names: dict[str, Sequence[str]] = {}
+    if first.name.lower().endswith((".las", ".laz")):
+        names["class"] = ASPRS_CLASSES
+    if sweeps is not None and sweeps.station_numbers.any():
+        names[STATION.name] = _station_names(first, sweeps)
+    return View(
+        ScanOrderedPoints(cloud),
+        None,
+        sweeps,
+        " ".join(notes),
+        title,
+        downloads=downloads,
+        names=names,
+        stated_epsg=first.epsg,
+    )
+
+
+def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
+    """Return the names of the stations 0 (none), 1, 2, …, with "" for unnamed stations."""
+    numbers = sweeps.station_numbers.tolist()
+    names = [""] * (max(numbers) + 1)
+    for number, name in zip(numbers, recording.stations, strict=False):  # some may not be read
+        names[number] = names[number] or name
+    return names
+
+
+def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
+    """Return the view of a sample of a cloud that has `Recording.sample`, and its points.
+
+    The sample consists of runs of points, which are read within a second.
+    """
+    sample = shown(recording.read_sample(_SAMPLE_POINTS))
+    view = View(
+        InMemoryPoints(joined_cloud([sample])),
+        note=" ".join(recording.notes),
+        title=title,
+        names={"class": ASPRS_CLASSES},
+        stated_epsg=recording.epsg,
+    )
+    return view, sample
+
+
+def growing_view(
+    recording: Recording, title: str, read: Callable[[OnPart], View]
+) -> ProgressiveView:
+    """Return a view that shows a sample of a cloud, and more points while `read` reads all."""
+    total = recording.point_count or 0
+    sampled, sample = sampled_view(recording, title)
+    parts = [sample]
+    step = -(-total // _GROWING_POINTS)
+
+    def grow(show: Callable[[Points, float], None]) -> View:
+        def on_part(part: Sweep, share: float) -> None:
+            parts.append(part.select(slice(None, None, step)))
+            show(InMemoryPoints(joined_cloud(parts)), share)
+
+        return read(on_part)
+
+    return ProgressiveView(sampled, total, grow)
+
+
+def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:
+    """Read a cloud, or evenly distributed points of a large cloud."""
+    total = recording.point_count or 0
+    step = max(1, -(-total // MAX_POINTS))
+    parts: list[Sweep] = []
+    for number in range(len(recording)):
+        part = shown(recording[number].select(slice(None, None, step)))
+        parts.append(part.replace(points=np.asarray(part.points, np.float64)))
+        on_part(parts[-1], (number + 1) / len(recording))
+    return joined_cloud(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _TimedSweep:
+    """A sweep of a recording, before it is read."""
+
+    begins_ns: float
+    sensor: int
+    number: int
+
+
+def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
+    """Return the sweeps of all sensors in the order of times, and whether the times are known."""
+    sweeps: list[_TimedSweep] = []
+    is_timed = True
+    for sensor, recording in enumerate(sensors):
+        stamps_ns = recording.stamps_ns
+        times = _SWEEP_NS * np.arange(len(recording), dtype=np.float64)
+        if stamps_ns is None or len(stamps_ns) < len(recording):
+            is_timed = False
+        else:
+            times = stamps_ns
+        sweeps += [
+            _TimedSweep(float(times[number]), sensor, number) for number in range(len(recording))
+        ]
+    start_ns = min((sweep.begins_ns for sweep in sweeps), default=0.0)
+    ordered = sorted(sweeps, key=lambda sweep: (sweep.begins_ns, sweep.sensor))
+    return [
+        _TimedSweep(sweep.begins_ns - start_ns, sweep.sensor, sweep.number) for sweep in ordered
+    ], is_timed
+
+
+def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
+    """Read sweeps until memory is full, and return their points, the sweeps, and notes."""
+    recordings = [*sensors.values()]
+    ordered, is_timed = _order(recordings)
+    frame_poses = [_frame_poses(recording) for recording in recordings]
+    if any(sensor_poses is None for sensor_poses in frame_poses):
+        frame_poses = [None] * len(recordings)  # sensors without a pose fit no others
+    read: list[Sweep] = []
+    poses: list[Floats | None] = []
+    count = 0
+    for timed in ordered:
+        sweep = recordings[timed.sensor][timed.number].returns()
+        sensor_poses = frame_poses[timed.sensor]
+        if sweep.pose is None and sensor_poses is not None:
+            sweep = sweep.replace(pose=sensor_poses[timed.number])
+        poses.append(sweep.pose)
+        read.append(shown(sweep if sweep.pose is None else sweep.replace(points=sweep.in_world())))
+        count += len(read[-1])
+        if count > MAX_POINTS:
+            break
+    notes = []
+    if len(poses) < len(ordered):
+        notes.append(f"Only the first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
+    are_stations = all(recording.stations for recording in recordings)
+    if not is_timed and len(ordered) > 1 and not are_stations:
+        notes.append("The recording contains no times. A rate of 10 sweeps per second is assumed.")
+    counts = [len(sweep) for sweep in read]
+    cloud = joined_cloud(read, scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
+    sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])
+    return cloud, replace(sweeps, stations=len(sweeps) if are_stations else 1), notes
+
+
+def _frame_poses(recording: Recording) -> Floats | None:
+    """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
+    has_frames = recording.read_poses is not None
+    return recording.poses(range(len(recording))) if has_frames else None
+
+
+def recorded_sweeps(
+    ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
+) -> Sweeps:
+    """Return sweeps of one scan each, without actors.
+
+    `names` are the names of the sensors.
+    """
+    known = [np.eye(4) if pose is None else pose for pose in poses]
+    matrices = np.array(known, np.float64).reshape(-1, 4, 4)
+    count = len(ordered)
+    begins_ns = np.array([sweep.begins_ns for sweep in ordered])
+    still = SweepPoses(np.zeros((len(names), 3)), np.tile([0.0, 0, 0, 1], (len(names), 1)))
+    return Sweeps(
+        scans=np.arange(count + 1),
+        begins_ns=begins_ns,
+        ends_ns=begins_ns,
+        sensor=np.array([sweep.sensor for sweep in ordered], np.uint8),
+        pose=SweepPoses(matrices[:, :3, 3], quaternions_of(matrices[:, :3, :3])),
+        mounts=still,
+        sensors=tuple(names),
+        objects=(),
+        actors=(),
+        actor_poses=SweepPoses(np.zeros((0, count, 3)), np.zeros((0, count, 4))),
+        actor_velocities=np.zeros((0, count, 3)),
+        actor_bounds=np.zeros((0, 2, 3)),
+        actor_there=np.zeros((0, count), np.bool_),
+        actor_comes=np.zeros((0, count), np.bool_),
+        actor_leaves=np.zeros((0, count), np.bool_),
+        coordinates="sensor" if any(pose is None for pose in poses) else "world",
+        precision_m=0.001,
+    )

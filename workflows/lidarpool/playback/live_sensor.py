@@ -1,0 +1,124 @@
+"""Packets: a live sensor, whose datagrams leave at their own times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Self
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.packets.encoders import PacketEncoder, PacketSource, encoder_of
+from lidarsim.packets.shots import Shots, check_columns
+from lidarsim.sweeps.instruments import IMU_FILE, Instruments
+from lidarsim.sweeps.sweeps import Sweeps
+
+from ..clouds.writing import ExportSpec
+from .bridge import Bridge, BridgeOptions
+from .schedule import Schedule
+from .transmitter import Transmitter, sensor_streams
+
+_LEAD_NS = 0.3e9  # lead of a sweep before its first packet: the process that sends holds so much
+
+
+class PacketsBridge(Bridge):
+    """Sends the packets of each sensor in its maker's protocol, and answers the maker's software.
+
+    The settings are `api`, NAME=HOST:PORT or HOST:PORT where the sensors' interfaces listen, and
+    `lateness`, a file for how late packets were.
+    """
+
+    format = ExportSpec("pcap")
+    settings = ("api", "lateness")
+    lead_ns = _LEAD_NS
+
+    def __init__(
+        self,
+        sweeps: Sweeps,
+        schedule: Schedule,
+        options: BridgeOptions,
+        note: Callable[[str], None],
+    ) -> None:
+        super().__init__(sweeps, schedule, options, note)
+        instruments = sweeps.instruments
+        if options.period_ns and instruments is not None:
+            instruments = RepeatedInstruments.of(instruments, options.period_ns)
+        sources = [
+            PacketSource.for_sensor(replace(sweeps, instruments=instruments), number)
+            for number in range(len(sweeps.sensors))
+        ]
+        self._encoders = [encoder_of(source) for source in sources]
+        streams = sensor_streams(self._encoders, options.to, options.settings.get("api", ()))
+        self._transmitter = Transmitter(streams, note, options.settings.get("lateness"))
+
+    @property
+    def description(self) -> str:
+        """Where the packets go, and what answers."""
+        return self._transmitter.description
+
+    def due_ns(self, sweep: int) -> float:
+        """Return when the sweep starts: its first packet leaves soon after."""
+        return float(self.sweeps.begins_ns[sweep])
+
+    def prepare(self, sweep: int, points: Cloud) -> None:
+        """Encode a sweep by an encoder that is thrown away, which compiles loops."""
+        source = PacketSource.for_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
+        encoder = encoder_of(replace(source, instruments=None))
+        encoder.encode(self._shots(encoder, sweep, points))
+
+    def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
+        """Hand the packets of a sweep to the process that sends them."""
+        number = int(self.sweeps.sensor[sweep])
+        encoder = self._encoders[number]
+        shots = self._shots(encoder, sweep, points).shifted(shift_ns)
+        self._transmitter.sender.send(number, encoder.encode(shots), self.schedule.deadlines_ns)
+
+    def finish(self) -> None:
+        """Send the packets that are left, and wait until all are sent."""
+        for number, encoder in enumerate(self._encoders):
+            self._transmitter.sender.send(number, encoder.finish(), self.schedule.deadlines_ns)
+        self._transmitter.sender.finish()
+
+    @property
+    def summary(self) -> str:
+        """How many packets were sent, and how late."""
+        return self._transmitter.summary
+
+    def __enter__(self) -> Self:
+        self._transmitter.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._transmitter.__exit__(*error)
+
+    def _shots(self, encoder: PacketEncoder, sweep: int, points: Cloud) -> Shots:
+        check_columns(points.columns, encoder.columns)
+        return Shots.from_points(self.sweeps, sweep, points, encoder.columns)
+
+
+@dataclass(frozen=True)
+class RepeatedInstruments(Instruments):
+    """Instruments whose samples of the IMU are repeated without end, `period_ns` later each time.
+
+    Positions are not: the receiver states its last position from then on.
+    """
+
+    period_ns: int = 0
+
+    @classmethod
+    def of(cls, instruments: Instruments, period_ns: int) -> RepeatedInstruments:
+        """Return repeated instruments."""
+        return cls(instruments.imu, instruments.gnss, instruments.folder, period_ns)
+
+    def rows(self, name: str) -> Iterator[list[str]]:
+        """Yield the rows of a file, and rows of the IMU again and again, with later times."""
+        if name != IMU_FILE:
+            yield from super().rows(name)
+            return
+        shift_ns = 0
+        while True:
+            row: list[str] = []
+            for row in super().rows(name):
+                yield [str(int(row[0]) + shift_ns), *row[1:]]
+            if not row:
+                return
+            shift_ns += self.period_ns

@@ -1,0 +1,197 @@
+"""What is played: the sweeps of a result, or of a scenario, which are cast as they are due."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.cloud_file import CloudFile
+from lidarsim.columns.table import AXES, SCAN
+from lidarsim.errors import LidarError, MissingFileError
+from lidarsim.io.storage import Storage
+from lidarsim.packets.capture import ENDINGS as CAPTURE_ENDINGS
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.instruments import INSTRUMENT_FILES
+from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
+from lidarview.picture_file import PICTURE_FILE, PictureContent
+
+from ..clouds.folder import local_result
+from ..clouds.navigation_files import write_instruments
+from ..clouds.writing import ExportSpec
+from ..scenario.advice import advice
+from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_sections import is_campaign
+from ..scenario.job import Job
+from ..scenario.prepare import prepare
+from ..scenario.scenario import Scenario
+from ..scenario.sections import OutputSection
+from .schedule import casting_threads
+
+CLOUD = "cloud.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """Sweeps to play, and their points.
+
+    Iterating yields number and points of each sweep, in the order of the starts of the sweeps.
+    """
+
+    sweeps: Sweeps
+    points: Callable[[int], Cloud]  # points of the sweep of a number; casts the sweep of a scenario
+    # Returns scene and planned path; None for a result without them.
+    content: Callable[[], PictureContent | None] = lambda: None
+    threads: int = 1  # threads that may ask for points at the same time
+
+    def __post_init__(self) -> None:
+        if not len(self.sweeps):
+            raise LidarError("There are no sweeps to play. Set `poses`, or a longer trajectory.")
+
+    def __iter__(self) -> Iterator[tuple[int, Cloud]]:
+        for sweep in self.order:
+            yield sweep, self.points(sweep)
+
+    @property
+    def order(self) -> list[int]:
+        """Numbers of the sweeps in the order of their starts."""
+        order: list[int] = np.argsort(self.sweeps.begins_ns, kind="stable").tolist()
+        return order
+
+    @property
+    def period_ns(self) -> int:
+        """Time from the start of the first sweep to its start when all are played again."""
+        ends_ns = []
+        for number in range(len(self.sweeps.sensors)):
+            rows = np.flatnonzero(self.sweeps.sensor == number)
+            begins_ns = self.sweeps.begins_ns[rows]
+            last_ns = self.sweeps.ends_ns[rows[-1]] - begins_ns[-1]
+            ends_ns.append(begins_ns[-1] + max(last_ns, *np.diff(begins_ns[-2:]), 1.0))
+        return round(max(ends_ns) - self.sweeps.begins_ns.min())
+
+
+@contextmanager
+def open_source(
+    source: Path | Storage,
+    needs: ExportSpec | None = None,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> Iterator[Played]:
+    """Open a result, scenario, campaign or mesh file to be played.
+
+    Of a campaign, the first job is played. The cloud of a scenario has the columns that the format
+    `needs` holds. `of_mesh` are `mesh_data`'s options of a mesh file; `tell` is called with each
+    note on the scene.
+
+    Raises
+    ------
+    LidarError
+        If the source cannot be read, or has no sweeps.
+    """
+    if isinstance(source, Path) and not source.exists():
+        raise MissingFileError(
+            f"{source} does not exist. Specify a result, a scenario or a recording."
+        )
+    with ExitStack() as stack:
+        if isinstance(source, Path) and source.is_file():
+            if source.suffix.lower() in CAPTURE_ENDINGS:
+                raise LidarError(
+                    f"{source} contains packets. Play it with `--as packets`, or specify a "
+                    "result or a scenario."
+                )
+            yield _cast(scenario_job(source, needs, of_mesh, tell), stack)
+            return
+        if of_mesh:
+            raise LidarError(
+                f"`unit` and `up_axis` can only be used with mesh files, but {source} is a "
+                "result. Omit them."
+            )
+        files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
+        folder = stack.enter_context(local_result(source, files))
+        yield _recorded(folder, source)
+
+
+def _recorded(folder: Path, source: Path | Storage) -> Played:
+    """Return the sweeps of a result in a folder.
+
+    Raises LidarError if files are missing.
+    """
+    for name in (CLOUD, SWEEPS_FILE):
+        if not (folder / name).exists():
+            raise LidarError(
+                f"{source} contains no {name}. Specify a scenario, or the output folder of a "
+                "finished run."
+            )
+    sweeps = Sweeps.load(folder / SWEEPS_FILE)
+    cloud = CloudFile(folder / CLOUD)
+
+    def read(sweep: int) -> Cloud:
+        """Read the points of a sweep, and no others."""
+        first, stop = (cloud.row_of(scan) for scan in sweeps.scans[sweep : sweep + 2].tolist())
+        if stop <= first:  # the scans may still be out of order
+            return next(sweeps.points(cloud, sweep, sweep + 1))
+        points = next(cloud.chunks(stop - first, first))
+        return next(sweeps.points(points, sweep, sweep + 1))
+
+    return Played(sweeps, read, lambda: PictureContent.load_from(folder))
+
+
+def scenario_job(
+    path: Path,
+    needs: ExportSpec | None = None,
+    of_mesh: Mapping[str, Any] = MappingProxyType({}),
+    tell: Callable[[str], None] = lambda note: None,
+) -> Job:
+    """Return the job of a scenario or mesh file, or the first job of a campaign.
+
+    Its cloud has the columns that the format `needs` holds, in place of the columns for the formats
+    that the scenario writes. `of_mesh` and `tell` as for `open_source`.
+    """
+    if path.suffix.lower() in (".yaml", ".yml") and not of_mesh and is_campaign(path):
+        campaign = CampaignSpec.load(path)
+        scenario = campaign.scenario(0)
+        if scenario is None:
+            raise LidarError(
+                f"The jobs of {path} are created by a function, so they cannot be played. Specify "
+                "a scenario."
+            )
+    else:
+        scenario = Scenario.load(path, of_mesh)
+    output = OutputSection(write=() if needs is None else (needs,))
+    prepared = prepare(scenario.model_copy(update={"output": output}), plans=False)
+    for note in advice(prepared):
+        tell(note)
+    return prepared.job
+
+
+def _cast(job: Job, stack: ExitStack) -> Played:
+    """Return the sweeps of a job, which are cast when their points are asked for."""
+    survey = job.survey
+    sweeps = job.sweeps
+    if sweeps.instruments is not None:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
+        write_instruments(folder, survey, job.scene.origin)
+        sweeps = replace(sweeps, instruments=replace(sweeps.instruments, folder=folder))
+    rig = Rig(job.scene, survey, threads=1)  # sweeps are cast beside each other
+    table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
+    origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
+
+    def cast(sweep: int) -> Cloud:
+        """Cast a sweep in this process."""
+        start, stop = sweeps.scans[sweep : sweep + 2].tolist()
+        part = columns_of([*rig.cast(start, stop)])
+        return part.cloud(table, survey.precision_m, origin)
+
+    def content() -> PictureContent | None:
+        """Return scene and planned path."""
+        return PictureContent.before_casting(job.scene, survey)[0]
+
+    return Played(sweeps, cast, content, casting_threads())

@@ -1,0 +1,228 @@
+"""Where packets go: the addresses of sensors, the process that sends, and what answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+from lidarsim.errors import LidarError, explained
+from lidarsim.packets.encoders import PacketEncoder
+from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
+from lidarsim.packets.service import Destination, Service
+from lidarsim.words import did_you_mean, joined
+
+# Returns the service of a sensor (`PacketEncoder.service`).
+MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """The datagrams of a sensor: where they go, and where the sensor's interface listens."""
+
+    name: str
+    model: str
+    kinds: Mapping[str, int]  # {kind of datagrams: port}, the returns first
+    make_service: MakeService
+    distinguished_by_receivers: bool = False  # see `PacketEncoder`
+    has_own_address: bool = False
+    destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
+    # Address of the interface
+    address: ReceiverAddress = field(default_factory=lambda: ReceiverAddress(LOOPBACK))
+    api_given: bool = False  # whether a user gives the address of the interface
+
+    @property
+    def source_address(self) -> str:
+        """The address that datagrams come from: the interface's, or no text for any."""
+        to_this_machine = ReceiverAddress(self.destination.host).is_loopback
+        return self.address.host if to_this_machine or not self.address.is_loopback else ""
+
+    @property
+    def ports(self) -> list[int]:
+        """Ports of the receiver, the port of the returns first."""
+        return list(self.destination.ports.values())
+
+    def describe(self) -> str:
+        """Return where the datagrams go, for the user."""
+        words = f"{self.model} sends to {self.destination.host}"
+        ports = " and ".join(map(str, self.ports))
+        return f"{words}, port {ports}" if ports else words
+
+    def to(self, receiver: ReceiverAddress) -> Stream:
+        """Return the stream to a receiver.
+
+        Raises LidarError if its datagrams cannot go there.
+
+        A port is the port of the returns; other kinds of datagrams move by as much.
+        """
+        if receiver.port is not None and not self.kinds:
+            raise LidarError(
+                f"The ports of {self.model}, to which `--to {receiver}` refers, are unknown. "
+                "Remove the port."
+            )
+        first = next(iter(self.kinds.values()), 0)
+        shift = 0 if receiver.port is None else receiver.port - first
+        numbers = {port: port + shift for port in self.kinds.values()}
+        if beyond := [port for port in numbers.values() if not 0 < port < 1 << 16]:
+            raise LidarError(
+                f"With `--to {receiver}`, other packets of {self.name} would be sent to port "
+                f"{beyond[0]}, which is out of range. Use a port closer to {first}."
+            )
+        check_reachable(ReceiverAddress(receiver.host, numbers.get(first)))
+        return replace(self, destination=Destination(receiver.host, numbers))
+
+
+def sensor_streams(
+    encoders: Sequence[PacketEncoder], to: Sequence[str], api: Sequence[str]
+) -> list[Stream]:
+    """Return the streams of sensors (`streams_to`)."""
+    streams = [
+        Stream(
+            encoder.source.name or "lidar",
+            encoder.source.sensor.model,
+            encoder.ports,
+            encoder.service,
+            encoder.distinguished_by_receivers,
+            encoder.has_own_address,
+        )
+        for encoder in encoders
+    ]
+    return streams_to(streams, to, api)
+
+
+def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
+    """Return streams to the addresses that a user gives, as [NAME=]HOST[:PORT].
+
+    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default, interfaces that need a separate
+    address from 127.0.0.2 on.
+
+    LidarError if an address cannot be used, or receivers could not tell two sensors apart.
+    """
+    names = [stream.name for stream in streams]
+    receivers = _by_sensor(to, names, "--to")
+    interfaces = _by_sensor(api, names, "--api")
+    placed: list[Stream] = []
+    for number, stream in enumerate(streams):
+        name = stream.name
+        moved = replace(
+            stream.to(receivers.get(name, ReceiverAddress(LOOPBACK))),
+            address=interfaces.get(name, _loopback_address(number, stream.has_own_address)),
+            api_given=name in interfaces,
+        )
+        for other in placed:
+            _check_apart(other, moved)
+        placed.append(moved)
+    return placed
+
+
+def _loopback_address(number: int, has_own_address: bool) -> ReceiverAddress:
+    """Return the default address of the interface of a sensor, by its number."""
+    return ReceiverAddress(f"127.0.0.{number + (2 if has_own_address else 1)}")
+
+
+def _by_sensor(
+    texts: Sequence[str], names: Sequence[str], option: str
+) -> dict[str, ReceiverAddress]:
+    """Return the address of each sensor by its name.
+
+    An address without a name is for all.
+    """
+    addresses: dict[str, ReceiverAddress] = {}
+    for text in texts:
+        name, separator, address = text.rpartition("=")
+        if separator and name not in names:
+            raise LidarError(
+                f"{option} {text} refers to the sensor {name!r}, which does not "
+                f"exist.{did_you_mean(name, names)} The sensors are {joined(names)}."
+            )
+        parsed = ReceiverAddress.parse(address)
+        for sensor in [name] if separator else names:
+            addresses[sensor] = parsed
+    return addresses
+
+
+def _check_apart(stream: Stream, other: Stream) -> None:
+    """Raise LidarError if receivers could not tell two sensors apart."""
+    shared = {*stream.ports} & {*other.ports}
+    host = stream.destination.host
+    if host != other.destination.host or not shared:
+        return
+    if stream.distinguished_by_receivers and stream.source_address != other.source_address:
+        return
+    port = min(stream.ports[0], 60_000)
+    raise LidarError(
+        f"{stream.name} and {other.name} would both send to {host}:{min(shared)}. Specify a "
+        f"port for each of them, such as `--to {stream.name}={host}:{port} --to "
+        f"{other.name}={host}:{port + 100}`."
+    )
+
+
+class Transmitter:
+    """The process that sends the datagrams of streams, and their services: a context manager.
+
+    How late they were is written to the file `lateness`, if it is given, as JSON.
+    """
+
+    def __init__(
+        self, streams: Sequence[Stream], note: Callable[[str], None], lateness: Path | None = None
+    ) -> None:
+        self.sender = Sender(note)
+        self._streams = streams
+        self._lateness_file = lateness
+        self._services: list[str] = []  # descriptions
+        self._stack = ExitStack()
+
+    @property
+    def description(self) -> str:
+        """Where the datagrams go, and what answers."""
+        return "; ".join([*(stream.describe() for stream in self._streams), *self._services])
+
+    @property
+    def summary(self) -> str:
+        """What was sent, and how late, once the context has ended."""
+        return f"{self.sender.lateness}."
+
+    def __enter__(self) -> Self:
+        self._write_lateness()  # a file that cannot be written is refused before it matters
+        with ExitStack() as stack:
+            stack.enter_context(self.sender)
+            for number, stream in enumerate(self._streams):
+                redirect = partial(self._redirect, number)
+                service = stream.make_service(str(stream.address), stream.destination, redirect)
+                if service is not None:
+                    service.names |= {stream.address.name} - {""}
+                    stack.enter_context(service)
+                    self._services.append(service.description)
+                elif stream.api_given:
+                    raise LidarError(
+                        f"`--api` cannot be used with {stream.model}, because no HTTP or command "
+                        "interface is simulated for this sensor. Remove `--api`."
+                    )
+                self.sender.redirect(number, stream.destination, stream.source_address)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.__exit__(None, None, None)
+        self._write_lateness()
+
+    def _write_lateness(self) -> None:
+        """Write how late datagrams were.
+
+        Raises LidarError if the file cannot be written.
+        """
+        file = self._lateness_file
+        if file is not None:
+            with explained(f"{file} cannot be written"):
+                text = json.dumps(self.sender.lateness.to_json(), indent=1) + "\n"
+                file.write_text(text, encoding="utf-8")
+
+    def _redirect(self, number: int, destination: Destination) -> None:
+        """Send the datagrams of a stream elsewhere, for its service."""
+        stream = replace(self._streams[number], destination=destination)
+        with suppress(LidarError):  # the next packets raise it
+            self.sender.redirect(number, destination, stream.source_address)

@@ -1,0 +1,1 @@
+"""Processes on a machine: forking, shared memory, output streams, logs and tracing."""

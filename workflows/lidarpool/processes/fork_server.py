@@ -1,0 +1,72 @@
+"""Start and stop the process that forks the workers of a local cluster.
+
+A spawned worker imports Dask, NumPy and lidarpool, which takes about one second of CPU time. The
+fork server imports them once, while the driver continues. It then forks each worker in about
+20 ms, including workers that are restarted.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from multiprocessing import forkserver
+from typing import Any
+
+from lidarsim.environment.interrupts import children_spared
+
+# Numerical libraries are limited to one thread, because workers share the cores and threads do not
+# survive a fork.
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# Values of M_TRIM_THRESHOLD (-1) and M_MMAP_THRESHOLD (-3), the options of glibc's mallopt.
+_THRESHOLDS = {-1: 256 << 20, -3: 256 << 20}
+
+
+def start_fork_server() -> bool:
+    """Start the fork server and return True, or return False if forking is not supported.
+
+    The fork server exits after this process and all workers have exited. Forking is only supported
+    on Linux, because the system libraries of macOS do not work in forked processes.
+    """
+    if sys.platform != "linux":
+        return False
+    server: Any = forkserver._forkserver
+    preload = server._preload_modules
+    environment = dict(os.environ)
+    server.set_forkserver_preload(
+        ["lidarpool.processes.rare_collections", "lidarpool.run.pipeline.forked"]
+    )
+    os.environ.update(_ENVIRONMENT)
+    try:
+        with children_spared():
+            server.ensure_running()
+    finally:
+        server.set_forkserver_preload(preload)
+        os.environ.clear()
+        os.environ.update(environment)
+    return True
+
+
+def keep_freed_memory() -> None:
+    """Let this process and its forks keep the memory of large arrays after they are freed.
+
+    By default, glibc returns this memory to the system, and the next large array causes page
+    faults. Rendering pictures spent an eighth of its time on such page faults.
+    """
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # only in glibc
+        for option, size in _THRESHOLDS.items():
+            mallopt(option, size)
+
+
+def stop_fork_server() -> None:
+    """Kill the fork server and wait until it has exited.
+
+    The CPU time of the server and its workers is then included in the CPU time that the system
+    reports for the children of this process.
+    """
+    server: Any = forkserver._forkserver
+    if server._forkserver_pid is not None:
+        # Without the signal, the server would wait until the last worker exits.
+        os.kill(server._forkserver_pid, signal.SIGKILL)
+        server._stop()

@@ -1,0 +1,209 @@
+"""Pictures of a twin: a held-out sweep beside its simulation, the place, and errors on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
+from lidarview.render import theme
+from lidarview.render.picture_page import Page, label_logarithms
+
+from ..clouds.rings import elevations
+from .alignment import AlignedSweep, AlignedSweeps
+from .reflectances import Reflectances
+from .surface_map import Place
+
+_WIDTH = 1600
+_LEFT = 0.075
+_CHART_WIDTH = 0.77
+_IMAGE_HEIGHT = 190
+_GAP = 62
+_ABOVE_HEIGHT = 1000
+_ABOVE_FRAME = (_LEFT, 0.09, 0.86, 0.76)  # left, bottom, width and height, shares of the page
+_TOP = 150
+_BOTTOM = 90
+_COLUMNS = 720  # of the images, at most: 0.5° each
+_ROWS = 64  # of the images of a sensor without rings
+_DIFFERENCE_M = 0.1  # end of the scale of differences
+STANDING_DOTS = 150_000
+_MOVED_DOTS = 40_000
+_NO_RETURN = theme.rgb("#c8cbd0")
+_MOVED_COLOR = "#d7301f"
+_PATH_COLOR = "#08519c"
+
+
+class _Image(NamedTuple):
+    """A picture of the values of a sweep."""
+
+    words: str
+    values: Floats32  # (r, c)
+    scale: Any  # of Matplotlib
+    colors: str  # name of a color map
+
+
+class SweepImages(NamedTuple):
+    """Images (r, c) of a sweep by ring and azimuth, recorded and in the twin; NaN for no return."""
+
+    number: Ints  # (1,): of the sweep
+    range_m: Floats32
+    simulated_m: Floats32
+    intensity: Floats32 | None
+    simulated_intensity: Floats32 | None
+
+    @classmethod
+    def of_sweep(
+        cls, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None, number: int
+    ) -> SweepImages:
+        """Make the images of a sweep and of its rays in a place."""
+        sweep = sweeps.read(number)
+        cells = _cells(sweep, sweeps)
+        seen = place.see(sweep)
+        simulated_m = np.full(len(sweep.points), np.nan)
+        simulated_m[seen.rays] = seen.distance_m
+        range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))
+        if reflectances is None or sweep.intensities is None:
+            return cls(np.array([number]), range_m, in_twin_m, None, None)
+        simulated = reflectances.intensities(sweep, seen)
+        intensity, in_twin = (_image(values, cells) for values in (sweep.intensities, simulated))
+        return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
+
+    def pictures(self) -> list[_Image]:
+        """Return the pictures to draw."""
+        near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
+        ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
+        differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
+        words = f"difference up to {1000 * _DIFFERENCE_M:.0f} mm (red: reconstruction is farther)"
+        images = [
+            _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLORS),
+            _Image("range, reconstructed", self.simulated_m, ranges, theme.RANGE_COLORS),
+            _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
+        ]
+        if self.intensity is not None and self.simulated_intensity is not None:
+            scale = Normalize(0, max(float(np.nanquantile(self.intensity, 0.98)), 1e-9))
+            images.append(_Image("intensity, recorded", self.intensity, scale, "gray"))
+            images.append(
+                _Image("intensity, reconstructed", self.simulated_intensity, scale, "gray")
+            )
+        return images
+
+
+class Above(NamedTuple):
+    """Some points of some sweeps, in the world."""
+
+    still: Floats32  # (n, 2): of what stands, meters
+    moved: Floats32  # (k, 2)
+
+    @classmethod
+    def of_sweeps(
+        cls, sweeps: AlignedSweeps, standing: Mapping[int, Bools], numbers: Ints, share: float
+    ) -> Above:
+        """Choose a share of the points of some sweeps."""
+        still: list[Floats] = []
+        moved: list[Floats] = []
+        for number in numbers.tolist():
+            mask = standing[number]
+            world = sweeps.read(number).world[:, :2]
+            chosen = np.random.default_rng(number).random(len(world)) < share
+            still.append(world[mask & chosen])
+            moved.append(world[~mask][:_MOVED_DOTS])
+        parts = (np.concatenate(points).astype(np.float32) for points in (still, moved))
+        return cls(*parts)
+
+
+def draw_sweep(sweep: SweepImages) -> Page:
+    """Draw ranges and intensities of a sweep, recorded and in the twin, and their differences."""
+    images = sweep.pictures()
+    height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
+    page = Page((_WIDTH, height))
+    page.title(f"Sweep {int(sweep.number[0])}", "held out from the reconstruction")
+    for index, one in enumerate(images):
+        bottom = height - _TOP - (index + 1) * _IMAGE_HEIGHT - index * _GAP
+        frame = (_LEFT, bottom / height, _CHART_WIDTH, _IMAGE_HEIGHT / height)
+        axes = page.chart(frame, ylabel="ring")
+        known = np.nan_to_num(one.values, nan=1.0)
+        drawn = theme.apply_colormap(one.colors, np.asarray(one.scale(known).data))
+        drawn[~np.isfinite(one.values)] = _NO_RETURN
+        extent = (180, -180, one.values.shape[0] - 0.5, -0.5)
+        axes.imshow(drawn[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
+        axes.grid(False)
+        page.heading(axes, one.words)
+    axes.set_xlabel("azimuth, °")
+    return page
+
+
+def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int, int]]:
+    """Return the cells (n,) of the points of a sweep in an image, and the image's shape."""
+    row_count = sweeps.recorded.ring_count
+    row = sweep.ring
+    if not len(sweeps.recorded.elevation_rad):
+        elevation = elevations(sweep.points)
+        low, high = np.quantile(elevation, (0, 1))
+        row_count = _ROWS
+        share = (high - elevation) / max(high - low, 1e-9)
+        row = (share * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
+    # More columns than a ring has pulses would leave stripes.
+    column_count = min(_COLUMNS, int(np.bincount(row).max()))
+    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
+    column = (turns * column_count).astype(np.int64) % column_count
+    return row * column_count + column, (row_count, column_count)
+
+
+def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
+    """Return the image (r, c) of values (n,): the last value of each cell, or NaN."""
+    cell, shape = cells
+    image = np.full(shape[0] * shape[1], np.nan, np.float32)
+    image[cell] = values
+    return image.reshape(shape)
+
+
+def draw_above(parts: Sequence[Above], path: Floats) -> Page:
+    """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
+    page = Page((_WIDTH, _ABOVE_HEIGHT))
+    page.title(
+        "Top view", "gray: stationary points; red: points removed because rays passed through them"
+    )
+    near = np.concatenate([part.still for part in parts])
+    moved = np.concatenate([part.moved for part in parts])
+    low, high = np.quantile(near, (0.01, 0.99), axis=0)
+    # A meter is as long in x as in y.
+    sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
+    half = ((high - low) / sides).max() * sides / 2
+    axes = page.map_chart(_ABOVE_FRAME, (low + high) / 2 + [-half, half])
+    for points, color, size, most in (
+        (near, theme.UNSEEN, 1.0, STANDING_DOTS),
+        (moved, _MOVED_COLOR, 1.6, _MOVED_DOTS),
+    ):
+        some = points[:: max(-(-len(points) // most), 1)]
+        dots = size * page.unit**2
+        axes.scatter(some[:, 0], some[:, 1], c=color, s=dots, lw=0, rasterized=True)
+    axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOR, lw=1.6 * page.unit)
+    return page
+
+
+def draw_errors(figures: Mapping[str, Any]) -> Page:
+    """Draw the differences of ranges along the drive, and by range."""
+    page = Page((_WIDTH, 560))
+    page.title(
+        "Range differences",
+        "absolute values in held-out sweeps; dots: medians; bars: 90th percentiles",
+    )
+    rows = (
+        (figures["held_out"]["by_sweep"], "sweep", "sweep"),
+        (figures["held_out"]["by_range"], "from_m", "range from, m"),
+    )
+    for index, (entries, key, label) in enumerate(rows):
+        axes = page.chart((_LEFT + 0.46 * index, 0.17, 0.38, 0.56), xlabel=label, ylabel="mm")
+        known = [entry for entry in entries if entry["median_abs_difference_m"] is not None]
+        x = [entry[key] for entry in known]
+        half = [1000 * entry["median_abs_difference_m"] for entry in known]
+        most = [1000 * entry["p90_abs_difference_m"] for entry in known]
+        axes.vlines(x, half, most, color=theme.UNSEEN, lw=1.8 * page.unit)
+        axes.plot(x, half, "o", color=theme.OBJECT_COLORS[0], ms=4 * page.unit, mew=0)
+        axes.set_yscale("log")
+        if known:
+            label_logarithms(axes.yaxis, max(most) < 1000 * min(half))
+    return page

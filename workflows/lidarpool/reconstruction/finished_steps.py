@@ -1,0 +1,139 @@
+"""Results of the steps of a twin, kept in a folder until the twin is written.
+
+A step is done for each stretch of the drive, or once. What is done is read again, so the memory of
+a drive is that of a stretch, and a command that was killed goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim._version import __version__
+from lidarsim.errors import LidarError, explained
+
+from ..identity.fingerprint import fingerprint
+
+STEPS_FOLDER = ".lidarpool-twin"
+_OF_FILE = "of.json"  # of what the steps are results
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+class TwinStep(NamedTuple):
+    """What a step is called, and the classes of the arrays that it returns."""
+
+    name: str
+    kinds: tuple[type, ...]  # NamedTuples or dataclasses whose fields are arrays or None
+
+
+@dataclass(frozen=True)
+class FinishedSteps:
+    """The folder of the results of steps."""
+
+    folder: Path
+
+    @classmethod
+    def begin(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
+        """Make the folder, or go on with one whose steps were `made_of` the same.
+
+        LidarError if the folder has steps of something else, or `resume` is not given.
+        """
+        own = {"lidarpool": __version__, "made_of": fingerprint(made_of)}
+        file = folder / _OF_FILE
+        if file.exists():
+            if not resume:
+                raise LidarError(
+                    f"{folder.parent} contains an unfinished reconstruction. Continue it with "
+                    "`--resume`, or start again with `--overwrite`."
+                )
+            if json.loads(file.read_text(encoding="utf-8")) != own:
+                raise LidarError(
+                    f"{folder.parent} contains an unfinished reconstruction of another "
+                    "recording, or one with other options or from another version of "
+                    "lidarpool. Start again with `--overwrite`."
+                )
+            return cls(folder)
+        with explained(f"Cannot write to {folder.parent}", "choose another folder"):
+            folder.mkdir(parents=True, exist_ok=True)
+            _replace(file, lambda path: path.write_text(json.dumps(own), encoding="utf-8"))
+        return cls(folder)
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def each(
+        self, step: TwinStep, run: Map, function: Callable[[Any], Any], items: Sequence[Any]
+    ) -> Iterator[tuple[Any, ...]]:
+        """Yield what a function returns for each item: of earlier calls, or called by `run`.
+
+        The function returns a record, or None, for each of the step's kinds.
+        """
+        done = [self._file(step, index).exists() for index in range(len(items))]
+        results = iter(
+            run(function, [item for item, known in zip(items, done, strict=True) if not known])
+        )
+        for index, is_known in enumerate(done):
+            if not is_known:
+                self._save(step, index, next(results))
+            yield self.load(step, index)
+
+    def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
+        """Return what a call returns: of an earlier call, or of this."""
+        if not self._file(step, 0).exists():
+            self._save(step, 0, call())
+        return self.load(step, 0)
+
+    def load(self, step: TwinStep, index: int) -> tuple[Any, ...]:
+        """Return the records of a step for an item."""
+        with np.load(self._file(step, index)) as arrays:
+            return tuple(
+                _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
+            )
+
+    def _file(self, step: TwinStep, index: int) -> Path:
+        return self.folder / f"{step.name}-{index:05d}.npz"
+
+    def _save(self, step: TwinStep, index: int, records: Sequence[Any]) -> None:
+        arrays = {
+            f"{number}.{name}": getattr(record, name)
+            for number, record in enumerate(records)
+            if record is not None
+            for name in _names(type(record))
+            if getattr(record, name) is not None
+        }
+
+        def write(path: Path) -> None:
+            with path.open("wb") as file:
+                np.savez(file, **arrays)
+
+        with explained(f"Cannot write to {self.folder}", "free some disk space"):
+            _replace(self._file(step, index), write)
+
+
+def _record(kind: type, prefix: str, arrays: Any) -> Any:
+    """Return the record of a kind among arrays, or None."""
+    found = {name: arrays.get(prefix + name) for name in _names(kind)}
+    return None if all(value is None for value in found.values()) else kind(**found)
+
+
+def _names(kind: type) -> list[str]:
+    """Return the names of the fields of a record."""
+    if is_dataclass(kind):
+        return [field.name for field in fields(kind)]
+    names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
+    return [*names]
+
+
+def _replace(file: Path, write: Callable[[Path], Any]) -> None:
+    """Write a file whole, or not at all."""
+    part = file.with_name(f"{file.name}.part")
+    write(part)
+    Path(part).replace(file)

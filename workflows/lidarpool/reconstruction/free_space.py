@@ -1,0 +1,116 @@
+"""What stands: points through which rays of other sweeps pass are not part of the place.
+
+The rays of a sweep are a range image. A point of another sweep is in front of the surfaces that the
+image has around its direction, or among them, or behind them. In front: a ray of the image passed
+where the point was, so the point was on something that moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
+
+from ..clouds.rings import elevations
+from .alignment import AlignedSweeps
+
+_COLUMNS = 1024  # of an image: wider than the step of azimuth of nearly all sensors
+_ROW_RAD = np.radians(0.5)  # of an image of a sensor without rings
+_MARGIN_RAD = 0.003  # above the highest and below the lowest ring: divergence of a beam
+# Distance of a point in front of the surfaces around its direction: at least, and for each meter.
+_TOLERANCE_M = 0.2
+_TOLERANCE_PER_M = 0.01
+# Sweeps before and after a sweep that are asked, in numbers of sweeps.
+_OFFSETS = (1, 2, 3, 5, 8, 13, 21, 34)
+_MIN_PASSING = 2  # as many passing rays as confirming ones are enough from here on
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Nearest and farthest surfaces of a sweep around each direction.
+
+    A direction's surroundings are three rows and three columns: the beams are wide, and a point
+    beside an edge is neither in front nor behind.
+    """
+
+    edges_rad: Floats  # (r - 1,): negated elevations between the rows, ascending
+    limits_rad: tuple[float, float]  # lowest and highest elevation of its rays
+    nearest_m: Floats32  # (r, c): inf without a return
+    farthest_m: Floats32  # (r, c): -inf without a return
+
+    @classmethod
+    def of_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
+        """Make the image of points (n, 3) in the sensor frame, with rows (r,), highest first."""
+        from scipy.ndimage import maximum_filter, minimum_filter
+
+        edges_rad = -(row_elevation_rad[1:] + row_elevation_rad[:-1]) / 2
+        shape = (len(row_elevation_rad), _COLUMNS)
+        cells = _cells(points, edges_rad)
+        range_m = np.linalg.norm(points, axis=1).astype(np.float32)
+        nearest = np.full(shape, np.inf, np.float32)
+        farthest = np.full(shape, -np.inf, np.float32)
+        np.minimum.at(nearest, cells, range_m)
+        np.maximum.at(farthest, cells, range_m)
+        modes = ("nearest", "wrap")
+        limits = row_elevation_rad[-1] - _MARGIN_RAD, row_elevation_rad[0] + _MARGIN_RAD
+        return cls(
+            edges_rad,
+            (float(limits[0]), float(limits[1])),
+            minimum_filter(nearest, 3, mode=modes),
+            maximum_filter(farthest, 3, mode=modes),
+        )
+
+    def judge(self, points: Floats) -> tuple[Bools, Bools]:
+        """Return which points (n, 3) in the sensor frame rays pass, and which they confirm."""
+        elevation = elevations(points)
+        cells = _cells(points, self.edges_rad)
+        range_m = np.linalg.norm(points, axis=1)
+        tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * range_m
+        nearest = self.nearest_m[cells]
+        low, high = self.limits_rad
+        seen = np.isfinite(nearest) & (elevation > low) & (elevation < high)
+        passing = seen & (nearest > range_m + tolerance_m)
+        behind = self.farthest_m[cells] < range_m - tolerance_m
+        return passing, seen & ~passing & ~behind
+
+
+def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
+    """Return the rows and columns (n,) of points (n, 3) in an image."""
+    turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    rows = np.searchsorted(edges_rad, -elevations(points))
+    return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
+
+
+def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
+    """Return a mask of the points of each sweep that stand: {number: (n,)}.
+
+    `numbers` name the sweeps that are compared with each other, ascending.
+    """
+    row_elevation_rad = sweeps.recorded.elevation_rad
+    if not len(row_elevation_rad):
+        elevation = np.concatenate([elevations(sweeps.read(number).points) for number in numbers])
+        high = float(elevation.max())
+        row_elevation_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
+    images = {
+        number: RangeImage.of_points(sweeps.read(number).points, row_elevation_rad)
+        for number in numbers
+    }
+    masks = {}
+    for index, number in enumerate(numbers):
+        world = sweeps.read(number).world
+        passing = np.zeros(len(world), np.int64)
+        confirming = np.zeros(len(world), np.int64)
+        for offset in (*_OFFSETS, *(-offset for offset in _OFFSETS)):
+            if not 0 <= index + offset < len(numbers):
+                continue
+            other = numbers[index + offset]
+            pose = sweeps.alignment.poses[other]
+            passed, confirmed = images[other].judge((world - pose[:3, 3]) @ pose[:3, :3])
+            passing += passed
+            confirming += confirmed
+        moved = (passing > confirming) | ((passing >= _MIN_PASSING) & (passing >= confirming))
+        masks[number] = ~moved
+    return masks

@@ -1,0 +1,71 @@
+"""Processes that rebuild the stretches of a drive: of a cluster, of this machine, or this one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, nullcontext
+from functools import partial
+from typing import Any
+
+import dask
+from dask.system import CPU_COUNT
+from distributed import Client
+
+import poolpart.deploy
+from lidarsim.io.allowance import memory
+from poolpart import Partition
+from poolpart.deploy import forked_workers
+
+from ..processes.fork_server import start_fork_server
+from ..run.cluster.connection import check_starts_workers
+from ..run.pipeline.stage_names import OTHER
+from .finished_steps import Map
+
+_STRETCH_BYTES = 3 << 30  # that a process takes for a stretch, of a sensor with 64 rings
+# Dask would stop processes that take more than their share of the memory, and so would lose them.
+_UNLIMITED = dict.fromkeys(
+    (f"distributed.worker.memory.{limit}" for limit in ("target", "spill", "pause", "terminate")),
+    False,
+)
+
+
+@contextmanager
+def mapping(client: Client | None, count: int) -> Iterator[Map]:
+    """Yield a `map` function that runs in worker processes and keeps the order of the items.
+
+    Parameters
+    ----------
+    client
+        Client of a cluster whose OTHER workers run the function. None to start processes on this
+        machine.
+    count
+        Maximum number of items. A single item is processed in this process.
+
+    Raises
+    ------
+    LidarError
+        If this process cannot start worker processes.
+    """
+    workers = min(count, CPU_COUNT, max(1, memory() // _STRETCH_BYTES))
+    if client is not None:
+        yield partial(_map, Partition(OTHER, client))
+    elif workers == 1:
+        yield map
+    else:
+        check_starts_workers()
+        forks = start_fork_server()
+        with (
+            dask.config.set(_UNLIMITED),
+            forked_workers() if forks else nullcontext(),
+            closing(
+                poolpart.deploy.local_cluster({OTHER: (workers, 1)}, dashboard_port=None)
+            ) as cluster,
+            Client(cluster, set_as_default=False) as own,
+        ):
+            yield partial(_map, Partition(OTHER, own))
+
+
+def _map(
+    partition: Partition, function: Callable[[Any], Any], items: Iterable[Any]
+) -> Iterable[Any]:
+    return partition.map(function, items, chunk=1)

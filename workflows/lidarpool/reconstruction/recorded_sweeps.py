@@ -1,0 +1,306 @@
+"""Sweeps of a recording with the columns that a reconstruction requires.
+
+Worker processes read them, too. `RecordedSweeps.read` describes the columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.column_names import STRENGTHS, TIMES
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import AnyArray, Floats
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.words import plural
+
+from ..clouds.point_times import PointTimes
+from ..clouds.recording import Recording
+from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
+from ..recordings.opening import open_recording
+from .labels import labels_of
+
+_COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # columns that are used
+_GAP_RAD = np.radians(0.5)  # angle between rays over many sweeps, for sensors without rings
+_REFERENCE_SWEEPS = 5  # sweeps from which the rotation is determined
+_MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rings
+_MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
+
+RecordingFile = tuple[Path, str | None, str | None]  # path, sensor or topic, intensity column
+
+
+@lru_cache(maxsize=1)
+def _opened(file: RecordingFile) -> Recording:
+    return open_recording(*file, name="the recording")
+
+
+class Rotation(NamedTuple):
+    """Rotation of a sensor."""
+
+    is_clockwise: bool
+    start_deg: float  # azimuth at the start of a sweep, 0 to 360
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSweeps:
+    """The sweeps of a recording, which are read one at a time.
+
+    Rings, times and timestamps are stored here, so that other processes do not have to determine
+    them again.
+
+    Attributes
+    ----------
+    source
+        Path, sensor and intensity column of a recording, which each process opens once, or a
+        recording in memory, which cannot be sent to other processes.
+    rings
+        Rings of the sensor, which are empty for a sensor without rings.
+    point_times
+        Unit and clock of the point times, or None if the points have no times.
+    stamps_s
+        Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
+    """
+
+    source: RecordingFile | Recording
+    rings: Rings
+    point_times: PointTimes | None
+    stamps_s: Floats | None
+    _kept: dict[int, Sweep] = field(default_factory=dict)
+
+    @classmethod
+    def open(
+        cls, path: Path, sensor: str | None = None, intensity: str | None = None
+    ) -> RecordedSweeps:
+        """Open a recording, or raise LidarError if it cannot be read."""
+        file = (path, sensor, intensity)
+        return replace(cls.from_recording(_opened(file)), source=file)
+
+    @classmethod
+    def from_recording(cls, recording: Recording) -> RecordedSweeps:
+        """Determine the rings and times of a recording.
+
+        Raises LidarError if the recording has no sweeps or no points.
+        """
+        if recording.is_cloud or not len(recording):
+            raise LidarError(
+                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
+            )
+        rings = recording.rings
+        if not len(rings) and not rings.note and not _has_points(recording):
+            raise LidarError(
+                f"{recording.name} contains no points, so there is nothing to reconstruct."
+            )
+        return cls(recording, rings, recording.point_times, _stamps_s(recording))
+
+    @property
+    def recording(self) -> Recording:
+        """The recording, which each process opens once."""
+        return self.source if isinstance(self.source, Recording) else _opened(self.source)
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes for the user on information that the recording lacks."""
+        notes = [self.rings.note]
+        if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
+            notes.append(self.point_times.note(self.recording.name))
+        return [note for note in notes if note]
+
+    @property
+    def count(self) -> int:
+        """Number of sweeps."""
+        return len(self.recording)
+
+    @property
+    def elevation_rad(self) -> Floats:
+        """Median elevations of the rings from the highest to the lowest, of shape (r,)."""
+        return self.rings.elevation_rad
+
+    @property
+    def ring_count(self) -> int:
+        """Number of rings, which is 1 for a sensor without rings."""
+        return max(len(self.rings), 1)
+
+    @property
+    def gap_rad(self) -> float:
+        """Typical angle between the rays of neighboring rings in radians."""
+        if len(self.rings) < MIN_RINGS:
+            return _GAP_RAD
+        return float(np.median(-np.diff(self.elevation_rad)))
+
+    @property
+    def is_compensated(self) -> bool:
+        """Whether the points are known to be motion-compensated, as in results of lidarpool."""
+        return self.recording.fired is not None
+
+    def keeping(self, numbers: Iterable[int]) -> RecordedSweeps:
+        """Return a copy that holds some sweeps in memory.
+
+        `numbers` are in ascending order, because bags can only be read from their start.
+        """
+        return replace(self, _kept={number: _compact(self.read(number)) for number in numbers})
+
+    def read(self, number: int) -> Sweep:
+        """Read the returns of a sweep whose rings are known.
+
+        Raises LidarError if the recording cannot be read.
+
+        The sweep has the following columns. All except `row` are omitted if they are unknown, and
+        `time_s` and `start_rad` are also omitted if the points are known to be compensated.
+
+        - `row`: index of the ring in `rings`, or 0 for a sensor without rings.
+        - `intensity`: on the scale of the recording.
+        - `label`: see `labels_of`.
+        - `time_s`: time relative to the timestamp of the sweep, which may be that of its last
+          point.
+        - `start_rad`: azimuth at which the ring of the point starts.
+        """
+        sweep = _wide(self._kept[number]) if number in self._kept else self._read(number)
+        if not len(self.rings) or self.is_compensated:
+            return sweep
+        starts_rad = ring_starts(sweep, self.ring_count)
+        return sweep.with_columns(**sweep.columns, start_rad=starts_rad[sweep.columns["row"]])
+
+    def _read(self, number: int) -> Sweep:
+        returns = self._returns(number)
+        row = self.rings.ring_indices(returns)
+        intensity = returns.intensity
+        sweep = Sweep(returns.points).with_columns(
+            row=row.clip(min=0),
+            intensity=None if intensity is None else np.asarray(intensity, np.float64),
+            label=labels_of(returns),
+            time_s=None if self.is_compensated else self._times_s(number, returns),
+        )
+        known = row >= 0
+        return sweep if known.all() or not len(self.rings) else sweep.select(known)
+
+    def _returns(self, number: int) -> Sweep:
+        """Read the returns of a sweep with the columns that are used."""
+        sweep = self.recording[number]
+        used = {name: values for name, values in sweep.columns.items() if name in _COLUMNS}
+        return sweep.with_columns(**used).returns()
+
+    def _times_s(self, number: int, returns: Sweep) -> Floats | None:
+        """Return the times (n,) of the points of a sweep relative to its timestamp, or None."""
+        if self.point_times is None:
+            return None
+        stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
+        if len(returns) and not returns.columns:
+            return None  # `of_points` cannot count the points
+        return self.point_times.relative_times(returns.columns, stamp_s)
+
+    def rotation(self, period_s: float, first_s: float) -> Rotation | None:
+        """Determine the rotation from the times and azimuths of points, or return None.
+
+        A revolution takes `period_s` and starts at `first_s` relative to the timestamp. The start
+        azimuth is a mean over rings and sweeps. Motion compensation hardly affects it, because it
+        shifts azimuths to the left and to the right.
+        """
+        sums = np.zeros(2, complex)
+        count = 0
+        for number in even_indices(self.count, _REFERENCE_SWEEPS).tolist():
+            returns = self._returns(number)
+            times_s = self._times_s(number, returns)
+            if times_s is None or not len(returns):
+                continue
+            azimuth = np.arctan2(returns.points[:, 1], returns.points[:, 0])
+            rotation_rad = 2 * np.pi * (times_s - first_s) / period_s
+            sums += [np.exp(1j * (azimuth - sign * rotation_rad)).sum() for sign in (1, -1)]
+            count += len(returns)
+        best = int(np.abs(sums).argmax())
+        if np.abs(sums[best]) <= _MIN_AGREEMENT * count:
+            return None
+        return Rotation(best == 1, float(np.degrees(np.angle(sums[best])) % 360))
+
+    def starts(self, *, is_clockwise: bool) -> Rotation:
+        """Determine the rotation from the azimuths at which rings start, given its direction."""
+        numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
+        starts_rad = [ring_starts(self.read(number), self.ring_count) for number in numbers]
+        mean = float(np.angle(np.exp(1j * np.stack(starts_rad)).sum()))
+        return Rotation(is_clockwise, float(np.degrees(mean) % 360))
+
+    def cone_spread_rad(self, number: int) -> float:
+        """Return how far the rings of a sweep deviate from cones, or inf if it has no points."""
+        sweep = self.read(number)
+        if not len(sweep):
+            return float("inf")
+        return summarize_rings(sweep.columns["row"], elevations(sweep.points))[2]
+
+
+def ring_starts(sweep: Sweep, ring_count: int) -> Floats:
+    """Return the azimuths (r,) in radians at which the rings of a sweep start.
+
+    The points are in the order of the recording, so a ring starts at its first point. In some
+    sensors, the azimuths of the lasers differ by several degrees. If the first pulses of a ring
+    have no return, for example in the sky, the start of most rings is used.
+    """
+    if not len(sweep):
+        return np.zeros(ring_count)
+    row = sweep.columns["row"]
+    firsts = np.full(ring_count, -1)
+    firsts[row[::-1]] = np.arange(len(row))[::-1]  # the last assignment remains
+    present = np.flatnonzero(firsts >= 0)
+    points = sweep.points[firsts[present]]
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    apart = np.abs((azimuth[:, None] - azimuth + np.pi) % (2 * np.pi) - np.pi)
+    together = apart < _MAX_START_RAD
+    common = int(together.sum(axis=1).argmax())
+    starts = np.full(ring_count, azimuth[common])
+    starts[present[together[common]]] = azimuth[together[common]]
+    return starts
+
+
+def _compact(sweep: Sweep) -> Sweep:
+    """Return a sweep that uses half as much memory."""
+    columns = {name: values for name, values in sweep.columns.items() if name != "start_rad"}
+    columns["row"] = columns["row"].astype(np.int16)
+    if "intensity" in columns:
+        columns["intensity"] = _exact32(columns["intensity"])
+    return Sweep(_exact32(sweep.points), columns)
+
+
+def _wide(sweep: Sweep) -> Sweep:
+    """Return a compact sweep in double precision."""
+    columns = {**sweep.columns, "row": sweep.columns["row"].astype(np.int64)}
+    if "intensity" in columns:
+        columns["intensity"] = columns["intensity"].astype(np.float64)
+    return Sweep(sweep.points.astype(np.float64), columns)
+
+
+def _exact32(values: AnyArray) -> AnyArray:
+    """Return values in single precision if they can be represented exactly."""
+    single = values.astype(np.float32)
+    return single if np.array_equal(single, values, equal_nan=True) else values
+
+
+def _has_points(recording: Recording) -> bool:
+    """Return whether any of the reference sweeps has points."""
+    numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
+    return any(len(recording.read_fired(number)) for number in numbers)
+
+
+def _stamps_s(recording: Recording) -> Floats | None:
+    """Return the timestamps (s,) of the sweeps of a recording in seconds, or None without any."""
+    if recording.stamps_ns is None:
+        return None
+    stamps_s = 1e-9 * recording.stamps_ns
+    if len(stamps_s) != len(recording):
+        raise LidarError(
+            f"{recording.name} has {plural(len(recording), 'sweep')}, but only "
+            f"{len(stamps_s):,} can be read. Repair the file, or record it again."
+        )
+    backward = np.flatnonzero(np.diff(stamps_s) <= 0)
+    if len(backward):
+        number = int(backward[0])
+        raise LidarError(
+            f"The timestamps of {recording.name} do not increase: sweep {number:,} is at "
+            f"{stamps_s[number]:.6f} s, and sweep {number + 1:,} is at "
+            f"{stamps_s[number + 1]:.6f} s. Remove repeated sweeps, and sort the others by "
+            "timestamp."
+        )
+    return stamps_s

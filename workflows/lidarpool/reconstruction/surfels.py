@@ -1,0 +1,240 @@
+"""Surfels of the points of many sweeps, as large as the gaps between the rays of the sensor.
+
+A lidar sees a surface in lines: points of a ring are close to each other, and rings are far apart.
+The twelve nearest points of a point are often on one line, which has no plane. Then more points are
+asked, until lines of other rings and sweeps are among these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.errors import LidarError
+from lidarsim.io.allowance import bytes_of, memory
+from lidarsim.numerics.arrays import AnyFloats, Bools, Floats, Ints
+from lidarsim.scene.colors import join_colors
+from lidarsim.scene.face_materials import join_materials
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from ..scenario.point_files import POINT_BYTES
+from ..scenario.point_scene import PointVoxels, surfel_faces, surfel_materials
+
+_NEIGHBORS = (12, 32, 80)  # of which the first number that is no line counts
+_MIN_WIDTH = 0.1  # smaller over larger variance within a plane: less is a line
+_EXTENT = 0.85  # half of a side over the standard deviation of the neighbors
+_MAX_HALF_VOXELS = 3  # that half a side is long, beside the gaps between rays
+_MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
+_PLANE_GAPS = 0.55  # half a side, across the rings, over the gap between rays on a plane
+_MAX_RADII = 1.0  # the same over the distance of the farthest neighbor, at most
+_MAX_GAPS = 1.0  # half a side over the gap between rays elsewhere, at most
+_MIN_COSINE = 0.1  # of the incidence, by which gaps grow
+_BLOCK = 1 << 16  # surfels at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Surfels, each two triangles in turn."""
+
+    mesh: SceneMesh
+    dark: Bools  # (m,): of surfaces that return nothing, such as windows
+
+    def __len__(self) -> int:
+        return len(self.mesh.faces) // 2
+
+    @cached_property
+    def centers(self) -> Floats:
+        """Middles of the surfels, (m, 3), meters."""
+        return surfel_centers(self.mesh)
+
+    @cached_property
+    def normals(self) -> Floats:
+        """Unit normals of the surfels, (m, 3)."""
+        corners = self.mesh.vertices.reshape(-1, 4, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray(normals / np.maximum(lengths, 1e-12))
+
+    def part(self, rows: Bools) -> Surfels:
+        """Return selected surfels."""
+        mesh = self.mesh
+        vertices = mesh.vertices.reshape(-1, 4, 3)[rows].reshape(-1, 3)
+        faces = surfel_faces(int(rows.sum()))
+        both = np.flatnonzero(rows.repeat(2))
+        materials = None if mesh.materials is None else mesh.materials.take(both)
+        return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
+
+    def moved(self, shifts_m: Floats) -> Surfels:
+        """Return the surfels moved along their normals by shifts (m,), meters."""
+        offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
+        return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
+
+    def with_dark(self, others: Surfels) -> Surfels:
+        """Return these surfels, and others that return nothing."""
+        dark = np.append(self.dark, np.ones(len(others), bool))
+        return Surfels(joined_surfels([self.mesh, others.mesh]), dark)
+
+    @staticmethod
+    def are_enough(points: Floats, voxel_m: float) -> bool:
+        """Whether points (n, 3) make surfels: they are in enough voxels."""
+        cells = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)
+        return len(cells) > 2 * _NEIGHBORS[-1]
+
+    @classmethod
+    def of_points(
+        cls,
+        name: str,
+        points: Floats,
+        outward: AnyFloats,
+        voxel_m: float,
+        gap_rad: float,
+        labels: Ints | None = None,
+    ) -> Surfels:
+        """Make surfels of the means of points in voxels.
+
+        Parameters
+        ----------
+        name
+            Of the mesh, and in messages.
+        points
+            Positions of shape (n, 3), in meters.
+        outward
+            Vectors from the points to the sensor, of shape (n, 3), in meters.
+        voxel_m
+            Edge of the voxels.
+        gap_rad
+            Angle between the rays of neighboring rings.
+        labels
+            Labels of the points (`labels_of`), of shape (n,), or None. The most frequent label of
+            the points of a surfel is in the name of its material.
+
+        Raises
+        ------
+        LidarError
+            If there are too few points, or too many for the memory.
+        """
+        from scipy.spatial import cKDTree
+
+        voxels = PointVoxels.of_points(Path(name), points, voxel_m)
+        count = len(voxels.counts)
+        if count * POINT_BYTES > memory() // 2:
+            raise LidarError(
+                f"The reconstruction of {name} would have {count:,} surfels, which require "
+                f"{bytes_of(count * POINT_BYTES)} of memory, but the limit is "
+                f"{bytes_of(memory() // 2)}. Set `voxel_m` to more than {voxel_m:.3g}."
+            )
+        if count < _NEIGHBORS[-1]:
+            raise LidarError(
+                f"{name} has stationary points in {count} voxels of {voxel_m:.3g} m, but at "
+                f"least {_NEIGHBORS[-1]} are required. Use a smaller `voxel_m`, or a longer "
+                "recording."
+            )
+        means = voxels.means(points)
+        mean_outward = voxels.means(outward)
+        tree = cKDTree(means)
+        corners = np.empty((count, 4, 3))
+        for start in range(0, count, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            planes = _Planes.around(means[block], tree, means)
+            corners[block] = planes.corners(means[block], mean_outward[block], voxel_m, gap_rad)
+        mesh = SceneMesh(
+            name,
+            corners.reshape(-1, 3),
+            surfel_faces(count),
+            materials=surfel_materials(labels, voxels),
+        )
+        return cls(mesh, np.zeros(count, bool))
+
+
+def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
+    """Return the mesh of surfels with corners (m, 4, 3), meters."""
+    return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
+
+
+def surfel_centers(mesh: SceneMesh) -> Floats:
+    """Return the middles (m, 3) of the surfels of a mesh, meters."""
+    return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
+
+
+def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Return the surfels of meshes as one mesh, with the name of the first."""
+    sizes = [len(mesh.faces) for mesh in meshes]
+    return SceneMesh(
+        meshes[0].name,
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        surfel_faces(sum(sizes) // 2),
+        colors=join_colors([mesh.colors for mesh in meshes], sizes),
+        materials=join_materials([mesh.materials for mesh in meshes], sizes),
+    )
+
+
+class _Planes(NamedTuple):
+    """Planes of the neighbors of m points."""
+
+    axes: Floats  # (m, 3, 3): unit vectors: normal, across the lines, along the lines
+    halves: Floats  # (m, 2): half the sides of surfels across and along, meters
+    radius_m: Floats  # (m,): distance of the farthest neighbor; 0 if these are in no plane
+
+    @classmethod
+    def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
+        """Find the planes of the neighbors of some of the means (v, 3), which are in a tree."""
+        count = len(centers)
+        axes = np.empty((count, 3, 3))
+        halves = np.empty((count, 2))
+        radius_m = np.empty(count)
+        left = np.arange(count)
+        for neighbors in _NEIGHBORS:
+            around = means[_nearest(tree, centers[left], neighbors)]
+            variances, found = _principal(around)
+            axes[left] = found
+            flat = variances[:, 0] < _MAX_FLAT * variances[:, 1]
+            farthest_m = np.linalg.norm(around[:, -1] - centers[left], axis=1)
+            radius_m[left] = np.where(flat, farthest_m, 0.0)
+            near = around[:, : _NEIGHBORS[0]] - centers[left, None]
+            close = np.square(np.einsum("mki,mji->mkj", near, found[:, 1:])).mean(axis=1)
+            is_line = close[:, 0] < _MIN_WIDTH * close[:, 1]
+            close[is_line, 0] = variances[is_line, 1]
+            halves[left] = _EXTENT * np.sqrt(np.maximum(close, 0))
+            left = left[variances[:, 1] < _MIN_WIDTH * variances[:, 2]]
+            if not len(left):
+                break
+        return cls(axes, halves, radius_m)
+
+    def corners(self, centers: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
+        """Return the corners (m, 4, 3) of surfels, counter-clockwise seen from the sensor."""
+        range_m = np.linalg.norm(outward, axis=1)
+        facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
+        cosine = np.abs(facing) / np.maximum(range_m, 1e-9)
+        gap_m = gap_rad * range_m / np.maximum(cosine, _MIN_COSINE)
+        longest_m = np.maximum(_MAX_HALF_VOXELS * voxel_m, _MAX_GAPS * gap_m)
+        halves = np.minimum(self.halves, longest_m[:, None])
+        # Between two rings of a sweep a plane goes on, wherever the rings of others are.
+        to_next_m = np.minimum(_PLANE_GAPS * gap_m, _MAX_RADII * self.radius_m)
+        halves[:, 0] = np.maximum(halves[:, 0], to_next_m)
+        across = self.axes[:, 1] * halves[:, :1]
+        along = self.axes[:, 2] * halves[:, 1:]
+        inverted = np.einsum("mi,mi->m", np.cross(along, across), outward) < 0
+        across = np.where(inverted[:, None], -across, across)
+        corners = np.empty((len(centers), 4, 3))
+        for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
+            corners[:, corner] = centers + a * along + b * across
+        return corners
+
+
+def _nearest(tree: object, centers: Floats, count: int) -> Ints:
+    """Return the indices (m, count) of the nearest points in a tree, the nearest first."""
+    _, rows = tree.query(centers, count)  # type: ignore[attr-defined]
+    return np.asarray(rows)
+
+
+def _principal(around: Floats) -> tuple[Floats, Floats]:
+    """Return the variances (m, 3), ascending, and axes (m, 3, 3) of points (m, k, 3)."""
+    offsets = around - around.mean(axis=1, keepdims=True)
+    covariances = np.einsum("mki,mkj->mij", offsets, offsets) / around.shape[1]
+    variances, axes = np.linalg.eigh(covariances)
+    return variances, np.swapaxes(axes, 1, 2)

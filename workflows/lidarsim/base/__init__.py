@@ -1,1 +1,0 @@
-"""Foundations of the other rooms: errors, arrays, files, validation, words."""

@@ -1,0 +1,1 @@
+"""Optional libraries, plug-ins, signals, notebooks and network ports of the current process."""

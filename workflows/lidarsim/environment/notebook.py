@@ -1,0 +1,72 @@
+"""Notebooks: displays in their cells, and how objects are shown there as tables and pictures."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+PICTURE_SIZE = (800, 500)  # pixels; letters of smaller pictures could not be read
+
+# {name of a class: "module:function" that draws an instance as a PNG}, of packages that draw.
+_drawers: dict[str, str] = {}
+
+
+def cell_display() -> Any:
+    """Return `IPython.display` in a notebook, whose cells show printed text, else None."""
+    if "ipykernel" not in sys.modules:
+        return None
+    from IPython import display, get_ipython
+
+    shell: Any = get_ipython()
+    return display if type(shell).__name__ == "ZMQInteractiveShell" else None
+
+
+def draw_with(drawers: Mapping[str, str]) -> None:
+    """Register functions that draw objects in notebooks.
+
+    `drawers` maps class names to functions, which are specified as "module:function". A function
+    receives an instance of the class and returns a PNG, or None if there is nothing to draw. Its
+    module is imported when a notebook displays such an instance for the first time.
+    """
+    _drawers.update(drawers)
+
+
+def table_of(rows: Iterable[tuple[str, str]]) -> str:
+    """Return an HTML table of names and values, in the colors of the notebook."""
+    from html import escape
+
+    left = " style='text-align:left'"
+    lines = (
+        f"<tr><th{left}>{escape(name)}</th><td{left}>{escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    return f"<table>{''.join(lines)}</table>"
+
+
+def picture_of(instance: object) -> str:
+    """Return the picture of an instance as HTML, or "" if no package draws its class."""
+    from importlib import import_module
+
+    from ..errors import LidarError
+
+    names = (kind.__name__ for kind in type(instance).__mro__)
+    drawer = next((_drawers[name] for name in names if name in _drawers), None)
+    if drawer is None:
+        return ""
+    module, _, function = drawer.partition(":")
+    try:
+        png: bytes | None = getattr(import_module(module), function)(instance)
+    except LidarError:  # a scene that cannot be cast is shown as a table
+        return ""
+    return "" if png is None else image_of(png, type(instance).__name__)
+
+
+def image_of(png: bytes, name: str) -> str:
+    """Return a PNG as HTML, as wide as drawn at most."""
+    from base64 import b64encode
+    from html import escape
+
+    data = b64encode(png).decode()
+    style = f"display:block;width:100%;max-width:{PICTURE_SIZE[0]}px"
+    return f'<img alt="{escape(name)}" src="data:image/png;base64,{data}" style="{style}">'

@@ -1,0 +1,122 @@
+"""YAML files as plain data: no tags, no duplicate keys, numbers as in YAML 1.2."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..errors import LidarError, MissingFileError, as_sentence, prefixed
+from .allowance import Allowance
+from .input_files import not_found, read_input_text
+
+_NODE_BYTES = 500  # memory of a value in the loader
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that refuses duplicate keys, and aliases that repeat too much.
+
+    PyYAML silently takes the last of two keys. Aliases of a value share an object, but merging or
+    reading aliases takes as long as if they were written out.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._allowance = Allowance(len(text), "shorten it, or do not use aliases (*name)")
+        # {value with an anchor: bytes with aliases written out}
+        self._node_bytes: dict[yaml.Node, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node, and count each use of an alias towards the memory."""
+        event: Any = self.peek_event()
+        used_bytes = self._allowance.used_bytes
+        self._allowance.take(_NODE_BYTES)
+        node: Any = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent):
+            if node not in self._node_bytes:
+                mark: Any = event.start_mark
+                problem = f"{event.anchor!r} contains itself"
+                raise yaml.composer.ComposerError(None, None, problem, mark)
+            self._allowance.take(self._node_bytes[node])
+        elif event.anchor is not None:
+            self._node_bytes[node] = self._allowance.used_bytes - used_bytes
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Build a mapping.
+
+        Raises ConstructorError, with the line, for a duplicate key.
+        """
+        keys: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in keys:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} is duplicated", key.start_mark
+                )
+            keys.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+# In YAML 1.1, which PyYAML implements, 1e-3 is text; in YAML 1.2 it is a number.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
+def load_yaml(text: str) -> Any:
+    """Return the content of a YAML text.
+
+    Raises
+    ------
+    LidarError
+        If the text has too many values, with aliases written out.
+    yaml.YAMLError
+        If the text is not YAML.
+    ValueError, OverflowError, RecursionError
+        For a number, a date or a depth that Python cannot represent.
+    """
+    loader = _Loader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
+
+def read_yaml(
+    path: Path, form: str = "A scenario is a mapping with sections such as scene, sensor and poses"
+) -> dict[str, Any]:
+    """Read a YAML file of a mapping, for errors that describe the expected mapping by `form`.
+
+    Raises
+    ------
+    LidarError
+        If the file is missing, unreadable, too large, not UTF-8, not YAML, empty, or holds
+        something other than a mapping.
+    """
+    try:
+        with prefixed(path):
+            content = load_yaml(read_input_text(path))
+    except FileNotFoundError as error:
+        raise MissingFileError(not_found(path)) from error
+    except OSError as error:
+        raise LidarError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        raise LidarError(f"{path}{line}: {error.problem or 'not valid YAML'}.") from error
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        # ValueError: not UTF-8, or a date or number that Python cannot hold, such as 2026-99-99.
+        reason = " ".join(str(error).partition(";")[0].split())[:200]
+        raise LidarError(f"{path} is not valid YAML: {reason}.") from error
+    if content is None:
+        raise LidarError(f"{path} is empty. {as_sentence(form)}")
+    if not isinstance(content, dict):
+        kind = "a list" if isinstance(content, list) else f"only {str(content)[:40]!r}"
+        raise LidarError(f"{path} contains {kind}. {as_sentence(form)}")
+    return content

@@ -1,0 +1,1 @@
+"""Bit-identical vector and elementary functions on every processor, and random numbers."""
