@@ -35,7 +35,7 @@ PACKAGES = [
     "workflows/lidarscenes/files",
     "workflows/lidarscenes/roads",
     *("workflows/lidarpool/" + name for name in (
-        "clouds", "comparing", "places", "plan", "columns", "datasets", "recordings",
+        "clouds", "comparing", "reconstruction", "plan", "columns", "datasets", "recordings",
         "run/pipeline", "run/store", "scenario/campaign_sections.py", "scenario/campaign_jobs.py",
         "report/merging.py", "report/growing_cloud.py", "identity/shard.py",
     )),

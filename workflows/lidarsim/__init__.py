@@ -69,7 +69,7 @@ __all__ = [
 # Modules of the names above, except names of `sensor`. A module is imported when one of its names
 # is asked for, because importing all modules takes half a second.
 _MODULES = {
-    "base.errors": ("LidarError",),
+    "errors": ("LidarError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "media.materials": ("Material",),
