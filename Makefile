@@ -58,12 +58,16 @@ mutants: dev  ## COUNT faults planted in the sources (default 20), and which of 
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint: dev docs  ## format check, lint, types, spelling, layers, documentation; prints lines per package
+SOURCES := kernels scheduler workflows tests benchmarks examples docs
+
+lint: dev docs  ## format check, lint, types, spelling, names, layers, documentation; prints lines per package
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/codespell
+	$(BIN)/codespell --builtin en-GB_to_en-US --regex '[A-Za-z][a-z]+' .ci $(SOURCES)  # identifiers
 	$(BIN)/lint-imports
+	$(BIN)/python .ci/names.py
 	$(BIN)/python .ci/lines.py
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error

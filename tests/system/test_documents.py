@@ -9,17 +9,14 @@ import ast
 import doctest
 import importlib.util
 import inspect
-import io
 import json
 import re
 import runpy
 import shlex
 import subprocess
 import sys
-import tokenize
 import tomllib
 import warnings
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -714,41 +711,3 @@ def test_the_docstring_of_simulate_says_what_is_printed(in_threads, capsys):
     for example in examples:
         exec(example.source, names)
     assert capsys.readouterr().out == "".join(example.want for example in examples) != ""
-
-
-def texts_of(source: str) -> Iterator[str]:
-    """Yield the comments and docstrings of Python code."""
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.string
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            yield ast.get_docstring(node) or ""
-
-
-def test_modules_that_comments_and_docstrings_name_exist():
-    folders = ("kernels", "scheduler", "workflows")
-    modules = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
-    pages = [ROOT / "tests", ROOT / "benchmarks", ROOT / "examples"]
-    known = [*modules, *(path for page in pages for path in page.rglob("*.py"))]
-    known += [path for folder in folders for path in (ROOT / folder).rglob("*.cu")]
-    endings = {"/".join(path.parts[-count:]) for path in known for count in range(1, 5)}
-    named = {
-        (path.name, name)
-        for path in modules
-        for text in texts_of(path.read_text(encoding="utf-8"))
-        for name in re.findall(r"(?<![\w./*{}-])(?:\w+/)*\w+\.(?:py|cu)\b", text)
-    }
-    assert len(named) > 20
-    assert sorted(pair for pair in named if pair[1] not in endings) == []
-
-
-def test_public_class_names_are_unique():
-    modules = defaultdict[str, list[str]](list)
-    for folder in ("kernels", "scheduler", "workflows"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                    modules[node.name].append(str(path.relative_to(ROOT)))
-    assert len(modules) > 500
-    assert {name: paths for name, paths in modules.items() if len(paths) > 1} == {}
