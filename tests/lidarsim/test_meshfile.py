@@ -323,7 +323,7 @@ def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, more_formats.__name__, None)
     package = more_formats.__name__.partition(".")[0]
     with pytest.raises(
-        LidarError, match=f"formats of {package}, run pip install -e \\. in a checkout"
+        LidarError, match=f"formats of {package}, run pip install -e ./kernels .* in a checkout"
     ):
         load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))
     assert len(load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))) == 2

@@ -8,8 +8,6 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,19 +40,12 @@ class Distribution:
         return [(ROOT / self.folder / package).resolve().name for package in self.packages]
 
 
-# {name: distribution}; the first holds all packages.
+# {name: distribution}; the first requires the others.
 DISTRIBUTIONS = {
     "lidarpool": Distribution(
         ".",
-        (
-            "kernels/raybeam",
-            "scheduler/poolpart",
-            "workflows/lidarsim",
-            "workflows/lidarscenes",
-            "workflows/lidarview",
-            "workflows/lidarpool",
-        ),
-        without=frozenset({"raybeam", "poolpart", "lidarsim", "pytest"}),
+        ("workflows/lidarscenes", "workflows/lidarview", "workflows/lidarpool"),
+        without=frozenset({"pytest"}),
     ),
     "raybeam": Distribution(
         "kernels",
@@ -97,8 +88,7 @@ def test_a_part_wants_what_the_whole_wants(name):
     whole = declared(WHOLE)["project"]
     part = declared(name)["project"]
     extras = whole["optional-dependencies"]
-    foreign = {text for text in part["dependencies"] if Requirement(text).name not in PARTS}
-    assert foreign < set(whole["dependencies"])
+    assert set(part["dependencies"]) < set(whole["dependencies"])
     for extra, wanted in part.get("optional-dependencies", {}).items():
         assert set(wanted) <= set(extras.get(extra, whole["dependencies"]))
     assert part["requires-python"] == whole["requires-python"]
@@ -109,6 +99,14 @@ def test_a_part_wants_what_the_whole_wants(name):
 def test_all_parts_have_one_version(part):
     assert part.__version__ == lidarsim.__version__
     assert "__version__" in part.__all__
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_other_distributions_are_required_at_the_same_version(name):
+    required = [Requirement(text) for text in declared(name)["project"]["dependencies"]]
+    others = {one.name: str(one.specifier) for one in required if one.name in DISTRIBUTIONS}
+    assert set(others.values()) <= {f"=={__version__}"}
+    assert {*others} == {WHOLE: {*PARTS}, "lidarsim": {"raybeam"}}.get(name, set())
 
 
 def outside() -> dict[str, str]:
@@ -153,9 +151,8 @@ def test_they_hold_the_files_that_git_has_and_no_others(built, name):
         text=True,
         check=True,
     ).stdout.split()
-    sim = DISTRIBUTIONS["lidarsim"].folder
-    of_lidarsim = ABOUT if name == "lidarsim" else {f"{sim}/{file}" for file in ABOUT}
-    tracked = [file for file in tracked if file not in of_lidarsim]
+    if name == "lidarsim":  # whose package is the folder of the distribution
+        tracked = [file for file in tracked if file not in ABOUT]
     assert len(tracked) > 20
     stem = f"{name}-{__version__}"
     with tarfile.open(built / f"{stem}.tar.gz") as archive:
@@ -221,16 +218,6 @@ class Environment:
         found = importlib.metadata.distributions(path=[str(self._site)])
         return {one.metadata["Name"] for one in found}
 
-    def hashes(self, names: Iterable[str]) -> dict[str, list[str]]:
-        """Hashes of the packages' files, {file: one for each distribution that has it}."""
-        found: dict[str, list[str]] = {}
-        for name in names:
-            [one] = importlib.metadata.distributions(name=name, path=[str(self._site)])
-            for file in one.files or ():
-                if file.hash and not file.parts[0].endswith(".dist-info"):
-                    found.setdefault(str(file), []).append(file.hash.value)
-        return found
-
     def run(self, *command: str, cwd: Path) -> str:
         done = subprocess.run(
             [self.bin / command[0], *command[1:]],
@@ -275,17 +262,12 @@ def surveys(environment: Environment, folder: Path, *options: str) -> str:
     return environment.run("lidarpool", "run", car, "--out", "out", *options, cwd=folder)
 
 
-@pytest.mark.slow
-def test_all_together_share_equal_files(built, tmp_path):
-    """Uninstalling a part takes its files from lidarpool, which is then to be installed again."""
-    together = Environment(tmp_path / "venv", built, *DISTRIBUTIONS)
-    found = together.hashes(DISTRIBUTIONS)
-    assert all(len(set(hashes)) == 1 for hashes in found.values())
-    twice = {file.split("/")[0] for file, hashes in found.items() if len(hashes) == 2}
-    held = Counter(name for one in DISTRIBUTIONS.values() for name in one.imports)
-    shared = {name for name, count in held.items() if count == 2}
-    assert twice == shared
-    together.pip("uninstall", "--yes", *shared)
-    assert surveys(together, tmp_path).startswith("exit 1")
-    together.pip("install", "--force-reinstall", "lidarpool")
-    assert "results in out: cloud.ply" in surveys(together, tmp_path, "--cloud-only")
+@pytest.mark.extended
+def test_no_file_is_in_two_distributions(built):
+    holders: dict[str, list[str]] = {}
+    for wheel in sorted(built.glob("*.whl")):
+        with zipfile.ZipFile(wheel) as archive:
+            for file in archive.namelist():
+                holders.setdefault(file, []).append(wheel.name)
+    assert len(holders) > 700
+    assert {file: names for file, names in holders.items() if len(names) > 1} == {}

@@ -9,19 +9,22 @@ from importlib.util import find_spec
 from ..errors import LidarError, message_of, prefixed, unreadable
 
 CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
+_PARTS = ("./kernels", "./scheduler", "./workflows/lidarsim", ".")  # distributions of a checkout
 
 
 def install_command(*requirements: str) -> str:
     """Return the command that installs requirements, such as ``lidarpool[las]``, here.
 
-    lidarpool is on no package index: its extras are added from a checkout.
+    lidarpool is not on a package index. It is installed from a checkout, and so are its extras.
     """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
     words: list[str] = []
     for name in requirements:
-        if name.partition("[")[0] == "lidarpool":
-            # Editable: a copy beside a checkout would hide changes of the checkout.
+        # Editable, because a copy next to a checkout would hide changes of the checkout.
+        if name == "lidarpool":
+            words += [word for part in _PARTS for word in ("-e", part)]
+        elif name.startswith("lidarpool["):
             words += ["-e", f".{name.removeprefix('lidarpool')}"]
         else:
             words.append(name)
