@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all durations slow compat chaos mutants soak lint docs format bench clean dev
+.PHONY: help demo test test-all durations slow lock compat chaos mutants soak lint docs format bench clean dev
 
 # Where Python may not write what it has compiled, as in containers, each of the many processes of a
 # run or of the tests would compile all modules again.
@@ -44,7 +44,10 @@ slow: dev  ## the tests that take seconds to minutes each
 	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
 
-compat:  ## the tests with the oldest and the newest versions allowed, on three Pythons
+lock:  ## newest versions of all dependencies, with hashes, into requirements/; OPTIONS="--upgrade-package numpy" for one
+	@.ci/lock $(OPTIONS)
+
+compat:  ## the tests with the oldest, the newest and the locked versions of the dependencies, on four Pythons
 	@sh .ci/compat
 
 chaos: dev  ## 200 faults at every point of a survey, and damage of files; SEED=n plays them again
