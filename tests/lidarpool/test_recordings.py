@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import multiprocessing
+import sys
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -423,8 +425,10 @@ def write_e57(path):
 
 
 @pytest.mark.parametrize("name", ["bag", "e57"])
-def test_sweeps_can_be_read_by_threads_and_forked_processes(tmp_path, name):
+def test_sweeps_can_be_read_by_threads_and_forked_processes(tmp_path, name, request):
     """Both move the position of the same open file."""
+    request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
+    sys.setswitchinterval(1e-6)  # so that threads meet in the middle of a read
     if name == "bag":
         path = write_bag(tmp_path / "drive", drive(relative))
     else:

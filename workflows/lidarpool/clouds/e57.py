@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
+from threading import Lock
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -179,8 +179,8 @@ def _open_e57(source: RecordingSource) -> Recording:
 
     with reading(source.name):
         size = input_size(source.path)
-        files = PerProcess(partial(pye57.E57, str(source.path)))
-        file = files()
+        files = PerProcess(lambda: (pye57.E57(str(source.path)), Lock()))
+        file, _ = files()
         headers = [file.get_header(number) for number in range(file.scan_count)]
         # A column of equal values takes no space in the file, regardless of the number of points.
         total = Allowance(size, _THIN, in_parts=True)
@@ -190,8 +190,9 @@ def _open_e57(source: RecordingSource) -> Recording:
 
         def read(number: int) -> Sweep:
             Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
-            file = files()
-            return _read_scan(file, file.get_header(number), number, scale)
+            file, lock = files()
+            with lock:  # a file cannot have two readers
+                return _read_scan(file, file.get_header(number), number, scale)
 
         notes = list(scale.notes)
         for number, header in enumerate(headers):
