@@ -11,7 +11,7 @@ from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.labels import divided, labels_of
+from lidarpool.reconstruction.labels import labels_of, split_by_object
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
@@ -174,9 +174,9 @@ def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     rows = np.unique(labels)
     names = tuple(f"{CLASS_MATERIAL}{label}" for label in rows.tolist())
     index = np.repeat(np.searchsorted(rows, labels), 2).astype(np.int32)
-    mesh = SceneMesh("Place", corners, surfel_faces(5), materials=FaceMaterials(names, index))
-    parts = divided(mesh)
-    assert [part.name for part in parts] == ["object 0", "object 2", "Place"]
+    mesh = SceneMesh("SurfaceMap", corners, surfel_faces(5), materials=FaceMaterials(names, index))
+    parts = split_by_object(mesh)
+    assert [part.name for part in parts] == ["object 0", "object 2", "SurfaceMap"]
     surfels = corners.reshape(5, 4, 3)
     for part, expected in zip(parts, ([1, 4], [0, 3], [2]), strict=True):
         np.testing.assert_array_equal(part.vertices.reshape(-1, 4, 3), surfels[expected])
@@ -192,7 +192,7 @@ def test_range_images_have_a_row_around_each_ring():
     points = ranges[:, None] * np.stack(
         [np.cos(elevation), 0 * elevation, np.sin(elevation)], axis=1
     )
-    image = RangeImage.of_points(points, elevation)
+    image = RangeImage.from_points(points, elevation)
     column = np.isfinite(image.nearest_m).all(axis=0)
     assert column.sum() == 3
     np.testing.assert_allclose(image.nearest_m[:, column].T, [[10, 10, 20, 30, 40]] * 3)

@@ -34,7 +34,7 @@ from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.rings import Rings, elevations
 from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.lost_pulses import Answering, lost_pulses
+from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
@@ -194,8 +194,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
     sweep = Sweep(points, {"row": ring[rows]})
-    answering = Answering(np.ones((16, 720), bool), 50.0)
-    lost, _ = lost_pulses(sweep, elevation, answering, 0.0)
+    coverage = SensorCoverage(np.ones((16, 720), bool), 50.0)
+    lost, _ = lost_pulses(sweep, elevation, coverage, 0.0)
     expected = ~returned & received
     assert len(lost) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
@@ -205,10 +205,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
     # Second returns of the pulses, whose azimuths are rounded.
     both = Sweep.joined([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
-    assert len(lost_pulses(both, elevation, answering, 0.0)[0]) == pytest.approx(
-        len(lost), rel=0.01
-    )
-    unknown, _ = lost_pulses(sweep, np.empty(0), answering, 0.0)
+    assert len(lost_pulses(both, elevation, coverage, 0.0)[0]) == pytest.approx(len(lost), rel=0.01)
+    unknown, _ = lost_pulses(sweep, np.empty(0), coverage, 0.0)
     assert not len(unknown)
 
 

@@ -25,7 +25,7 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS, elevations
-from .lost_pulses import Answering, lost_pulses
+from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses
 from .recorded_sweeps import RecordedSweeps
@@ -210,7 +210,7 @@ class AlignedSweeps:
 
     recorded: RecordedSweeps
     alignment: Alignment
-    answering: Answering
+    coverage: SensorCoverage
 
     @property
     def name(self) -> str:
@@ -230,7 +230,7 @@ class AlignedSweeps:
         moved_m = share * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
         elevation_rad = self.recorded.elevation_rad
-        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.answering, moved_m)
+        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.coverage, moved_m)
         aligned = self.aligned(lost, number)._replace(gap_range_m=gap_range_m)
         return self.aligned(sweep, number), aligned
 
@@ -240,8 +240,8 @@ class AlignedSweeps:
         pose = self.alignment.poses[number]
         return AlignedSweep(
             points=points,
-            world=placed(points, pose),
-            origins=placed(origins, pose),
+            world=transform_points(points, pose),
+            origins=transform_points(origins, pose),
             ring=sweep.columns["row"],
             intensities=sweep.intensity,
             labels=sweep.columns.get("label"),
@@ -349,7 +349,7 @@ def _filled_voxels(
     for number, sample in enumerate(scaled):
         points, _ = alignment.compensated(sample, number)
         near = np.linalg.norm(sample.points, axis=1) < _NEAR_VOXELS * voxel_m
-        parts.append(placed(points[near], alignment.poses[number]))
+        parts.append(transform_points(points[near], alignment.poses[number]))
     # A level floor on a boundary is in two layers of voxels: of other voxels it is in one.
     cells = np.concatenate(parts) / voxel_m
     return sum(
@@ -402,10 +402,10 @@ def _planes(
 ) -> VoxelPlanes:
     """Return the planes of the map of some sweeps, or raise LidarError without planes."""
     parts = [
-        placed(alignment.compensated(samples[number], number)[0], alignment.poses[number])
+        transform_points(alignment.compensated(samples[number], number)[0], alignment.poses[number])
         for number in mapped
     ]
-    planes = VoxelPlanes.of_points(name, np.concatenate(parts), alignment.voxel_m)
+    planes = VoxelPlanes.from_points(name, np.concatenate(parts), alignment.voxel_m)
     if planes is None:
         raise LidarError(
             f"{name} contains no planar surfaces, such as a floor or walls, which the "
@@ -425,11 +425,13 @@ class _PlanePoints:
     weights: Floats  # (k,): 0 to 1
 
     @classmethod
-    def of_sweep(
+    def from_sweep(
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
         """Find the points (n, 3) of a sweep, at a pose, that are near planes."""
-        distances, plane, rows = planes.distances(placed(points, pose), _MAX_VOXELS * voxel_m)
+        distances, plane, rows = planes.distances(
+            transform_points(points, pose), _MAX_VOXELS * voxel_m
+        )
         spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
         sigma = max(spread_m, _MIN_SIGMA_M)
         weights = np.maximum(1 - (distances / (_TUKEY_SIGMAS * sigma)) ** 2, 0) ** 2
@@ -447,7 +449,7 @@ def _registered(
     pose = alignment.poses[number].copy()
     voxel_m = alignment.voxel_m
     for _ in range(_STEPS):
-        on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
+        on_planes = _PlanePoints.from_sweep(points, pose, planes, voxel_m)
         enough = min(_MIN_PLANE_POINTS, len(points) / 10)
         if len(points) < _MIN_ALIGNED_POINTS or on_planes.weights.sum() < enough:
             return pose, on_planes  # too few surfaces: odometry knows better
@@ -459,7 +461,7 @@ def _registered(
         change = np.linalg.solve(normal, -weighted.T @ on_planes.distances)
         pose[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[3:]
-    return pose, _PlanePoints.of_sweep(points, pose, planes, voxel_m)
+    return pose, _PlanePoints.from_sweep(points, pose, planes, voxel_m)
 
 
 def _aligned(
@@ -525,6 +527,6 @@ def _axes(points: Floats) -> tuple[Floats, Floats, Floats]:
     return outward, upward, leftward
 
 
-def placed(points: Floats, pose: Floats) -> Floats:
+def transform_points(points: Floats, pose: Floats) -> Floats:
     """Return points (n, 3) moved by a pose (4, 4)."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])

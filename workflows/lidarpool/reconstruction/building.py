@@ -41,20 +41,27 @@ from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
-from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, draw_sweep
+from .charts import (
+    STANDING_DOTS,
+    SweepImages,
+    TopViewPoints,
+    draw_errors,
+    draw_sweep,
+    draw_top_view,
+)
 from .finished_steps import FinishedSteps, Map, TwinStep
-from .held_out import HeldOut
-from .labels import divided
-from .lost_pulses import Answering, firings_per_turn
+from .held_out import HeldOutRays
+from .labels import split_by_object
+from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
 from .processes import mapping
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
-from .submap_tasks import BuildTask, StretchSurfels, StretchTask, align_stretch, build_stretch
-from .submaps import AlignedStretch, Stretch, divide, joined
+from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
+from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
-from .surfels import joined_surfels, surfel_centers, surfel_mesh
+from .surfels import merge_surfels, surfel_centers, surfel_mesh
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -68,10 +75,10 @@ DEFAULT_VOXEL_M = 0.1
 _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
 _POSE_DECIMALS = 6
-_RESPONSE_STRETCHES = 4  # that tell the response of the sensor
+_RESPONSE_SUBMAPS = 4  # that tell the response of the sensor
 _POSES = TwinStep("poses", (RecordedPoses,))
-_ALIGN = TwinStep("align", (AlignedStretch,))
-_BUILD = TwinStep("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
+_ALIGN = TwinStep("align", (AlignedSubmap,))
+_BUILD = TwinStep("build", (SubmapSurfels, Observations, HeldOutRays, SweepImages, TopViewPoints))
 NO_RETURN = "no return"  # name of the object of dark surfels
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # which are written even by default
 _RATE_DECIMALS = 4
@@ -356,25 +363,25 @@ class _Building:
         poses = self._poses(trajectory)
         self.tell(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
-        stretches = divide(first.poses[:, :3, 3])
-        counting = np.concatenate([stretch.own_numbers for stretch in stretches])
+        submaps = split_into_submaps(first.poses[:, :3, 3])
+        counting = np.concatenate([submap.own_numbers for submap in submaps])
         others = counting[1::2]
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)]
         task = BuildTask(
             recorded=recorded,
             alignment=first,
-            stretch=stretches[0],
+            submap=submaps[0],
             mapped=counting[::2],
-            answering=Answering.of_sweeps(recorded),
+            coverage=SensorCoverage.from_sweeps(recorded),
             compared=compared,
             voxel_m=self.voxel_m,
             drawn_share=0.0,
         )
         is_shared = not isinstance(recorded.source, Recording)
-        with mapping(self.client, len(stretches) if is_shared else 1) as run:
-            task = replace(task, alignment=self._aligned(run, task, stretches))
-            built = self._built(run, task, stretches)
-            sweeps = AlignedSweeps(recorded, task.alignment, task.answering)
+        with mapping(self.client, len(submaps) if is_shared else 1) as run:
+            task = replace(task, alignment=self._aligned(run, task, submaps))
+            built = self._built(run, task, submaps)
+            sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
             return self._finished(built, sweeps, poses)
 
     def _poses(self, trajectory: Path | None) -> RecordedPoses:
@@ -388,53 +395,52 @@ class _Building:
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
 
-    def _aligned(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> Alignment:
+    def _aligned(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> Alignment:
         """Align all sweeps."""
-        self.tell(f"aligning the sweeps in {plural(len(stretches), 'submap')}")
+        self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
-            StretchTask(task.recorded, task.alignment, stretch, task.mapped)
-            for stretch in stretches
+            SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
         ]
-        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_stretch, tasks)]
-        return joined(task.alignment, stretches, aligned)
+        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
+        return merge_alignments(task.alignment, submaps, aligned)
 
-    def _built(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> _Built:
-        """Build the places of all stretches."""
-        sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in stretches]
-        count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in stretches)
+    def _built(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> _Built:
+        """Build the places of all submaps."""
+        sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
+        count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
         share = STANDING_DOTS / max(count, 1.0)
-        tasks = [replace(task, stretch=one, drawn_share=share) for one in stretches]
+        tasks = [replace(task, submap=one, drawn_share=share) for one in submaps]
         parts = []
-        for number, part in enumerate(self.steps.each(_BUILD, run, build_stretch, tasks), 1):
-            self.tell(f"built {number} of {plural(len(stretches), 'submap')}")
+        for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
+            self.tell(f"built {number} of {plural(len(submaps), 'submap')}")
             surfels, _, *others = part
-            parts.append(_BuiltStretch(surfels, *others))
-        return _Built(parts, stretches)
+            parts.append(_BuiltSubmap(surfels, *others))
+        return _Built(parts, submaps)
 
-    def _seen(self, index: int) -> Observations:
-        """Return the rays that end on surfels of a stretch."""
-        seen: Observations = self.steps.load(_BUILD, index)[1]
-        return seen
+    def _load_observations(self, index: int) -> Observations:
+        """Return the rays that end on surfels of a submap."""
+        observations: Observations = self.steps.load(_BUILD, index)[1]
+        return observations
 
     def _finished(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
         """Fit the response and the noise of the sensor, and make the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
         self.tell("fitting the sensor model")
-        some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
+        some = even_indices(len(built.parts), _RESPONSE_SUBMAPS).tolist()
         response = fit_response(
-            [self._seen(index) for index in some],
+            [self._load_observations(index) for index in some],
             recorded.ring_count,
             are_energies=recorded.recording.energies,
         )
         name = Path(recorded.recording.name).name
-        # The points of a stretch may all belong to its neighbors.
+        # The points of a submap may all belong to its neighbors.
         meshes = {
             index: part.surfels.mesh(name)
             for index, part in enumerate(built.parts)
             if len(part.surfels.corners)
         }
-        timing = SweepTiming.of_sweeps(sweeps)
+        timing = SweepTiming.from_sweeps(sweeps)
         model, notes = self._sensor(built, sweeps, meshes, response, timing)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
@@ -452,16 +458,23 @@ class _Building:
         }
         pictures = {
             "sweep": draw_sweep(built.images()),
-            "above": draw_above([part.above for part in built.parts], alignment.poses[:, :3, 3]),
+            "above": draw_top_view(
+                [part.top_view for part in built.parts], alignment.poses[:, :3, 3]
+            ),
             "errors": draw_errors(figures),
         }
         if response is not None:
             meshes = {
-                index: colored(mesh, response.reflectances(self._seen(index), surfel_centers(mesh)))
+                index: colored(
+                    mesh,
+                    response.reflectances(self._load_observations(index), surfel_centers(mesh)),
+                )
                 for index, mesh in meshes.items()
             }
         return Twin(
-            scene=Scene.from_meshes([*divided(joined_surfels([*meshes.values()])), *built.dark()]),
+            scene=Scene.from_meshes(
+                [*split_by_object(merge_surfels([*meshes.values()])), *built.dark()]
+            ),
             poses=alignment.poses,
             times_s=poses.times_s,
             start=timing.start(alignment),
@@ -482,14 +495,14 @@ class _Building:
     ) -> tuple[SensorModel, list[str]]:
         """Return the sensor with the noise of its pulses on a part of the place, and notes."""
         middle = len(built.parts) // 2
-        numbers = built.stretches[middle].own_numbers
+        numbers = built.submaps[middle].own_numbers
         sizes = built.parts[middle].surfels.points
         near = [mesh for index, mesh in meshes.items() if abs(index - middle) <= 1]
         sensor = self.base or timing.sensor(sweeps, int(numbers[sizes.argmax()]))
         model, notes = fit_sensor(
             sweeps,
             dict(zip(numbers.tolist(), sizes.tolist(), strict=True)),
-            Scene.from_meshes([joined_surfels(near)]),
+            Scene.from_meshes([merge_surfels(near)]),
             response,
             sensor,
         )
@@ -524,25 +537,27 @@ class _Building:
         }
 
 
-class _BuiltStretch(NamedTuple):
-    """What is kept of a stretch in memory."""
+class _BuiltSubmap(NamedTuple):
+    """What is kept of a submap in memory."""
 
-    surfels: StretchSurfels
-    held_out: HeldOut | None
+    surfels: SubmapSurfels
+    held_out: HeldOutRays | None
     images: SweepImages | None
-    above: Above
+    top_view: TopViewPoints
 
 
 @dataclass(frozen=True, eq=False)
 class _Built:
-    """The places of all stretches."""
+    """The places of all submaps."""
 
-    parts: Sequence[_BuiltStretch]
-    stretches: Sequence[Stretch]
+    parts: Sequence[_BuiltSubmap]
+    submaps: Sequence[Submap]
 
-    def held_out(self) -> HeldOut:
+    def held_out(self) -> HeldOutRays:
         """Return the rays of all held-out sweeps that were compared."""
-        return HeldOut.joined([part.held_out for part in self.parts if part.held_out is not None])
+        return HeldOutRays.concatenate(
+            [part.held_out for part in self.parts if part.held_out is not None]
+        )
 
     def dark(self) -> list[SceneMesh]:
         """Return the surfels that return nothing as at most one mesh."""
@@ -569,7 +584,7 @@ class SweepTiming(NamedTuple):
     rotation: Rotation | None  # None if unknown
 
     @classmethod
-    def of_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
+    def from_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
         """Find the timing of sweeps."""
         recorded = sweeps.recorded
         alignment = sweeps.alignment
@@ -618,7 +633,7 @@ class SweepTiming(NamedTuple):
             **known,
             firings_per_turn=firings_per_turn(recorded.read(number)),
             rate_hz=self.rate_hz,
-            range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
+            range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
             beams={"elevation_deg": elevation_deg.tolist()},
         )
 

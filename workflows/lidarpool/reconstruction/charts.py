@@ -1,4 +1,4 @@
-"""Pictures of a twin: a held-out sweep beside its simulation, the place, and errors on the way."""
+"""Pictures of a twin: a held-out sweep beside its simulation, the surface_map, and errors on the way."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarview.render.picture_page import Page, label_logarithms
 from ..clouds.rings import elevations
 from .alignment import AlignedSweep, AlignedSweeps
 from .reflectances import Reflectances
-from .surface_map import Place
+from .surface_map import SurfaceMap
 
 _WIDTH = 1600
 _LEFT = 0.075
@@ -55,19 +55,23 @@ class SweepImages(NamedTuple):
     simulated_intensity: Floats32 | None
 
     @classmethod
-    def of_sweep(
-        cls, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None, number: int
+    def from_sweep(
+        cls,
+        sweeps: AlignedSweeps,
+        surface_map: SurfaceMap,
+        reflectances: Reflectances | None,
+        number: int,
     ) -> SweepImages:
-        """Make the images of a sweep and of its rays in a place."""
+        """Make the images of a sweep and of its rays in a surface_map."""
         sweep = sweeps.read(number)
         cells = _cells(sweep, sweeps)
-        seen = place.see(sweep)
+        hits = surface_map.cast(sweep)
         simulated_m = np.full(len(sweep.points), np.nan)
-        simulated_m[seen.rays] = seen.distance_m
+        simulated_m[hits.rays] = hits.distance_m
         range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))
         if reflectances is None or sweep.intensities is None:
             return cls(np.array([number]), range_m, in_twin_m, None, None)
-        simulated = reflectances.intensities(sweep, seen)
+        simulated = reflectances.intensities(sweep, hits)
         intensity, in_twin = (_image(values, cells) for values in (sweep.intensities, simulated))
         return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
 
@@ -91,16 +95,16 @@ class SweepImages(NamedTuple):
         return images
 
 
-class Above(NamedTuple):
+class TopViewPoints(NamedTuple):
     """Some points of some sweeps, in the world."""
 
     still: Floats32  # (n, 2): of what stands, meters
     moved: Floats32  # (k, 2)
 
     @classmethod
-    def of_sweeps(
+    def from_sweeps(
         cls, sweeps: AlignedSweeps, standing: Mapping[int, Bools], numbers: Ints, share: float
-    ) -> Above:
+    ) -> TopViewPoints:
         """Choose a share of the points of some sweeps."""
         still: list[Floats] = []
         moved: list[Floats] = []
@@ -160,7 +164,7 @@ def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
     return image.reshape(shape)
 
 
-def draw_above(parts: Sequence[Above], path: Floats) -> Page:
+def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
     """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
     page = Page((_WIDTH, _ABOVE_HEIGHT))
     page.title(

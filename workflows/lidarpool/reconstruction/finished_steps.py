@@ -1,7 +1,7 @@
 """Results of the steps of a twin, kept in a folder until the twin is written.
 
-A step is done for each stretch of the drive, or once. What is done is read again, so the memory of
-a drive is that of a stretch, and a command that was killed goes on.
+A step is done for each submap of the drive, or once. What is done is read again, so the memory of
+a drive is that of a submap, and a command that was killed goes on.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class RangeImage:
     farthest_m: Floats32  # (r, c): -inf without a return
 
     @classmethod
-    def of_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
+    def from_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
         """Make the image of points (n, 3) in the sensor frame, with rows (r,), highest first."""
         from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -84,7 +84,7 @@ def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
     return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
 
 
-def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
+def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
     """Return a mask of the points of each sweep that stand: {number: (n,)}.
 
     `numbers` name the sweeps that are compared with each other, ascending.
@@ -95,7 +95,7 @@ def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, 
         high = float(elevation.max())
         row_elevation_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
     images = {
-        number: RangeImage.of_points(sweeps.read(number).points, row_elevation_rad)
+        number: RangeImage.from_points(sweeps.read(number).points, row_elevation_rad)
         for number in numbers
     }
     masks = {}

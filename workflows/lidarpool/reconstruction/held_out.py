@@ -1,7 +1,7 @@
 """Figures of a twin: sweeps that were held out, beside what a scan of the twin gives.
 
 The rays of a held-out sweep are cast at the place that the other sweeps made. So a figure tells how
-a sensor would see the place, and not how well the place repeats what it was made of. The poses of
+a sensor would see the surface_map, and not how well the place repeats what it was made of. The poses of
 held-out sweeps are registered to the others' map, which hides a part of the errors of poses.
 """
 
@@ -18,14 +18,14 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .alignment import AlignedSweep, AlignedSweeps
 from .reflectances import Reflectances
-from .surface_map import Place
+from .surface_map import SurfaceMap
 
 _RANGE_MARGIN_M = 0.5  # beyond the largest recorded range
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutRays:
     """Rays of held-out sweeps, and what they meet in the twin, as arrays of n rays.
 
     Attributes
@@ -51,7 +51,7 @@ class HeldOut:
     standing: Bools
 
     @classmethod
-    def joined(cls, parts: Sequence[HeldOut]) -> HeldOut:
+    def concatenate(cls, parts: Sequence[HeldOutRays]) -> HeldOutRays:
         """Join rays."""
         return cls(
             *(
@@ -65,9 +65,9 @@ class HeldOut:
         """Mask (n,) of the rays that returned in the recording."""
         return np.isfinite(self.range_m)
 
-    def select(self, rays: Bools) -> HeldOut:
+    def select(self, rays: Bools) -> HeldOutRays:
         """Return selected rays."""
-        return HeldOut(*(getattr(self, column.name)[rays] for column in fields(self)))
+        return HeldOutRays(*(getattr(self, column.name)[rays] for column in fields(self)))
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of all rays, of those whose points stand, and by class of range."""
@@ -145,21 +145,21 @@ class HeldOut:
         return figures
 
 
-def hold_out(
+def simulate_held_out(
     sweeps: AlignedSweeps,
-    place: Place,
+    surface_map: SurfaceMap,
     reflectances: Reflectances | None,
     standing: Mapping[int, Bools],
     numbers: Sequence[int],
-) -> HeldOut:
+) -> HeldOutRays:
     """Cast the rays of held-out sweeps at a place that other sweeps made.
 
     Parameters
     ----------
     sweeps
         The sweeps.
-    place, reflectances
-        The place, and its reflectances; None without intensities.
+    surface_map, reflectances
+        The surface_map, and its reflectances; None without intensities.
     standing
         Which points of the held-out sweeps stand, by all sweeps: {number: (n,)}.
     numbers
@@ -170,35 +170,39 @@ def hold_out(
         sweep, lost = sweeps.read_with_lost(number)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
-        parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
-        parts.append(_rays(place, None, lost, number, no_ranges, no_points))
-    rays = HeldOut.joined(parts)
+        parts.append(
+            _rays(surface_map, reflectances, sweep, number, sweep.range_m, standing[number])
+        )
+        parts.append(_rays(surface_map, None, lost, number, no_ranges, no_points))
+    rays = HeldOutRays.concatenate(parts)
     # What was seen from nearer is out of reach here.
-    in_reach = rays.simulated_m <= sweeps.answering.max_range_m + _RANGE_MARGIN_M
+    in_reach = rays.simulated_m <= sweeps.coverage.max_range_m + _RANGE_MARGIN_M
     return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan))
 
 
 def _rays(
-    place: Place,
+    surface_map: SurfaceMap,
     reflectances: Reflectances | None,
     sweep: AlignedSweep,
     number: int,
     range_m: Floats,
     standing: Bools,
-) -> HeldOut:
-    """Cast the rays of a sweep, with recorded ranges (n,), at a place."""
-    seen = place.see(sweep)
+) -> HeldOutRays:
+    """Cast the rays of a sweep, with recorded ranges (n,), at a surface_map."""
+    hits = surface_map.cast(sweep)
     simulated_m = np.full(len(sweep.points), np.nan)
-    simulated_m[seen.rays] = np.where(place.surfels.dark[seen.surfel], np.nan, seen.distance_m)
+    simulated_m[hits.rays] = np.where(
+        surface_map.surfels.dark[hits.surfel], np.nan, hits.distance_m
+    )
     unknown = np.full(len(sweep.points), np.nan)
-    return HeldOut(
+    return HeldOutRays(
         sweep=np.full(len(sweep.points), number),
         ring=sweep.ring,
         range_m=range_m,
         simulated_m=simulated_m,
         intensity=unknown if sweep.intensities is None else sweep.intensities,
         simulated_intensity=(
-            unknown if reflectances is None else reflectances.intensities(sweep, seen)
+            unknown if reflectances is None else reflectances.intensities(sweep, hits)
         ),
         standing=standing,
     )

@@ -37,7 +37,7 @@ def labels_of(sweep: Sweep) -> Ints | None:
     return label
 
 
-def divided(mesh: SceneMesh) -> list[SceneMesh]:
+def split_by_object(mesh: SceneMesh) -> list[SceneMesh]:
     """Divide surfels by the objects of their labels, and name their materials by classes.
 
     Objects are in the order of their numbers. Surfels of no object keep the name of the mesh, and

@@ -19,7 +19,7 @@ from lidarsim.numerics.even_samples import even_indices
 from ..clouds.rings import elevations
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
-_MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
+_MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep submaps steps
 _MAX_STEPS = 3.0  # of a ring's own step, over the typical step
 _MIN_STEP_RAD = np.radians(0.02)  # closer returns are of one pulse
 _MIN_RETURNS = 8  # of a ring whose steps are known
@@ -28,15 +28,15 @@ _MAX_GAP_M = 5.0  # wide, of lost pulses on a surface that returns nothing: a si
 _MAX_STEP_M = 0.5
 _MAX_STEP_PER_M = 0.2
 _COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
-_ANSWERING_SWEEPS = 100  # that show these cells
+_COVERAGE_SWEEPS = 100  # that show these cells
 _LOW_RAD = np.radians(-3)  # elevation of rings that see the ground
-_MIN_ANSWERING = 0.1  # share of the sweeps in which a cell of such a ring has a return
+_MIN_RETURN_SHARE = 0.1  # share of the sweeps in which a cell of such a ring has a return
 _SECTORS = 360  # of azimuth, in which all rings may be empty
 _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no packet came
 
 
 def lost_pulses(
-    sweep: Sweep, elevation_rad: Floats, answering: Answering, moved_m: float
+    sweep: Sweep, elevation_rad: Floats, coverage: SensorCoverage, moved_m: float
 ) -> tuple[Sweep, Floats]:
     """Return the lost pulses of a sweep, as points a meter away, and the ranges around their gaps.
 
@@ -47,7 +47,7 @@ def lost_pulses(
     elevation_rad
         (r,): of the rings, radians; empty for a sensor without rings, whose lost pulses are
         unknown.
-    answering
+    coverage
         Where the sensor has returns at all.
     moved_m
         How far the sensor moved during the sweep, if points are compensated; else 0.
@@ -60,7 +60,7 @@ def lost_pulses(
     """
     if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
         return sweep.select(slice(0)), np.empty(0)
-    gaps = _Gaps.of_sweep(sweep)
+    gaps = _Gaps.from_sweep(sweep)
     lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
     circle = np.arange(-np.pi, np.pi, np.median(gaps.step_rad))
@@ -79,7 +79,7 @@ def lost_pulses(
         columns["start_rad"] = ring_starts(sweep, len(elevation_rad))[ring]
     pulses = Sweep(directions, columns)
     received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    chosen = received & answering.cells[_cells(pulses)]
+    chosen = received & coverage.cells[_cells(pulses)]
     return pulses.select(chosen), range_m[chosen]
 
 
@@ -94,7 +94,7 @@ def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
 
 def firings_per_turn(sweep: Sweep) -> int:
     """Return the number of steps of a revolution, by the typical step between returns of a ring."""
-    return round(2 * np.pi / float(np.median(_Gaps.of_sweep(sweep).step_rad)))
+    return round(2 * np.pi / float(np.median(_Gaps.from_sweep(sweep).step_rad)))
 
 
 class _Lost(NamedTuple):
@@ -118,7 +118,7 @@ class _Gaps(NamedTuple):
     step_rad: Floats  # (n,): between the azimuths of neighboring pulses of the ring
 
     @classmethod
-    def of_sweep(cls, sweep: Sweep) -> _Gaps:
+    def from_sweep(cls, sweep: Sweep) -> _Gaps:
         """Sort the returns of a sweep."""
         azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
         order = np.lexsort((azimuth, sweep.columns["row"]))
@@ -186,18 +186,18 @@ def _sectors(azimuth: Floats) -> Ints:
     return np.asarray(np.floor(azimuth / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS)
 
 
-class Answering(NamedTuple):
+class SensorCoverage(NamedTuple):
     """Where a sensor has returns at all."""
 
     cells: Bools  # (r, c): rings and columns; in the others the carrier hides all
     max_range_m: float  # of a return
 
     @classmethod
-    def of_sweeps(cls, sweeps: RecordedSweeps) -> Answering:
+    def from_sweeps(cls, sweeps: RecordedSweeps) -> SensorCoverage:
         """Look where any sweep has a return; LidarError if the recording cannot be read."""
         returned = np.zeros((sweeps.ring_count, _COLUMNS), np.int64)
         max_range_m = 0.0
-        numbers = even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist()
+        numbers = even_indices(sweeps.count, _COVERAGE_SWEEPS).tolist()
         for number in numbers:
             sweep = sweeps.read(number)
             cells = np.zeros_like(returned, bool)
@@ -208,7 +208,7 @@ class Answering(NamedTuple):
         # Below the horizon is the ground, unless the carrier hides it in most sweeps.
         is_low = np.zeros(sweeps.ring_count, bool)
         is_low[: len(sweeps.elevation_rad)] = sweeps.elevation_rad < _LOW_RAD
-        least = np.where(is_low, _MIN_ANSWERING * len(numbers), 0)
+        least = np.where(is_low, _MIN_RETURN_SHARE * len(numbers), 0)
         return cls(returned > least[:, None], max_range_m)
 
 

@@ -1,4 +1,4 @@
-"""Processes that rebuild the stretches of a drive: of a cluster, of this machine, or this one."""
+"""Processes that rebuild the submaps of a drive: of a cluster, of this machine, or this one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..run.cluster.connection import check_starts_workers
 from ..run.pipeline.stage_names import OTHER
 from .finished_steps import Map
 
-_STRETCH_BYTES = 3 << 30  # that a process takes for a stretch, of a sensor with 64 rings
+_SUBMAP_BYTES = 3 << 30  # that a process takes for a submap, of a sensor with 64 rings
 # Dask would stop processes that take more than their share of the memory, and so would lose them.
 _UNLIMITED = dict.fromkeys(
     (f"distributed.worker.memory.{limit}" for limit in ("target", "spill", "pause", "terminate")),
@@ -46,7 +46,7 @@ def mapping(client: Client | None, count: int) -> Iterator[Map]:
     LidarError
         If this process cannot start worker processes.
     """
-    workers = min(count, CPU_COUNT, max(1, memory() // _STRETCH_BYTES))
+    workers = min(count, CPU_COUNT, max(1, memory() // _SUBMAP_BYTES))
     if client is not None:
         yield partial(_map, Partition(OTHER, client))
     elif workers == 1:

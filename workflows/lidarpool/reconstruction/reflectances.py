@@ -19,7 +19,7 @@ import numpy as np
 from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
 
 from .alignment import AlignedSweep
-from .surface_map import Observations, Seen
+from .surface_map import Observations, SurfelHits
 
 _ROUNDS = 12  # of factors and reflectances in turn
 _RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100, 130, 200, np.inf)
@@ -94,19 +94,19 @@ class Response:
         law = self.model.law(range_m, cosine)
         return np.asarray(factors * self.by_ring[ring] * self.white * law)
 
-    def reflectances(self, seen: Observations, centers: Floats) -> Reflectances:
+    def reflectances(self, observations: Observations, centers: Floats) -> Reflectances:
         """Return the reflectances of surfels with centers (m, 3).
 
         Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
         """
         from scipy.spatial import cKDTree
 
-        seen = seen.part(np.isfinite(seen.intensity))
+        observations = observations.part(np.isfinite(observations.intensity))
         count = len(centers)
-        expected = self.factors(seen.range_m, seen.cosine, seen.ring)
-        law = self.model.law(seen.range_m, seen.cosine)
-        intensity = np.minimum(seen.intensity, self.brightest * law)
-        surfels = _ratios(seen.surfel, intensity, expected, np.full(count, np.nan))
+        expected = self.factors(observations.range_m, observations.cosine, observations.ring)
+        law = self.model.law(observations.range_m, observations.cosine)
+        intensity = np.minimum(observations.intensity, self.brightest * law)
+        surfels = _ratios(observations.surfel, intensity, expected, np.full(count, np.nan))
         known = np.isfinite(surfels)
         if known.any():
             _, nearest = cKDTree(centers[known]).query(centers[~known])
@@ -133,14 +133,14 @@ class Reflectances:
     surfels: Floats  # (m,): 0.01 to 1
     response: Response
 
-    def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
+    def intensities(self, sweep: AlignedSweep, hits: SurfelHits) -> Floats:
         """Return the simulated intensities (n,) of the rays of a sweep, on the recorded scale.
 
         They are NaN for rays that meet nothing.
         """
-        law = self.response.model.simulated(seen.distance_m, seen.cosine)
+        law = self.response.model.simulated(hits.distance_m, hits.cosine)
         intensities = np.full(len(sweep.points), np.nan)
-        intensities[seen.rays] = self.surfels[seen.surfel] * law * self.response.scale
+        intensities[hits.rays] = self.surfels[hits.surfel] * law * self.response.scale
         return intensities
 
 
@@ -155,22 +155,24 @@ def fit_response(
     relative, because energies span several decades, and near surfaces would decide alone. Sums, not
     logarithms, are compared: many sensors report dark surfaces as 0.
     """
-    seen = Observations.joined(parts)
-    seen = seen.part(np.isfinite(seen.intensity) & (seen.cosine > _MIN_COSINE))
-    if not (seen.intensity > 0).any():
+    observations = Observations.concatenate(parts)
+    observations = observations.part(
+        np.isfinite(observations.intensity) & (observations.cosine > _MIN_COSINE)
+    )
+    if not (observations.intensity > 0).any():
         return None
     models = (IntensityModel.ENERGIES,) if are_energies else tuple(IntensityModel)
-    fits = [_Factors.of_rays(seen, model, ring_count) for model in models]
+    fits = [_Factors.from_rays(observations, model, ring_count) for model in models]
     best = fits[0]
     if fits[-1].difference < _MAX_DIFFERENCE * best.difference:
         best = fits[-1]
     # Reflectances of 1 are white: the factors take what is above. Surfels that few rays met
     # scatter, so rays count.
-    reflectance = best.reflectance[seen.surfel]
+    reflectance = best.reflectance[observations.surfel]
     white = max(float(np.quantile(reflectance, _WHITE_SHARE)), 1e-6 * best.brightest)
     typical = float(np.nanmedian(best.reflectance)) / white
     simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
-    simulated *= best.model.simulated(seen.range_m, seen.cosine)
+    simulated *= best.model.simulated(observations.range_m, observations.cosine)
     scale = float(best.intensity.sum() / simulated.sum())
     by_range, by_incidence, by_ring = best.factors
     return Response(
@@ -179,7 +181,7 @@ def fit_response(
 
 
 class _Factors(NamedTuple):
-    """Factors by range, incidence and ring, and reflectances of surfels, NaN if not seen."""
+    """Factors by range, incidence and ring, and reflectances of surfels, NaN if not observations."""
 
     model: IntensityModel
     intensity: Floats  # (k,): those of reflectors as those of white surfaces
@@ -189,32 +191,38 @@ class _Factors(NamedTuple):
     difference: float  # mean, of intensities, over their sum
 
     @classmethod
-    def of_rays(cls, seen: Observations, model: IntensityModel, ring_count: int) -> _Factors:
+    def from_rays(
+        cls, observations: Observations, model: IntensityModel, ring_count: int
+    ) -> _Factors:
         """Fit factors and reflectances in turn to the intensities of rays.
 
         A surface is met by few ranges, incidences and rings: what these do not tell stays.
         """
-        law = model.law(seen.range_m, seen.cosine)
-        brightest = float(np.quantile(seen.intensity / law, _WHITE_QUANTILE))
-        intensity = np.minimum(seen.intensity, brightest * law)
-        unknown = np.full(int(seen.surfel.max()) + 1, np.nan)
-        rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
+        law = model.law(observations.range_m, observations.cosine)
+        brightest = float(np.quantile(observations.intensity / law, _WHITE_QUANTILE))
+        intensity = np.minimum(observations.intensity, brightest * law)
+        unknown = np.full(int(observations.surfel.max()) + 1, np.nan)
+        rows: list[Integers] = [
+            _range_bin(observations.range_m),
+            _incidence_bin(observations.cosine),
+            observations.ring,
+        ]
         counts = (len(_RANGE_EDGES_M) - 1, _INCIDENCE_BINS, ring_count)
         factors = [np.ones(count) for count in counts]
         reflectance = unknown
         product = law
         for _ in range(_ROUNDS):
             product = law * np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
-            reflectance = _ratios(seen.surfel, intensity, product, unknown)
+            reflectance = _ratios(observations.surfel, intensity, product, unknown)
             for index, row in enumerate(rows):
                 others = product / factors[index][row]
-                expected = others * reflectance[seen.surfel]
+                expected = others * reflectance[observations.surfel]
                 factors[index] = _ratios(row, intensity, expected, factors[index])
                 factors[index] /= np.average(
                     factors[index], weights=np.bincount(row, minlength=len(factors[index]))
                 )
                 product = others * factors[index][row]
-        expected = reflectance[seen.surfel] * product
+        expected = reflectance[observations.surfel] * product
         difference = np.abs(expected - intensity) / np.maximum(expected + intensity, 1e-300)
         return cls(model, intensity, factors, reflectance, brightest, float(difference.mean()))
 

@@ -1,4 +1,4 @@
-"""What processes do with the stretches of a drive: they align the sweeps, and rebuild the place."""
+"""What processes do with the submaps of a drive: they align the sweeps, and rebuild the surface_map."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from .alignment import AlignedSweeps, Alignment, align
-from .charts import Above, SweepImages
-from .free_space import standing_points
-from .held_out import HeldOut, hold_out
-from .lost_pulses import Answering
+from .charts import SweepImages, TopViewPoints
+from .free_space import find_stationary_points
+from .held_out import HeldOutRays, simulate_held_out
+from .lost_pulses import SensorCoverage
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
-from .submaps import AlignedStretch, Stretch
-from .surface_map import Observations, Place, build_place
+from .submaps import AlignedSubmap, Submap
+from .surface_map import Observations, SurfaceMap, build_surface_map
 from .surfels import Surfels, surfel_mesh
 
 
 @dataclass(frozen=True, eq=False)
-class StretchTask:
-    """A stretch of a drive.
+class SubmapTask:
+    """A submap of a drive.
 
     Attributes
     ----------
@@ -34,25 +34,25 @@ class StretchTask:
         All sweeps.
     alignment
         Of all sweeps.
-    stretch
-        Sweeps of the stretch, and around.
+    submap
+        Sweeps of the submap, and around.
     mapped
         int64, ascending: sweeps of the drive whose points make the map.
     """
 
     recorded: RecordedSweeps
     alignment: Alignment
-    stretch: Stretch
+    submap: Submap
     mapped: Ints
 
 
 @dataclass(frozen=True, eq=False)
-class BuildTask(StretchTask):
-    """A stretch whose place is built.
+class BuildTask(SubmapTask):
+    """A submap whose place is built.
 
     Attributes
     ----------
-    answering
+    coverage
         Where the sensor has returns at all.
     compared
         int64, ascending: held-out sweeps of the drive that are compared.
@@ -62,19 +62,19 @@ class BuildTask(StretchTask):
         Share of the points that are drawn from above.
     """
 
-    answering: Answering
+    coverage: SensorCoverage
     compared: Ints
     voxel_m: float
     drawn_share: float
 
     def read(self) -> AlignedSweeps:
-        """Read the sweeps of the stretch and around, and keep these."""
-        recorded = self.recorded.keeping(self.stretch.numbers.tolist())
-        return AlignedSweeps(recorded, self.alignment, self.answering)
+        """Read the sweeps of the submap and around, and keep these."""
+        recorded = self.recorded.keeping(self.submap.numbers.tolist())
+        return AlignedSweeps(recorded, self.alignment, self.coverage)
 
 
-class StretchSurfels(NamedTuple):
-    """Surfels of a stretch, and numbers of the points of its own sweeps."""
+class SubmapSurfels(NamedTuple):
+    """Surfels of a submap, and numbers of the points of its own sweeps."""
 
     corners: Floats  # (m, 4, 3): meters
     dark_corners: Floats  # (d, 4, 3): of surfels that return nothing
@@ -84,9 +84,9 @@ class StretchSurfels(NamedTuple):
     moved: Ints  # (k,): of these, on things that moved
 
     @classmethod
-    def of_surfels(
+    def from_surfels(
         cls, surfels: Surfels, chosen: Bools, standing: Mapping[int, Bools], own: Ints
-    ) -> StretchSurfels:
+    ) -> SubmapSurfels:
         """Return the arrays of chosen surfels (m,), and numbers of points of its `own` sweeps."""
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         lit = chosen & ~surfels.dark
@@ -111,40 +111,44 @@ class StretchSurfels(NamedTuple):
         return replace(surfel_mesh(name, self.corners), materials=materials)
 
 
-BuiltStretch = tuple[StretchSurfels, Observations, HeldOut | None, SweepImages | None, Above]
+BuiltSubmap = tuple[
+    SubmapSurfels, Observations, HeldOutRays | None, SweepImages | None, TopViewPoints
+]
 
 
-def align_stretch(task: StretchTask) -> tuple[AlignedStretch]:
-    """Align the sweeps of a stretch; LidarError if these show hardly any planes."""
-    aligned = align(task.recorded, task.alignment, task.stretch.numbers, set(task.mapped.tolist()))
-    return (AlignedStretch.of_alignment(aligned),)
+def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
+    """Align the sweeps of a submap; LidarError if these show hardly any planes."""
+    aligned = align(task.recorded, task.alignment, task.submap.numbers, set(task.mapped.tolist()))
+    return (AlignedSubmap.from_alignment(aligned),)
 
 
-def build_stretch(task: BuildTask) -> BuiltStretch:
-    """Build the place of a stretch, and compare held-out sweeps; LidarError if nothing stands."""
-    stretch = task.stretch
+def build_submap(task: BuildTask) -> BuiltSubmap:
+    """Build the place of a submap, and compare held-out sweeps; LidarError if nothing stands."""
+    submap = task.submap
     sweeps = task.read()
-    standing = standing_points(sweeps, stretch.numbers.tolist())
+    standing = find_stationary_points(sweeps, submap.numbers.tolist())
     held_out, images = compared_sweeps(sweeps, task, standing)
-    place = build_place(sweeps, standing, task.voxel_m)
-    own = stretch.owns(place.surfels.centers, task.alignment.poses)
-    seen = place.observations(sweeps, standing).of_surfels(own & ~place.surfels.dark)
-    surfels = StretchSurfels.of_surfels(place.surfels, own, standing, stretch.own_numbers)
-    above = Above.of_sweeps(sweeps, standing, stretch.own_numbers, task.drawn_share)
-    return surfels, seen, held_out, images, above
+    surface_map = build_surface_map(sweeps, standing, task.voxel_m)
+    own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
+    observations = surface_map.observations(sweeps, standing).select_surfels(
+        own & ~surface_map.surfels.dark
+    )
+    surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, standing, submap.own_numbers)
+    top_view = TopViewPoints.from_sweeps(sweeps, standing, submap.own_numbers, task.drawn_share)
+    return surfels, observations, held_out, images, top_view
 
 
 def compared_sweeps(
     sweeps: AlignedSweeps, task: BuildTask, standing: Mapping[int, Bools]
-) -> tuple[HeldOut | None, SweepImages | None]:
-    """Compare held-out sweeps of a stretch with the place that the others make.
+) -> tuple[HeldOutRays | None, SweepImages | None]:
+    """Compare held-out sweeps of a submap with the place that the others make.
 
     Parameters
     ----------
     sweeps
         The sweeps, at their places.
     task
-        The stretch. Without sweeps of its own to compare, nothing is.
+        The submap. Without sweeps of its own to compare, nothing is.
     standing
         Which points of the sweeps stand: {number: (n,)}.
 
@@ -158,35 +162,35 @@ def compared_sweeps(
     LidarError
         If too few points stand.
     """
-    stretch = task.stretch
-    compared = np.intersect1d(task.compared, stretch.own_numbers).tolist()
+    submap = task.submap
+    compared = np.intersect1d(task.compared, submap.own_numbers).tolist()
     if not compared:
         return None, None
-    mapped = np.intersect1d(stretch.numbers, task.mapped).tolist()
-    place, reflectances = rebuild(sweeps, mapped, task.voxel_m)
-    rays = hold_out(sweeps, place, reflectances, standing, compared)
+    mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
+    surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
+    rays = simulate_held_out(sweeps, surface_map, reflectances, standing, compared)
     with_points = np.unique(rays.sweep[rays.returned])
     if not len(with_points):
         return rays, None
     drawn = int(with_points[len(with_points) // 2])
-    return rays, SweepImages.of_sweep(sweeps, place, reflectances, drawn)
+    return rays, SweepImages.from_sweep(sweeps, surface_map, reflectances, drawn)
 
 
-def rebuild(
+def build_map_with_reflectances(
     sweeps: AlignedSweeps, numbers: list[int], voxel_m: float
-) -> tuple[Place, Reflectances | None]:
+) -> tuple[SurfaceMap, Reflectances | None]:
     """Build the place of some sweeps alone, without what moved.
 
     Returns its reflectances, too, or None without intensities; LidarError if too few points stand.
     """
-    standing = standing_points(sweeps, numbers)
-    place = build_place(sweeps, standing, voxel_m)
-    seen = place.observations(sweeps, standing)
+    standing = find_stationary_points(sweeps, numbers)
+    surface_map = build_surface_map(sweeps, standing, voxel_m)
+    observations = surface_map.observations(sweeps, standing)
     response = fit_response(
-        [seen],
+        [observations],
         sweeps.recorded.ring_count,
         are_energies=sweeps.recorded.recording.energies,
     )
     if response is None:
-        return place, None
-    return place, response.reflectances(seen, place.surfels.centers)
+        return surface_map, None
+    return surface_map, response.reflectances(observations, surface_map.surfels.centers)

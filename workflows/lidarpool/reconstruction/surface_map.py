@@ -32,7 +32,7 @@ from .surfels import Surfels
 _ROUNDS = 3  # of casting, leaving surfels out, and moving them
 _MAX_SHIFT_M = 0.3  # difference of ranges beyond which a ray moves no surfel
 _SHIFT_PRIOR = 1.0  # rays that would leave a surfel where it is
-_VOTING_SWEEPS = 40  # of a stretch at most, evenly chosen
+_VOTING_SWEEPS = 40  # of a submap at most, evenly chosen
 _ON_SURFEL_M = 0.06  # distance to the plane of a surfel within which a point is on it
 _VIEW_CELL_M = 0.5  # edge of the cells in which ranges of points are compared
 _CELL_BITS = 21  # of a coordinate of a cell: places repeat every million meters
@@ -51,7 +51,7 @@ class Observations(NamedTuple):
     intensity: AnyFloats  # (k,): NaN where the recording has none
 
     @classmethod
-    def joined(cls, parts: Sequence[Observations]) -> Observations:
+    def concatenate(cls, parts: Sequence[Observations]) -> Observations:
         """Join rays at different surfels, which are numbered in turn."""
         counts = [int(part.surfel.max(initial=-1)) + 1 for part in parts]
         starts = np.cumsum(counts) - counts
@@ -61,7 +61,7 @@ class Observations(NamedTuple):
         ]
         return cls(*map(np.concatenate, zip(*shifted, strict=True)))
 
-    def of_surfels(self, chosen: Bools) -> Observations:
+    def select_surfels(self, chosen: Bools) -> Observations:
         """Return the rays of chosen surfels (m,), which are numbered anew."""
         numbers = (np.cumsum(chosen) - 1).astype(np.int32)
         rays = self.part(chosen[self.surfel])
@@ -78,7 +78,7 @@ class Observations(NamedTuple):
         )
 
 
-class Seen(NamedTuple):
+class SurfelHits(NamedTuple):
     """Surfels that the rays of a sweep meet, as arrays of the k rays that meet a surfel."""
 
     rays: Ints  # (k,): indices of the points of the sweep
@@ -97,31 +97,31 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class SurfaceMap:
     """Surfels, and the caster of rays at these."""
 
     surfels: Surfels
     caster: RayCaster
 
     @classmethod
-    def of_surfels(cls, surfels: Surfels) -> Place:
+    def from_surfels(cls, surfels: Surfels) -> SurfaceMap:
         """Make the caster of some surfels."""
         return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
 
-    def see(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Seen:
+    def cast(self, sweep: AlignedSweep, chosen: Bools | None = None) -> SurfelHits:
         """Cast the rays of a sweep, or the rays of its points that `chosen` (n,) marks."""
         rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
         directions = sweep.world[rows] - sweep.origins[rows]
-        hits = self.caster.cast(sweep.origins[rows], directions)
-        met = np.flatnonzero(hits.hit)
-        surfel = hits.triangle[met].astype(np.int64) // 2
+        ray_hits = self.caster.cast(sweep.origins[rows], directions)
+        met = np.flatnonzero(ray_hits.hit)
+        surfel = ray_hits.triangle[met].astype(np.int64) // 2
         range_m = np.linalg.norm(directions[met], axis=1)
         normals = self.surfels.normals[surfel]
         offsets = sweep.world[rows[met]] - self.surfels.centers[surfel]
         off_plane_m = np.abs(np.einsum("ij,ij->i", offsets, normals))
         inward = np.einsum("ij,ij->i", directions[met], normals) / range_m
-        return Seen(
-            rows[met], surfel, hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
+        return SurfelHits(
+            rows[met], surfel, ray_hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
         )
 
     def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
@@ -137,19 +137,19 @@ class Place:
         offset_m = []
         for number in _some(standing):
             sweep, lost = sweeps.read_with_lost(number)
-            seen = self.see(sweep, standing[number])
-            ends = seen.ends
-            farther_m = seen.range_m - seen.distance_m
-            dark = self.surfels.dark[seen.surfel]
+            hits = self.cast(sweep, standing[number])
+            ends = hits.ends
+            farther_m = hits.range_m - hits.distance_m
+            dark = self.surfels.dark[hits.surfel]
             passing = ~ends & (farther_m > _ON_RAY_M)
-            votes += np.bincount(seen.surfel[ends & ~dark], minlength=count)
+            votes += np.bincount(hits.surfel[ends & ~dark], minlength=count)
             votes -= np.bincount(
-                seen.surfel[np.where(dark, ends | passing, passing)], minlength=count
+                hits.surfel[np.where(dark, ends | passing, passing)], minlength=count
             )
-            votes += sign * np.bincount(self.see(lost).surfel, minlength=count)
+            votes += sign * np.bincount(self.cast(lost).surfel, minlength=count)
             moving = ~dark & (ends | (np.abs(farther_m) < _MAX_SHIFT_M))
-            surfel.append(seen.surfel[moving])
-            offset_m.append((farther_m * seen.inward)[moving])
+            surfel.append(hits.surfel[moving])
+            offset_m.append((farther_m * hits.inward)[moving])
         shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
         supported = votes >= self.surfels.dark  # a dark surfel needs a pulse that is lost
         if not supported.any():
@@ -163,15 +163,15 @@ class Place:
         parts: list[Observations] = []
         for number in _some(standing):
             sweep = sweeps.read(number)
-            seen = self.see(sweep, standing[number])
-            ends = seen.ends & ~self.surfels.dark[seen.surfel]
-            rays = seen.rays[ends]
+            hits = self.cast(sweep, standing[number])
+            ends = hits.ends & ~self.surfels.dark[hits.surfel]
+            rays = hits.rays[ends]
             parts.append(
                 Observations(
-                    seen.surfel[ends].astype(np.int32),
+                    hits.surfel[ends].astype(np.int32),
                     sweep.ring[rays].astype(np.int32),
-                    seen.range_m[ends].astype(np.float32),
-                    seen.cosine[ends].astype(np.float32),
+                    hits.range_m[ends].astype(np.float32),
+                    hits.cosine[ends].astype(np.float32),
                     np.full(len(rays), np.nan, np.float32)
                     if sweep.intensities is None
                     else sweep.intensities[rays].astype(np.float32),
@@ -180,7 +180,9 @@ class Place:
         return Observations(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float) -> Place:
+def build_surface_map(
+    sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float
+) -> SurfaceMap:
     """Build the place of the points that stand, or raise LidarError if too few stand."""
     points, outward, labels = _standing(sweeps, standing)
     if not len(points):
@@ -189,14 +191,14 @@ def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: f
         )
     name = Path(sweeps.name).name
     gap_rad = sweeps.recorded.gap_rad
-    surfels = Surfels.of_points(name, points, outward, voxel_m, gap_rad, labels)
+    surfels = Surfels.from_points(name, points, outward, voxel_m, gap_rad, labels)
     dark_points, dark_outward = _dark(sweeps, standing)
     if Surfels.are_enough(dark_points, voxel_m):
-        dark = Surfels.of_points(name, dark_points, dark_outward, voxel_m, gap_rad)
+        dark = Surfels.from_points(name, dark_points, dark_outward, voxel_m, gap_rad)
         surfels = surfels.with_dark(dark)
     for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
-        surfels = Place.of_surfels(surfels).refined(sweeps, standing)
-    return Place.of_surfels(surfels)
+        surfels = SurfaceMap.from_surfels(surfels).refined(sweeps, standing)
+    return SurfaceMap.from_surfels(surfels)
 
 
 def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Floats, Floats]:

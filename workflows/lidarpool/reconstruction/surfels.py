@@ -77,7 +77,7 @@ class Surfels:
     def with_dark(self, others: Surfels) -> Surfels:
         """Return these surfels, and others that return nothing."""
         dark = np.append(self.dark, np.ones(len(others), bool))
-        return Surfels(joined_surfels([self.mesh, others.mesh]), dark)
+        return Surfels(merge_surfels([self.mesh, others.mesh]), dark)
 
     @staticmethod
     def are_enough(points: Floats, voxel_m: float) -> bool:
@@ -86,7 +86,7 @@ class Surfels:
         return len(cells) > 2 * _NEIGHBORS[-1]
 
     @classmethod
-    def of_points(
+    def from_points(
         cls,
         name: str,
         points: Floats,
@@ -161,7 +161,7 @@ def surfel_centers(mesh: SceneMesh) -> Floats:
     return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
-def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
+def merge_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
     """Return the surfels of meshes as one mesh, with the name of the first."""
     sizes = [len(mesh.faces) for mesh in meshes]
     return SceneMesh(

@@ -27,7 +27,7 @@ class VoxelPlanes:
     thickness_m: float  # median standard deviation of the neighbors along the normals
 
     @classmethod
-    def of_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
+    def from_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
         """Find planes among points (n, 3) of a recording, or return None without planes.
 
         LidarError if the points are too far apart to be sorted into voxels.
