@@ -227,7 +227,7 @@ def meshes(
 ) -> tuple[SceneMesh, list[SceneMesh]]:
     """Return a mesh of the reflecting surfels, with colors, and a mesh of the others, if any."""
     dark = surface_map.surfels.dark
-    lit = surface_map.surfels.part(~dark).mesh
+    lit = surface_map.surfels.select(~dark).mesh
     if reflectances is not None:
         lit = colored(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
     corners = surface_map.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]

@@ -285,7 +285,7 @@ def test_poses_by_registration_are_moved_to_the_stamps():
         poses = RecordedPoses(
             matrices, 0.1 * np.arange(4), "from registration", np.zeros(3), 0.5, first_s
         )
-        found = Alignment.unaligned(poses, 0.1, Motion.TIMED, 1)
+        found = Alignment.from_poses(poses, 0.1, Motion.TIMED, 1)
         np.testing.assert_allclose(found.poses[:, 0, 3], np.arange(4) + moved_m, atol=1e-9)
 
 

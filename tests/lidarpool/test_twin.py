@@ -411,7 +411,7 @@ def test_kept_sweeps_are_as_they_were_read(drive):
         return Sweep(points, columns | {"label": np.full(len(points), 50)})
 
     sweeps = RecordedSweeps.from_recording(Recording("drive", len(opened), read))
-    kept = sweeps.keeping([2, 5])
+    kept = sweeps.with_cached([2, 5])
     for number in (2, 5, 7):
         one, other = sweeps.read(number), kept.read(number)
         assert set(one.columns) == {"row", "intensity", "label", "start_rad"}
@@ -427,7 +427,7 @@ def test_kept_sweeps_need_half_the_memory(drive, tmp_path):
     sweeps = RecordedSweeps.open(tmp_path / "drive.mcap")
     sweep = sweeps.read(3)
     arrays = [sweep.points, *sweep.columns.values()]
-    kept_bytes = len(pickle.dumps(sweeps.keeping([3]))) - len(pickle.dumps(sweeps))
+    kept_bytes = len(pickle.dumps(sweeps.with_cached([3]))) - len(pickle.dumps(sweeps))
     assert kept_bytes < 0.5 * sum(values.nbytes for values in arrays)
 
 
@@ -464,7 +464,7 @@ def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
         for step_s, whole_m in ((0.1, 2.0), (0.2, 1.0)):
             times_s = np.array([0, step_s])
             alignment = Alignment(poses, times_s, 0.1, 0.1, motion, np.zeros((1, 3)))
-            moved, origins = alignment.compensated(sweep, 0)
+            moved, origins = alignment.compensate(sweep, 0)
             np.testing.assert_allclose(origins[:, 0], whole_m * np.array(expected))
             np.testing.assert_allclose(moved, points + origins)
 

@@ -94,12 +94,12 @@ def test_poses_go_over_from_one_submap_to_the_next():
     assert found.plane_distance_m[border - 1] == 0.01
     assert found.plane_distance_m[border] == 0.02
     # A single submap is as it was aligned, and a sweep that does not count moves with the next.
-    turn = MotionStep(np.array([0, 0, 0.01]), np.array([0, 0.1, 0])).part(1.0)
+    turn = MotionStep(np.array([0, 0, 0.01]), np.array([0, 0.1, 0])).fraction(1.0)
     (whole,) = split_into_submaps(poses[:60, :3, 3])
     some = replace(whole, numbers=whole.numbers[:-1], own=slice(0, 59))
     moved = np.array([pose @ turn for pose in poses[:59]])
     offsets = AlignedSubmap(moved, np.zeros((4, 3)), np.array([0.1]), np.zeros(59))
-    one = merge_alignments(first.part(np.arange(60)), [some], [offsets])
+    one = merge_alignments(first.select(np.arange(60)), [some], [offsets])
     np.testing.assert_array_equal(one.poses[:59], moved)
     expected = moved[58] @ np.linalg.inv(poses[58]) @ poses[59]
     np.testing.assert_allclose(one.poses[59], expected)

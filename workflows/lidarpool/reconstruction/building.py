@@ -1,4 +1,4 @@
-"""Rebuilds a place from a recording: the scene, the drive, the sensor, and how near they come."""
+"""Reconstruct a scene, the drive and the sensor from a recording, and measure the accuracy."""
 
 from __future__ import annotations
 
@@ -70,25 +70,26 @@ SENSOR_FILE = "sensor.yaml"
 SCENARIO_FILE = "scenario.yaml"
 FIGURES_FILE = "twin.json"
 PAGE_FILE = "report.html"
-_COLUMNS = ["time", "intensity", "reflectivity", "class"]  # that the export to KITTI requires, too
+# includes the columns that the KITTI export requires
+_COLUMNS = ["time", "intensity", "reflectivity", "class"]
 DEFAULT_VOXEL_M = 0.1
-_FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
-_COMPARED_SWEEPS = 12  # of the held-out sweeps
+_FIT_SWEEPS = 13  # sweeps to which the sensor noise is fitted
+_COMPARED_SWEEPS = 12  # held-out sweeps that are compared
 _POSE_DECIMALS = 6
-_RESPONSE_SUBMAPS = 4  # that tell the response of the sensor
+_RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
 _POSES = TwinStep("poses", (RecordedPoses,))
 _ALIGN = TwinStep("align", (AlignedSubmap,))
 _BUILD = TwinStep("build", (SubmapSurfels, Observations, HeldOutRays, SweepImages, TopViewPoints))
-NO_RETURN = "no return"  # name of the object of dark surfels
-_ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # which are written even by default
+NO_RETURN = "no return"  # object name of surfels that return no pulses
+_ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
 _RATE_DECIMALS = 4
-_MIN_STEP_S = 1e-5  # between poses of the trajectory
-_MIN_LEAD = 0.01  # of a revolution, by which a stamp is after the first point
-_MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
+_MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
+_MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
+_MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
 
 
 class TwinPose(NamedTuple):
-    """Pose at a time."""
+    """Pose of the sensor at a time."""
 
     pose: Floats  # (4, 4)
     time_s: float
@@ -96,27 +97,29 @@ class TwinPose(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """A place that was reconstructed from a recording, with the recorded drive and the sensor.
+    """Static scene that was reconstructed from a recording, with the recorded drive and sensor.
 
     Attributes
     ----------
     scene
-        The place as surfels, with reflectances as colors and classes as materials.
+        The scene as surfels, with reflectances as colors and classes as materials.
     poses
-        Transformations from the sensor frame at the stamp of each sweep to the scene frame. float64
-        array of shape (s, 4, 4).
+        Transformations from the sensor frame at the timestamp of each sweep to the scene frame.
+        float64 array of shape (s, 4, 4).
     times_s
-        Stamps of the sweeps in seconds since the first. float64 array of shape (s,).
+        Timestamps of the sweeps in seconds since the first. float64 array of shape (s,).
     start, stop
-        Poses as in `poses`, and times as in `times_s`, of the first point of the first sweep and
-        of the end of the last sweep.
+        Pose and time of the first point of the first sweep, and of the end of the last sweep, in
+        the same frames as `poses` and `times_s`.
     origin
         Origin of the scene frame in the world frame of the recorded poses, in meters. float64 array
         of shape (3,).
     model
-        The recorded sensor, with the fitted noise.
+        The recorded sensor with the fitted noise.
     figures
         Statistics and texts of the report. Lengths are in meters.
+    pictures
+        Charts of the report by name.
     """
 
     scene: Scene
@@ -136,6 +139,11 @@ class Twin:
         """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
 
         The folder is created if it does not exist.
+
+        Returns
+        -------
+        list of Path
+            The written files.
 
         Raises
         ------
@@ -166,16 +174,16 @@ class Twin:
             return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
 
     def _classes(self) -> dict[int, str]:
-        """Return the names of the materials of surfels with a class of the recording."""
+        """Return the material names of surfels with a recorded class, by class number."""
         materials = self.scene.materials
         names = () if materials is None else sorted({*chain.from_iterable(materials.names)})
         numbers = {int(name.removeprefix(CLASS_MATERIAL)): name for name in names if name}
         return {number: numbers[number] for number in sorted(numbers) if number >= 0}
 
     def _trajectory(self) -> str:
-        """Return the table of the poses, from the start of the first sweep to the end of the last.
+        """Format the trajectory as CSV, from the start of the first sweep to the end of the last.
 
-        Otherwise a simulation would lack the last sweep.
+        If the trajectory ended at the last timestamp, a simulation would omit the last sweep.
         """
         before = [self.start] if self.start.time_s < self.times_s[0] else []
         after = [self.stop] if self.stop.time_s > self.times_s[-1] + _MIN_STEP_S else []
@@ -188,7 +196,7 @@ class Twin:
         return "\n".join(lines) + "\n"
 
     def _scenario(self) -> str:
-        """Return a scenario of the recording's sensor on its drive through the place."""
+        """Format a scenario that simulates the recorded sensor on its drive through the scene."""
         scenario: dict[str, Any] = {
             "scene": SCENE_FILE,
             "sensor": SENSOR_FILE,
@@ -296,7 +304,7 @@ def twin(
         if not isinstance(recording, Recording):
             recording = open_recording(recording, sensor, intensity, name="the recording")
         recorded = RecordedSweeps.from_recording(recording)
-    _check(recorded)
+    _check_sweeps(recorded)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
@@ -305,15 +313,15 @@ def twin(
     with ExitStack() as stack:
         if folder is None:
             folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
-        made_of = (_stated(recorded, track), voxel_m)
+        made_of = (_fingerprint_inputs(recorded, track), voxel_m)
         steps = FinishedSteps.begin(Path(folder), made_of, resume=resume)
         built = _Building(recorded, base, voxel_m, steps, client, tell).twin(track)
         steps.remove()
     return built
 
 
-def _check(recorded: RecordedSweeps) -> None:
-    """Raise LidarError if a place cannot be made of the sweeps."""
+def _check_sweeps(recorded: RecordedSweeps) -> None:
+    """Raise LidarError if the sweeps cannot be reconstructed."""
     recording = recorded.recording
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
@@ -325,10 +333,10 @@ def _check(recorded: RecordedSweeps) -> None:
         )
 
 
-def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
-    """Return what was chosen, and names, sizes and times of change of files that twins are of.
+def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
+    """Return what determines a twin: its source, and the names, sizes and change times of files.
 
-    Nothing is the same as a recording in memory.
+    A recording in memory has no such identity, so it never matches a previous one.
     """
     source = recorded.source
     if isinstance(source, Recording):
@@ -347,7 +355,7 @@ def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
 
 @dataclass(frozen=True, eq=False)
 class _Building:
-    """What a twin is built of, and how."""
+    """Steps that reconstruct a twin, with their settings."""
 
     recorded: RecordedSweeps
     base: SensorModel | None
@@ -357,10 +365,10 @@ class _Building:
     tell: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
-        """Build the twin."""
+        """Reconstruct the twin."""
         recorded = self.recorded
         self.tell(f"estimating the poses of {plural(recorded.count, 'sweep')}")
-        poses = self._poses(trajectory)
+        poses = self._find_poses(trajectory)
         self.tell(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
         submaps = split_into_submaps(first.poses[:, :3, 3])
@@ -379,14 +387,12 @@ class _Building:
         )
         is_shared = not isinstance(recorded.source, Recording)
         with mapping(self.client, len(submaps) if is_shared else 1) as run:
-            task = replace(task, alignment=self._aligned(run, task, submaps))
-            built = self._built(run, task, submaps)
+            task = replace(task, alignment=self._align_submaps(run, task, submaps))
+            built = self._build_submaps(run, task, submaps)
             sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
-            return self._finished(built, sweeps, poses)
+            return self._assemble(built, sweeps, poses)
 
-    def _poses(self, trajectory: Path | None) -> RecordedPoses:
-        """Return the poses of all sweeps."""
-
+    def _find_poses(self, trajectory: Path | None) -> RecordedPoses:
         def find() -> tuple[RecordedPoses]:
             return (find_poses(self.recorded, trajectory),)
 
@@ -395,8 +401,8 @@ class _Building:
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
 
-    def _aligned(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> Alignment:
-        """Align all sweeps."""
+    def _align_submaps(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> Alignment:
+        """Align all sweeps, submap by submap."""
         self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
             SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
@@ -404,8 +410,8 @@ class _Building:
         aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
         return merge_alignments(task.alignment, submaps, aligned)
 
-    def _built(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> _Built:
-        """Build the places of all submaps."""
+    def _build_submaps(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> _Built:
+        """Build the surface maps of all submaps."""
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
         share = STANDING_DOTS / max(count, 1.0)
@@ -418,12 +424,12 @@ class _Building:
         return _Built(parts, submaps)
 
     def _load_observations(self, index: int) -> Observations:
-        """Return the rays that end on surfels of a submap."""
+        """Load the rays that end on the surfels of a submap."""
         observations: Observations = self.steps.load(_BUILD, index)[1]
         return observations
 
-    def _finished(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
-        """Fit the response and the noise of the sensor, and make the twin."""
+    def _assemble(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
+        """Fit the response and the noise of the sensor, and assemble the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
         self.tell("fitting the sensor model")
@@ -434,14 +440,14 @@ class _Building:
             are_energies=recorded.recording.energies,
         )
         name = Path(recorded.recording.name).name
-        # The points of a submap may all belong to its neighbors.
+        # All points of a submap may belong to its neighbors.
         meshes = {
             index: part.surfels.mesh(name)
             for index, part in enumerate(built.parts)
             if len(part.surfels.corners)
         }
         timing = SweepTiming.from_sweeps(sweeps)
-        model, notes = self._sensor(built, sweeps, meshes, response, timing)
+        model, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
@@ -453,7 +459,7 @@ class _Building:
                 *recorded.recording.notes,
                 *recorded.notes,
                 *notes,
-                *_drive_notes(alignment),
+                *_stationary_notes(alignment),
             ],
         }
         pictures = {
@@ -485,7 +491,7 @@ class _Building:
             pictures=pictures,
         )
 
-    def _sensor(
+    def _fit_sensor(
         self,
         built: _Built,
         sweeps: AlignedSweeps,
@@ -493,7 +499,7 @@ class _Building:
         response: Response | None,
         timing: SweepTiming,
     ) -> tuple[SensorModel, list[str]]:
-        """Return the sensor with the noise of its pulses on a part of the place, and notes."""
+        """Return the sensor with noise that is fitted to the middle of the drive, and notes."""
         middle = len(built.parts) // 2
         numbers = built.submaps[middle].own_numbers
         sizes = built.parts[middle].surfels.points
@@ -514,7 +520,7 @@ class _Building:
         return model, notes
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
-        """Return the figures of the place and of the drive."""
+        """Return statistics of the reconstruction and of the drive."""
         path = alignment.poses[:, :3, 3]
         surfels = [part.surfels for part in built.parts]
         return {
@@ -538,7 +544,7 @@ class _Building:
 
 
 class _BuiltSubmap(NamedTuple):
-    """What is kept of a submap in memory."""
+    """Results of a submap that are kept in memory."""
 
     surfels: SubmapSurfels
     held_out: HeldOutRays | None
@@ -548,7 +554,7 @@ class _BuiltSubmap(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Built:
-    """The places of all submaps."""
+    """Results of all submaps."""
 
     parts: Sequence[_BuiltSubmap]
     submaps: Sequence[Submap]
@@ -560,12 +566,15 @@ class _Built:
         )
 
     def dark(self) -> list[SceneMesh]:
-        """Return the surfels that return nothing as at most one mesh."""
+        """Return at most one mesh, which contains the surfels that return no pulses."""
         corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
         return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
     def images(self) -> SweepImages:
-        """Return the images of a held-out sweep in the middle, or raise LidarError without one."""
+        """Return the images of a held-out sweep in the middle of the drive.
+
+        Raise LidarError if there is none.
+        """
         images = [part.images for part in self.parts if part.images is not None]
         if not images:
             raise LidarError(
@@ -576,20 +585,21 @@ class _Built:
 
 
 class SweepTiming(NamedTuple):
-    """When sweeps start, relative to their stamps, and how the sensor rotates."""
+    """Start times of sweeps relative to their timestamps, and the rotation of the sensor."""
 
-    rate_hz: float  # revolutions in a second
-    revolutions: int  # with those whose sweeps were dropped
-    first_s: float  # from the stamp of a sweep to its start, at most 0
+    rate_hz: float  # revolutions per second
+    revolutions: int  # includes dropped sweeps
+    first_s: float  # time from the timestamp of a sweep to its start, at most 0
     rotation: Rotation | None  # None if unknown
 
     @classmethod
     def from_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
-        """Find the timing of sweeps."""
+        """Determine the timing of sweeps."""
         recorded = sweeps.recorded
         alignment = sweeps.alignment
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
-        # Stamps jitter, and their mean step does not, if steps with dropped sweeps count as many.
+        # Timestamps jitter, but their mean interval does not. An interval with dropped sweeps
+        # counts as several intervals.
         steps = max(round(span_s / alignment.sweep_s), 1)
         rate_hz = round(steps / span_s, _RATE_DECIMALS)
         period_s = 1 / rate_hz
@@ -601,23 +611,23 @@ class SweepTiming(NamedTuple):
         return cls(rate_hz, steps + 1, first_s, rotation)
 
     def start(self, alignment: Alignment) -> TwinPose:
-        """Return the start of the first sweep."""
+        """Return the pose and time at the start of the first sweep."""
         step, step_s = alignment.step(0)
-        pose = alignment.poses[0] @ step.part(self.first_s / step_s)
+        pose = alignment.poses[0] @ step.fraction(self.first_s / step_s)
         return TwinPose(pose, float(alignment.times_s[0]) + self.first_s)
 
     def stop(self, alignment: Alignment) -> TwinPose:
-        """Return the end of the last sweep, to which its motion goes on."""
+        """Return the pose and time at the end of the last sweep, extrapolating its motion."""
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
         rest_s = self.first_s + self.revolutions / self.rate_hz - span_s
         step, step_s = alignment.step(len(alignment.poses) - 1)
-        pose = alignment.poses[-1] @ step.part(rest_s / step_s)
+        pose = alignment.poses[-1] @ step.fraction(rest_s / step_s)
         return TwinPose(pose, float(alignment.times_s[-1]) + rest_s)
 
     def sensor(self, sweeps: AlignedSweeps, number: int) -> SensorModel | None:
-        """Return a sensor with the recorded rings and rotation, or None without rings.
+        """Return a sensor with the recorded rings and rotation, or None if there are no rings.
 
-        The steps of azimuth are those of a sweep.
+        The azimuth step is determined from the sweep `number`.
         """
         recorded = sweeps.recorded
         if not len(recorded.elevation_rad):
@@ -645,39 +655,41 @@ def fit_sensor(
     response: Response | None,
     sensor: SensorModel | None,
 ) -> tuple[SensorModel, list[str]]:
-    """Fit the noise of a sensor to its pulses on a place.
+    """Fit the noise of a sensor to its pulses on reconstructed surfaces.
 
     Parameters
     ----------
     sweeps
-        Sweeps, at their places.
+        Aligned sweeps.
     sizes
-        Numbers of points of the sweeps that may be read: {number of the sweep: points}.
+        Number of points by sweep number, for the sweeps that may be read.
     scene
-        The place.
+        The reconstructed surfaces.
     response
-        How intensities follow from reflectances; None without intensities.
+        Response of the sensor, or None if there are no intensities.
     sensor
-        The sensor without noise, which may only be None for a recording with rings.
+        The sensor without noise. It must not be None if the recording has no rings.
 
     Returns
     -------
     tuple
-        The sensor, and notes.
+        The sensor with noise, and notes for the user.
     """
     assert sensor is not None
     if not len(sweeps.recorded.elevation_rad):
         return sensor, ["without rings, the sensor noise is that of the sensor model"]
-    # A sweep with few points, as with lost packets, looks like one of another sensor.
+    # A sweep with few points, for example due to lost packets, would look as if it came from a
+    # different sensor.
     counts = np.array([*sizes.values()])
     whole = np.array([*sizes])[counts >= np.median(counts) / 2]
     some = whole[even_indices(len(whole), 2 * _FIT_SWEEPS)]
-    # Compensated sweeps may be tilted against the sensor, so that their rings are no cones.
+    # Motion-compensated sweeps may be tilted relative to the sensor, in which case their rings are
+    # not cones.
     spread_rad = [sweeps.recorded.cone_spread_rad(number) for number in some.tolist()]
     chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]])
     try:
-        fitted = _fitted(sweeps, chosen, scene, response)
-    except LidarError as error:  # the place is there, and a scan of it needs no noise
+        fitted = _fit_to_sweeps(sweeps, chosen, scene, response)
+    except LidarError as error:  # The reconstruction is usable without fitted noise.
         return sensor, [f"the sensor noise is unknown: {error}"]
     performance = fitted.model.performance
     if performance is None:
@@ -692,11 +704,13 @@ def fit_sensor(
     return SensorModel.model_validate(sensor.model_dump() | changes), []
 
 
-def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None) -> Fit:
-    """Fit a sensor to chosen sweeps on a place, or raise LidarError.
+def _fit_to_sweeps(
+    sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None
+) -> Fit:
+    """Fit a sensor to the chosen sweeps, or raise LidarError.
 
-    Points as fired have a pose for each pulse. Compensated ones have none: their rings are blurred,
-    and steps of azimuth beside near things look like lost pulses.
+    Points as fired have a firing pose for each pulse. Motion-compensated points have none, so their
+    rings are blurred, and parallax at close objects looks like lost pulses.
     """
     recorded = sweeps.recorded
     poses = sweeps.alignment.poses[chosen]
@@ -705,7 +719,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
 
     def with_points(sweep: Sweep, points: Floats, **fields: Any) -> Sweep:
         intensity = sweep.intensity
-        if intensity is not None:  # as an energy, white at 10 m is 1
+        if intensity is not None:  # convert to energy, where white at 10 m is 1
             intensity = intensity / (white if are_energies and white else 1)
         channel = recorded.ring_count - 1 - sweep.columns["row"]
         return sweep.with_columns(channel=channel, intensity=intensity).replace(
@@ -715,7 +729,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     def fired(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
-        as_fired = sweeps.alignment.fired(sweep, number)
+        as_fired = sweeps.alignment.points_as_fired(sweep, number)
         assert as_fired is not None
         points, firing_poses = as_fired
         return with_points(sweep, points, firing_poses=firing_poses)
@@ -723,7 +737,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     def compensated(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
-        return with_points(sweep, sweeps.aligned(sweep, number).points)
+        return with_points(sweep, sweeps.align(sweep, number).points)
 
     is_compensated = sweeps.alignment.motion is Motion.COMPENSATED
     recording = Recording(
@@ -739,8 +753,8 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)
 
 
-def _drive_notes(alignment: Alignment) -> list[str]:
-    """Return a note on a sensor that stood."""
+def _stationary_notes(alignment: Alignment) -> list[str]:
+    """Return a note if the sensor was stationary."""
     if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
         return []
     return [
@@ -752,13 +766,13 @@ def _drive_notes(alignment: Alignment) -> list[str]:
 
 
 def _median(values: Floats) -> float | None:
-    """Return the median of the values that are known, or None."""
+    """Return the median of the finite values, or None if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
 
 
 def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
-    """Return the mesh of surfels, whose colors are their reflectances."""
+    """Color the surfels of a mesh by their reflectances."""
     if reflectances is None:
         return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)

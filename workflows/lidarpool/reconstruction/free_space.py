@@ -63,7 +63,7 @@ class RangeImage:
             maximum_filter(farthest, 3, mode=modes),
         )
 
-    def judge(self, points: Floats) -> tuple[Bools, Bools]:
+    def classify(self, points: Floats) -> tuple[Bools, Bools]:
         """Return which points (n, 3) in the sensor frame rays pass, and which they confirm."""
         elevation = elevations(points)
         cells = _cells(points, self.edges_rad)
@@ -108,7 +108,7 @@ def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dic
                 continue
             other = numbers[index + offset]
             pose = sweeps.alignment.poses[other]
-            passed, confirmed = images[other].judge((world - pose[:3, 3]) @ pose[:3, :3])
+            passed, confirmed = images[other].classify((world - pose[:3, 3]) @ pose[:3, :3])
             passing += passed
             confirming += confirmed
         moved = (passing > confirming) | ((passing >= _MIN_PASSING) & (passing >= confirming))

@@ -63,7 +63,7 @@ class MotionStep(NamedTuple):
             pose[:3, :3].T @ (following[:3, 3] - pose[:3, 3]),
         )
 
-    def part(self, share: float) -> Floats:
+    def fraction(self, share: float) -> Floats:
         """Return the motion (4, 4) of a share of the step."""
         from scipy.spatial.transform import Rotation
 
@@ -72,7 +72,7 @@ class MotionStep(NamedTuple):
         moved[:3, 3] = share * self.translation
         return moved
 
-    def compensated(self, points: Floats, shares: Floats) -> Floats:
+    def compensate(self, points: Floats, shares: Floats) -> Floats:
         """Return points (n, 3), fired at shares (n,) of the step, in its first frame."""
         from scipy.spatial.transform import Rotation
 

@@ -47,7 +47,7 @@ class RecordedPoses(NamedTuple):
         """Whether the poses are not found by registration of the points."""
         return not self.share
 
-    def part(self, window: slice) -> RecordedPoses:
+    def select(self, window: slice) -> RecordedPoses:
         """Return the poses of some consecutive sweeps."""
         return self._replace(matrices=self.matrices[window], times_s=self.times_s[window])
 

@@ -138,7 +138,7 @@ class RecordedSweeps:
         """Whether the points are known to be motion-compensated, as in results of lidarpool."""
         return self.recording.fired is not None
 
-    def keeping(self, numbers: Iterable[int]) -> RecordedSweeps:
+    def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
         """Return a copy that holds some sweeps in memory.
 
         `numbers` are in ascending order, because bags can only be read from their start.

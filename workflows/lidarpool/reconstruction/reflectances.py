@@ -101,7 +101,7 @@ class Response:
         """
         from scipy.spatial import cKDTree
 
-        observations = observations.part(np.isfinite(observations.intensity))
+        observations = observations.select(np.isfinite(observations.intensity))
         count = len(centers)
         expected = self.factors(observations.range_m, observations.cosine, observations.ring)
         law = self.model.law(observations.range_m, observations.cosine)
@@ -156,7 +156,7 @@ def fit_response(
     logarithms, are compared: many sensors report dark surfaces as 0.
     """
     observations = Observations.concatenate(parts)
-    observations = observations.part(
+    observations = observations.select(
         np.isfinite(observations.intensity) & (observations.cosine > _MIN_COSINE)
     )
     if not (observations.intensity > 0).any():

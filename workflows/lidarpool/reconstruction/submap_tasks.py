@@ -69,7 +69,7 @@ class BuildTask(SubmapTask):
 
     def read(self) -> AlignedSweeps:
         """Read the sweeps of the submap and around, and keep these."""
-        recorded = self.recorded.keeping(self.submap.numbers.tolist())
+        recorded = self.recorded.with_cached(self.submap.numbers.tolist())
         return AlignedSweeps(recorded, self.alignment, self.coverage)
 
 

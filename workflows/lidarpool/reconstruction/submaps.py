@@ -162,7 +162,7 @@ def merge_alignments(
         distance_m[submap.own_numbers] = one.plane_distance_m[submap.own]
     for number in np.flatnonzero(twist.any(axis=1)).tolist():
         mean = twist[number] / total[number]
-        poses[number] = poses[number] @ MotionStep(mean[:3], mean[3:]).part(1.0)
+        poses[number] = poses[number] @ MotionStep(mean[:3], mean[3:]).fraction(1.0)
     counting = np.flatnonzero(total)
     for number in np.flatnonzero(total == 0).tolist():
         nearest = counting[np.abs(counting - number).argmin()]

@@ -64,10 +64,10 @@ class Observations(NamedTuple):
     def select_surfels(self, chosen: Bools) -> Observations:
         """Return the rays of chosen surfels (m,), which are numbered anew."""
         numbers = (np.cumsum(chosen) - 1).astype(np.int32)
-        rays = self.part(chosen[self.surfel])
+        rays = self.select(chosen[self.surfel])
         return rays._replace(surfel=numbers[rays.surfel])
 
-    def part(self, rays: Bools) -> Observations:
+    def select(self, rays: Bools) -> Observations:
         """Return selected rays."""
         return Observations(
             self.surfel[rays],
@@ -124,7 +124,7 @@ class SurfaceMap:
             rows[met], surfel, ray_hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
         )
 
-    def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
+    def refine(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
         """Return the surfels without those that more rays contradict than support.
 
         Each surfel that is not dark moves along its normal to the median of the rays that end on
@@ -156,7 +156,7 @@ class SurfaceMap:
             raise LidarError(
                 f"The sweeps of {sweeps.name} are inconsistent with each other. Check their poses."
             )
-        return self.surfels.moved(shifts_m).part(supported)
+        return self.surfels.shift_along_normals(shifts_m).select(supported)
 
     def observations(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Observations:
         """Return the rays that end on surfels."""
@@ -197,7 +197,7 @@ def build_surface_map(
         dark = Surfels.from_points(name, dark_points, dark_outward, voxel_m, gap_rad)
         surfels = surfels.with_dark(dark)
     for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
-        surfels = SurfaceMap.from_surfels(surfels).refined(sweeps, standing)
+        surfels = SurfaceMap.from_surfels(surfels).refine(sweeps, standing)
     return SurfaceMap.from_surfels(surfels)
 
 

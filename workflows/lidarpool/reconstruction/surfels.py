@@ -60,7 +60,7 @@ class Surfels:
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.maximum(lengths, 1e-12))
 
-    def part(self, rows: Bools) -> Surfels:
+    def select(self, rows: Bools) -> Surfels:
         """Return selected surfels."""
         mesh = self.mesh
         vertices = mesh.vertices.reshape(-1, 4, 3)[rows].reshape(-1, 3)
@@ -69,7 +69,7 @@ class Surfels:
         materials = None if mesh.materials is None else mesh.materials.take(both)
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
-    def moved(self, shifts_m: Floats) -> Surfels:
+    def shift_along_normals(self, shifts_m: Floats) -> Surfels:
         """Return the surfels moved along their normals by shifts (m,), meters."""
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
         return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
