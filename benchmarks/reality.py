@@ -45,7 +45,7 @@ from lidarpool.reconstruction.submap_tasks import (
     BuildTask,
     align_submap,
     build_map_with_reflectances,
-    compared_sweeps,
+    compare_held_out_sweeps,
 )
 from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
 from lidarpool.reconstruction.surface_map import SurfaceMap
@@ -140,10 +140,10 @@ def mapped_sweeps(count: int, rule: str) -> Ints:
 
 
 class HalfMap(NamedTuple):
-    """The place of every second sweep of a recording, to compare the others with."""
+    """Surface map of every second sweep of a recording, with which the others are compared."""
 
     sweeps: AlignedSweeps
-    mapped: list[int]  # numbers of the sweeps that make the place
+    mapped: list[int]  # numbers of the sweeps from which the map is built
     compared: list[int]  # numbers of some of the others
     surface_map: SurfaceMap
     reflectances: Reflectances | None
@@ -153,7 +153,7 @@ class HalfMap(NamedTuple):
     def of_recording(
         cls, recording: Recording, compared_sweeps: int, coverage: SensorCoverage | None = None
     ) -> HalfMap:
-        """Build the place of the last sweeps of a recording."""
+        """Build the map of the last sweeps of a recording."""
         recorded = RecordedSweeps.from_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
         mapped = mapped_sweeps(recorded.count, "easy").tolist()
         first = first_alignment(recorded, find_poses(recorded, None))
@@ -168,7 +168,7 @@ class HalfMap(NamedTuple):
         return cls(sweeps, mapped, compared, surface_map, reflectances, standing)
 
     def rays(self, numbers: Sequence[int], reflectances: Reflectances | None) -> HeldOutRays:
-        """Cast the rays of held-out sweeps at the surface_map."""
+        """Cast the rays of held-out sweeps in the map."""
         return simulate_held_out(
             self.sweeps, self.surface_map, reflectances, self.standing, numbers
         )
@@ -345,7 +345,7 @@ def _compared(task: BuildTask) -> HeldOutRays | None:
     """Return the rays of the held-out sweeps of a submap."""
     sweeps = task.read()
     standing = find_stationary_points(sweeps, task.submap.numbers.tolist())
-    rays, _ = compared_sweeps(sweeps, task, standing)
+    rays, _ = compare_held_out_sweeps(sweeps, task, standing)
     return rays
 
 

@@ -183,7 +183,7 @@ class Alignment:
     def _split_by_step(
         self, number: int, times_s: Floats
     ) -> Iterator[tuple[Bools, MotionStep, Floats]]:
-        """Yield masks of the points fired at `times_s`, with the step and the fraction of the step."""
+        """Yield masks of points, with the step that moves them and their fractions of the step."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)

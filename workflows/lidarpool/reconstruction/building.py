@@ -42,20 +42,20 @@ from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import (
-    STANDING_DOTS,
+    STATIONARY_DOTS,
     SweepImages,
     TopViewPoints,
     draw_errors,
     draw_sweep,
     draw_top_view,
 )
-from .finished_steps import FinishedSteps, Map, TwinStep
+from .finished_steps import FinishedSteps, MapFunction, TwinStep
 from .held_out import HeldOutRays
 from .labels import split_by_object
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
-from .processes import mapping
+from .processes import parallel_map
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
@@ -386,7 +386,7 @@ class _Building:
             drawn_share=0.0,
         )
         is_shared = not isinstance(recorded.source, Recording)
-        with mapping(self.client, len(submaps) if is_shared else 1) as run:
+        with parallel_map(self.client, len(submaps) if is_shared else 1) as run:
             task = replace(task, alignment=self._align_submaps(run, task, submaps))
             built = self._build_submaps(run, task, submaps)
             sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
@@ -401,7 +401,9 @@ class _Building:
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
 
-    def _align_submaps(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> Alignment:
+    def _align_submaps(
+        self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
+    ) -> Alignment:
         """Align all sweeps, submap by submap."""
         self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
@@ -410,11 +412,13 @@ class _Building:
         aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
         return merge_alignments(task.alignment, submaps, aligned)
 
-    def _build_submaps(self, run: Map, task: BuildTask, submaps: Sequence[Submap]) -> _Built:
+    def _build_submaps(
+        self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
+    ) -> _Built:
         """Build the surface maps of all submaps."""
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
-        share = STANDING_DOTS / max(count, 1.0)
+        share = STATIONARY_DOTS / max(count, 1.0)
         tasks = [replace(task, submap=one, drawn_share=share) for one in submaps]
         parts = []
         for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):

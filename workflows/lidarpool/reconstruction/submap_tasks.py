@@ -1,4 +1,4 @@
-"""What processes do with the submaps of a drive: they align the sweeps, and rebuild the surface_map."""
+"""Tasks of worker processes, which align the sweeps of a submap and build its surface map."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from .surfels import Surfels, surfel_mesh
 
 @dataclass(frozen=True, eq=False)
 class SubmapTask:
-    """A submap of a drive.
+    """A submap to align.
 
     Attributes
     ----------
     recorded
         All sweeps.
     alignment
-        Of all sweeps.
+        Alignment of all sweeps.
     submap
-        Sweeps of the submap, and around.
+        Sweeps of the submap and its surroundings.
     mapped
-        int64, ascending: sweeps of the drive whose points make the map.
+        Numbers of all sweeps whose points form the map, in ascending order. int64 array.
     """
 
     recorded: RecordedSweeps
@@ -48,18 +48,18 @@ class SubmapTask:
 
 @dataclass(frozen=True, eq=False)
 class BuildTask(SubmapTask):
-    """A submap whose place is built.
+    """A submap whose surface map is built.
 
     Attributes
     ----------
     coverage
-        Where the sensor has returns at all.
+        Directions in which the sensor can have returns.
     compared
-        int64, ascending: held-out sweeps of the drive that are compared.
+        Numbers of all held-out sweeps that are compared, in ascending order. int64 array.
     voxel_m
-        Edge of the voxels of which surfels are made.
+        Edge length in meters of the voxels from which surfels are created.
     drawn_share
-        Share of the points that are drawn from above.
+        Share of the points that are drawn in the top view.
     """
 
     coverage: SensorCoverage
@@ -68,31 +68,31 @@ class BuildTask(SubmapTask):
     drawn_share: float
 
     def read(self) -> AlignedSweeps:
-        """Read the sweeps of the submap and around, and keep these."""
+        """Read the sweeps of the submap and its surroundings into memory."""
         recorded = self.recorded.with_cached(self.submap.numbers.tolist())
         return AlignedSweeps(recorded, self.alignment, self.coverage)
 
 
 class SubmapSurfels(NamedTuple):
-    """Surfels of a submap, and numbers of the points of its own sweeps."""
+    """Surfels of a submap, with point counts of its own sweeps."""
 
-    corners: Floats  # (m, 4, 3): meters
-    dark_corners: Floats  # (d, 4, 3): of surfels that return nothing
+    corners: Floats  # (m, 4, 3), meters
+    dark_corners: Floats  # (d, 4, 3), meters, of surfels that return no pulses
     materials: AnyArray | None  # names
-    material: Ints32 | None  # (m,): rows of `materials`
-    points: Ints  # (k,): of each of its own sweeps
-    moved: Ints  # (k,): of these, on things that moved
+    material: Ints32 | None  # (m,), indices of `materials`
+    points: Ints  # (k,), points in each of its own sweeps
+    moved: Ints  # (k,), how many of them are on moving objects
 
     @classmethod
     def from_surfels(
-        cls, surfels: Surfels, chosen: Bools, standing: Mapping[int, Bools], own: Ints
+        cls, surfels: Surfels, chosen: Bools, stationary: Mapping[int, Bools], own: Ints
     ) -> SubmapSurfels:
-        """Return the arrays of chosen surfels (m,), and numbers of points of its `own` sweeps."""
+        """Extract the chosen surfels, and count the points of the sweeps in `own`."""
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         lit = chosen & ~surfels.dark
         materials = surfels.mesh.materials
         index = None if materials is None else materials.index
-        masks = [standing[number] for number in own.tolist()]
+        masks = [stationary[number] for number in own.tolist()]
         return cls(
             corners[lit],
             corners[chosen & surfels.dark],
@@ -103,7 +103,7 @@ class SubmapSurfels(NamedTuple):
         )
 
     def mesh(self, name: str) -> SceneMesh:
-        """Return the mesh of the surfels that return light."""
+        """Return a mesh of the surfels that return pulses."""
         materials = None
         if self.materials is not None:
             index = None if self.material is None else self.material.repeat(2)
@@ -117,50 +117,63 @@ BuiltSubmap = tuple[
 
 
 def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
-    """Align the sweeps of a submap; LidarError if these show hardly any planes."""
+    """Align the sweeps of a submap.
+
+    Raises
+    ------
+    LidarError
+        If the sweeps contain hardly any planes.
+    """
     aligned = align(task.recorded, task.alignment, task.submap.numbers, set(task.mapped.tolist()))
     return (AlignedSubmap.from_alignment(aligned),)
 
 
 def build_submap(task: BuildTask) -> BuiltSubmap:
-    """Build the place of a submap, and compare held-out sweeps; LidarError if nothing stands."""
-    submap = task.submap
-    sweeps = task.read()
-    standing = find_stationary_points(sweeps, submap.numbers.tolist())
-    held_out, images = compared_sweeps(sweeps, task, standing)
-    surface_map = build_surface_map(sweeps, standing, task.voxel_m)
-    own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
-    observations = surface_map.observations(sweeps, standing).select_surfels(
-        own & ~surface_map.surfels.dark
-    )
-    surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, standing, submap.own_numbers)
-    top_view = TopViewPoints.from_sweeps(sweeps, standing, submap.own_numbers, task.drawn_share)
-    return surfels, observations, held_out, images, top_view
-
-
-def compared_sweeps(
-    sweeps: AlignedSweeps, task: BuildTask, standing: Mapping[int, Bools]
-) -> tuple[HeldOutRays | None, SweepImages | None]:
-    """Compare held-out sweeps of a submap with the place that the others make.
-
-    Parameters
-    ----------
-    sweeps
-        The sweeps, at their places.
-    task
-        The submap. Without sweeps of its own to compare, nothing is.
-    standing
-        Which points of the sweeps stand: {number: (n,)}.
-
-    Returns
-    -------
-    tuple
-        The rays of its held-out sweeps, and images of one; None without a sweep with points.
+    """Build the surface map of a submap, and compare its held-out sweeps.
 
     Raises
     ------
     LidarError
-        If too few points stand.
+        If there are too few stationary points.
+    """
+    submap = task.submap
+    sweeps = task.read()
+    stationary = find_stationary_points(sweeps, submap.numbers.tolist())
+    held_out, images = compare_held_out_sweeps(sweeps, task, stationary)
+    surface_map = build_surface_map(sweeps, stationary, task.voxel_m)
+    own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
+    observations = surface_map.observations(sweeps, stationary).select_surfels(
+        own & ~surface_map.surfels.dark
+    )
+    surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, stationary, submap.own_numbers)
+    top_view = TopViewPoints.from_sweeps(sweeps, stationary, submap.own_numbers, task.drawn_share)
+    return surfels, observations, held_out, images, top_view
+
+
+def compare_held_out_sweeps(
+    sweeps: AlignedSweeps, task: BuildTask, stationary: Mapping[int, Bools]
+) -> tuple[HeldOutRays | None, SweepImages | None]:
+    """Compare the held-out sweeps of a submap with a map of its other sweeps.
+
+    Parameters
+    ----------
+    sweeps
+        Aligned sweeps.
+    task
+        The submap.
+    stationary
+        Masks of the stationary points, by sweep number.
+
+    Returns
+    -------
+    tuple
+        The rays of the held-out sweeps, or None if the submap has none, and images of one of them,
+        or None if none has points.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
     """
     submap = task.submap
     compared = np.intersect1d(task.compared, submap.own_numbers).tolist()
@@ -168,7 +181,7 @@ def compared_sweeps(
         return None, None
     mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
     surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
-    rays = simulate_held_out(sweeps, surface_map, reflectances, standing, compared)
+    rays = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
     with_points = np.unique(rays.sweep[rays.returned])
     if not len(with_points):
         return rays, None
@@ -179,13 +192,18 @@ def compared_sweeps(
 def build_map_with_reflectances(
     sweeps: AlignedSweeps, numbers: list[int], voxel_m: float
 ) -> tuple[SurfaceMap, Reflectances | None]:
-    """Build the place of some sweeps alone, without what moved.
+    """Build a surface map of some sweeps, and estimate its reflectances.
 
-    Returns its reflectances, too, or None without intensities; LidarError if too few points stand.
+    The reflectances are None if there are no intensities.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
     """
-    standing = find_stationary_points(sweeps, numbers)
-    surface_map = build_surface_map(sweeps, standing, voxel_m)
-    observations = surface_map.observations(sweeps, standing)
+    stationary = find_stationary_points(sweeps, numbers)
+    surface_map = build_surface_map(sweeps, stationary, voxel_m)
+    observations = surface_map.observations(sweeps, stationary)
     response = fit_response(
         [observations],
         sweeps.recorded.ring_count,
