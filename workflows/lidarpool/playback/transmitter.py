@@ -193,7 +193,7 @@ class Transmitter:
 
     @property
     def summary(self) -> str:
-        """Number of sent datagrams and how late they were, available after the context has ended."""
+        """Number of sent datagrams and how late they were, once the context has ended."""
         return f"{self.sender.lateness}."
 
     def __enter__(self) -> Self:
