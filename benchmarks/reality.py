@@ -35,15 +35,20 @@ from PIL import Image
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, align, first_alignment
 from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
-from lidarpool.reconstruction.free_space import standing_points
-from lidarpool.reconstruction.held_out import HeldOut, hold_out
-from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.free_space import find_stationary_points
+from lidarpool.reconstruction.held_out import HeldOutRays, simulate_held_out
+from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.reflectances import Reflectances
-from lidarpool.reconstruction.submap_tasks import BuildTask, align_stretch, compared_sweeps, rebuild
-from lidarpool.reconstruction.submaps import divide, joined
-from lidarpool.reconstruction.surface_map import Place
+from lidarpool.reconstruction.submap_tasks import (
+    BuildTask,
+    align_submap,
+    build_map_with_reflectances,
+    compare_held_out_sweeps,
+)
+from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
+from lidarpool.reconstruction.surface_map import SurfaceMap
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
@@ -51,9 +56,9 @@ from lidarsim.numerics.even_samples import even_indices
 
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20
-_HALF_SWEEPS = 80  # of a `HalfPlace`
+_HALF_SWEEPS = 80  # of a `HalfMap`
 _STATIC_VOXEL_M = 0.4
-_STATIC_SWEEPS = 10  # between sweeps that have points at the same place: a second
+_STATIC_SWEEPS = 10  # between sweeps that have points at the same surface_map: a second
 _RESAMPLES = 400  # of sweeps, for intervals
 _IMAGE_COLUMNS = 870  # of the cells in which two recorded sweeps are compared
 _TRAM = Path("exampleData/MuehlburgerTor/velodyne_dist")
@@ -134,35 +139,39 @@ def mapped_sweeps(count: int, rule: str) -> Ints:
     return numbers[~held_out]
 
 
-class HalfPlace(NamedTuple):
-    """The place of every second sweep of a recording, to compare the others with."""
+class HalfMap(NamedTuple):
+    """Surface map of every second sweep of a recording, with which the others are compared."""
 
     sweeps: AlignedSweeps
-    mapped: list[int]  # numbers of the sweeps that make the place
+    mapped: list[int]  # numbers of the sweeps from which the map is built
     compared: list[int]  # numbers of some of the others
-    place: Place
+    surface_map: SurfaceMap
     reflectances: Reflectances | None
     standing: dict[int, Bools]  # {number of any sweep: mask of its points that stand}
 
     @classmethod
     def of_recording(
-        cls, recording: Recording, compared_sweeps: int, answering: Answering | None = None
-    ) -> HalfPlace:
-        """Build the place of the last sweeps of a recording."""
+        cls, recording: Recording, compared_sweeps: int, coverage: SensorCoverage | None = None
+    ) -> HalfMap:
+        """Build the map of the last sweeps of a recording."""
         recorded = RecordedSweeps.from_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
         mapped = mapped_sweeps(recorded.count, "easy").tolist()
         first = first_alignment(recorded, find_poses(recorded, None))
         alignment = align(recorded, first, np.arange(recorded.count), mapped)
-        sweeps = AlignedSweeps(recorded, alignment, answering or Answering.of_sweeps(recorded))
+        sweeps = AlignedSweeps(
+            recorded, alignment, coverage or SensorCoverage.from_sweeps(recorded)
+        )
         held_out = np.arange(1, recorded.count - 1, 2)  # a mapped sweep follows each
         compared = held_out[even_indices(len(held_out), compared_sweeps)].tolist()
-        place, reflectances = rebuild(sweeps, mapped, DEFAULT_VOXEL_M)
-        standing = standing_points(sweeps, range(recorded.count))
-        return cls(sweeps, mapped, compared, place, reflectances, standing)
+        surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, DEFAULT_VOXEL_M)
+        standing = find_stationary_points(sweeps, range(recorded.count))
+        return cls(sweeps, mapped, compared, surface_map, reflectances, standing)
 
-    def rays(self, numbers: Sequence[int], reflectances: Reflectances | None) -> HeldOut:
-        """Cast the rays of held-out sweeps at the place."""
-        return hold_out(self.sweeps, self.place, reflectances, self.standing, numbers)
+    def rays(self, numbers: Sequence[int], reflectances: Reflectances | None) -> HeldOutRays:
+        """Cast the rays of held-out sweeps in the map."""
+        return simulate_held_out(
+            self.sweeps, self.surface_map, reflectances, self.standing, numbers
+        )
 
 
 def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:
@@ -198,7 +207,9 @@ def _cells(world: Floats) -> Ints:
     return np.floor(world / _STATIC_VOXEL_M).astype(np.int64)
 
 
-def to_next(sweeps: RecordedSweeps, numbers: Ints, answering: Answering) -> dict[str, float | None]:
+def to_next(
+    sweeps: RecordedSweeps, numbers: Ints, coverage: SensorCoverage
+) -> dict[str, float | None]:
     """Return how far the ranges of sweeps are from the ranges of the next recorded sweep.
 
     With the F1 of "no return", of cells in which the sensor has returns.
@@ -207,8 +218,8 @@ def to_next(sweeps: RecordedSweeps, numbers: Ints, answering: Answering) -> dict
         n: _range_image(sweeps, n) for n in np.unique([numbers, numbers + 1]) if n < sweeps.count
     }
     share = (np.arange(_IMAGE_COLUMNS) + 0.5) / _IMAGE_COLUMNS
-    columns = (share * answering.cells.shape[1]).astype(np.int64)
-    is_answering = answering.cells[:, columns]
+    columns = (share * coverage.cells.shape[1]).astype(np.int64)
+    is_covered = coverage.cells[:, columns]
     differences = []
     lost_in_both = 0
     lost = 0
@@ -218,7 +229,7 @@ def to_next(sweeps: RecordedSweeps, numbers: Ints, answering: Answering) -> dict
         one, following = images[number], images[number + 1]
         both = np.isfinite(one) & np.isfinite(following)
         differences.append(np.abs(one - following)[both])
-        is_lost, is_lost_next = (np.isnan(image) & is_answering for image in (one, following))
+        is_lost, is_lost_next = (np.isnan(image) & is_covered for image in (one, following))
         lost_in_both += int((is_lost & is_lost_next).sum())
         lost += int(is_lost.sum() + is_lost_next.sum())
     if not differences:
@@ -241,7 +252,9 @@ def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
     return image
 
 
-def interval(rays: HeldOut, figure: Callable[[HeldOut], float | None]) -> list[float] | None:
+def interval(
+    rays: HeldOutRays, figure: Callable[[HeldOutRays], float | None]
+) -> list[float] | None:
     """Return the interval that holds a figure with 95 %, by drawing sweeps again."""
     random = np.random.default_rng(0)
     numbers = np.unique(rays.sweep)
@@ -259,7 +272,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     source = SOURCES[name]
     rows = []
     whole = source.open(root / source.repository)
-    answering = Answering.of_sweeps(RecordedSweeps.from_recording(whole))
+    coverage = SensorCoverage.from_sweeps(RecordedSweeps.from_recording(whole))
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)
         recorded = RecordedSweeps.from_recording(recording)
@@ -269,7 +282,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
             if len(mapped) == recorded.count:
                 continue  # too few sweeps for a block between others
             started = time.perf_counter()
-            row = _row(recorded, poses, mapped, answering)
+            row = _row(recorded, poses, mapped, coverage)
             row |= {
                 "recording": f"{name}, {part}",
                 "rule": rule,
@@ -286,25 +299,25 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
 
 
 def _row(
-    recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Answering
+    recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, coverage: SensorCoverage
 ) -> dict[str, Any]:
     """Return the figures of the held-out sweeps of a recording."""
     first = first_alignment(recorded, poses)
-    stretches = divide(first.poses[:, :3, 3])
-    counting = np.concatenate([stretch.own_numbers for stretch in stretches])
+    submaps = split_into_submaps(first.poses[:, :3, 3])
+    counting = np.concatenate([submap.own_numbers for submap in submaps])
     held_out = np.setdiff1d(counting, mapped)
     compared = held_out[even_indices(len(held_out), _COMPARED_SWEEPS)]
     task = BuildTask(
-        recorded, first, stretches[0], mapped, answering, compared, DEFAULT_VOXEL_M, drawn_share=0.0
+        recorded, first, submaps[0], mapped, coverage, compared, DEFAULT_VOXEL_M, drawn_share=0.0
     )
-    aligned = [align_stretch(replace(task, stretch=stretch))[0] for stretch in stretches]
-    task = replace(task, alignment=joined(first, stretches, aligned))
-    sweeps = AlignedSweeps(recorded, task.alignment, answering)
-    rays = HeldOut.joined(
+    aligned = [align_submap(replace(task, submap=submap))[0] for submap in submaps]
+    task = replace(task, alignment=merge_alignments(first, submaps, aligned))
+    sweeps = AlignedSweeps(recorded, task.alignment, coverage)
+    rays = HeldOutRays.concatenate(
         [
             part
-            for stretch in stretches
-            if (part := _compared(replace(task, stretch=stretch))) is not None
+            for submap in submaps
+            if (part := _compared(replace(task, submap=submap))) is not None
         ]
     )
     static = static_points(sweeps, compared)
@@ -321,18 +334,18 @@ def _row(
             rays.select(rays.standing),
             lambda part: part.figures()["all"]["median_abs_difference_m"],
         ),
-        "next": to_next(recorded, compared, answering),
+        "next": to_next(recorded, compared, coverage),
         "motion": sweeps.alignment.motion.value,
         "plane_m": float(np.nanmedian(plane_m)),
-        "stretches": len(stretches),
+        "submaps": len(submaps),
     }
 
 
-def _compared(task: BuildTask) -> HeldOut | None:
-    """Return the rays of the held-out sweeps of a stretch."""
+def _compared(task: BuildTask) -> HeldOutRays | None:
+    """Return the rays of the held-out sweeps of a submap."""
     sweeps = task.read()
-    standing = standing_points(sweeps, task.stretch.numbers.tolist())
-    rays, _ = compared_sweeps(sweeps, task, standing)
+    standing = find_stationary_points(sweeps, task.submap.numbers.tolist())
+    rays, _ = compare_held_out_sweeps(sweeps, task, standing)
     return rays
 
 

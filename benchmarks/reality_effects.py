@@ -30,11 +30,11 @@ import numpy as np
 
 from lidarpool.reconstruction.alignment import AlignedSweeps
 from lidarpool.reconstruction.building import NO_RETURN, colored, fit_sensor
-from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.reflectances import Reflectances
-from lidarpool.reconstruction.surface_map import Place
+from lidarpool.reconstruction.surface_map import SurfaceMap
 from lidarpool.reconstruction.surfels import surfel_mesh
 from lidarsim import Material, Noise, Returns, Scanner, Scene
 from lidarsim.motion.trajectory import CENTER
@@ -44,7 +44,7 @@ from lidarsim.sensor.beams import Spin
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.sensor.ray_sensors import ListedSensor
 
-from .reality import SOURCES, HalfPlace, part_of
+from .reality import SOURCES, HalfMap, part_of
 
 _COMPARED_SWEEPS = 12
 _SUBRAYS = 19
@@ -65,7 +65,7 @@ class Rays:
     Attributes
     ----------
     origins, directions
-        float64 (n, 3): in the place, meters, and of length 1.
+        float64 (n, 3): in the surface_map, meters, and of length 1.
     recorded_m
         float64 (n,): NaN of a lost pulse.
     standing
@@ -131,7 +131,7 @@ def _neighbors(ring: Ints, azimuth: Floats) -> Bools:
 
 @dataclass(frozen=True, eq=False)
 class Effects:
-    """Effects of a sensor in a place."""
+    """Effects of a sensor in a surface_map."""
 
     noise: Noise
     returns: Returns
@@ -222,13 +222,15 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
     }
 
 
-def meshes(place: Place, reflectances: Reflectances | None) -> tuple[SceneMesh, list[SceneMesh]]:
+def meshes(
+    surface_map: SurfaceMap, reflectances: Reflectances | None
+) -> tuple[SceneMesh, list[SceneMesh]]:
     """Return a mesh of the reflecting surfels, with colors, and a mesh of the others, if any."""
-    dark = place.surfels.dark
-    lit = place.surfels.part(~dark).mesh
+    dark = surface_map.surfels.dark
+    lit = surface_map.surfels.select(~dark).mesh
     if reflectances is not None:
         lit = colored(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
-    corners = place.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]
+    corners = surface_map.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]
     return lit, [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
 
@@ -237,16 +239,16 @@ def measure(name: str, root: Path) -> list[dict[str, Any]]:
     source = SOURCES[name]
     base = read_model(MODELS.get(name, _DEFAULT_MODEL))
     whole = source.open(root / source.repository)
-    answering = Answering.of_sweeps(RecordedSweeps.from_recording(whole))
+    coverage = SensorCoverage.from_sweeps(RecordedSweeps.from_recording(whole))
     rows = []
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)
-        half = HalfPlace.of_recording(recording, _COMPARED_SWEEPS, answering)
+        half = HalfMap.of_recording(recording, _COMPARED_SWEEPS, coverage)
         found = _rows(half, base)
         if half.sweeps.alignment.motion is not Motion.COMPENSATED:
             # A recording that knows its firings is read as compensated.
             stated = replace(recording, fired=recording.read)
-            rebuilt = HalfPlace.of_recording(stated, _COMPARED_SWEEPS, answering)
+            rebuilt = HalfMap.of_recording(stated, _COMPARED_SWEEPS, coverage)
             row = _rows(rebuilt, base, only=_ALL)[0]
             found.append(row | {"effect": "without motion within the sweep"})
         for row in found:
@@ -256,18 +258,18 @@ def measure(name: str, root: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _rows(half: HalfPlace, base: SensorModel, only: str = "") -> list[dict[str, Any]]:
+def _rows(half: HalfMap, base: SensorModel, only: str = "") -> list[dict[str, Any]]:
     """Return the figures of held-out sweeps, with all effects and without each."""
-    place, reflectances = half.place, half.reflectances
+    surface_map, reflectances = half.surface_map, half.reflectances
     sizes = {number: len(half.standing[number]) for number in half.mapped}
-    lit, dark = meshes(place, reflectances)
+    lit, dark = meshes(surface_map, reflectances)
     bare = Scene.from_meshes([lit])
     response = None if reflectances is None else reflectances.response
     model, notes = fit_sensor(half.sweeps, sizes, bare, response, base)
     rays = Rays.of_sweeps(half.sweeps, half.standing, half.compared)
     print(f"{len(rays.recorded_m):,} rays, {model.performance}, {notes}", flush=True)
     scene = Scene.from_meshes([lit, *dark])
-    max_range_m = half.sweeps.answering.max_range_m + _RANGE_MARGIN_M
+    max_range_m = half.sweeps.coverage.max_range_m + _RANGE_MARGIN_M
     rows = []
     for effect, effects in Effects.of_model(model, reflectances is not None).without().items():
         if only not in ("", effect):
@@ -279,7 +281,7 @@ def _rows(half: HalfPlace, base: SensorModel, only: str = "") -> list[dict[str, 
     return rows
 
 
-def _rank(half: HalfPlace, reflectances: Reflectances, textured: bool) -> float | None:
+def _rank(half: HalfMap, reflectances: Reflectances, textured: bool) -> float | None:
     """Return the rank correlation of recorded and simulated intensities.
 
     Without a texture, all surfels are as bright.

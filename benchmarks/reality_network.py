@@ -24,7 +24,7 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 
-from .reality import SOURCES, HalfPlace
+from .reality import SOURCES, HalfMap
 
 _COMPARED_SWEEPS = 12
 _NAMES = ("udacity", "kitti360")  # HDL-64E with intensities, on cars
@@ -48,21 +48,21 @@ class Sweep(NamedTuple):
 def sweeps_of(name: str, root: Path) -> list[tuple[Sweep, Sweep, Sweep]]:
     """Return held-out sweeps of a recording: recorded, simulated, and the next recorded."""
     source = SOURCES[name]
-    half = HalfPlace.of_recording(source.open(root / source.repository), _COMPARED_SWEEPS)
+    half = HalfMap.of_recording(source.open(root / source.repository), _COMPARED_SWEEPS)
     return [
         (_recorded(half, number), _simulated(half, number), _recorded(half, number + 1))
         for number in half.compared
     ]
 
 
-def _recorded(half: HalfPlace, number: int) -> Sweep:
+def _recorded(half: HalfMap, number: int) -> Sweep:
     """Return a sweep as it was recorded."""
     sweep = half.sweeps.recorded.read(number)
     assert sweep.intensities is not None
     return Sweep(sweep.points, sweep.intensities, half.standing[number])
 
 
-def _simulated(half: HalfPlace, number: int) -> Sweep:
+def _simulated(half: HalfMap, number: int) -> Sweep:
     """Return what the rays of a sweep meet in the place, lost pulses included."""
     rays = half.rays([number], half.reflectances)
     points = np.concatenate([sweep.points for sweep in half.sweeps.read_with_lost(number)])

@@ -17,7 +17,7 @@ from lidarpool.clouds.writing import ExportSpec
 from lidarpool.playback import bridge as bridges
 from lidarpool.playback.bridge import Bridge
 from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry
-from lidarpool.playback.schedule import MadeAhead
+from lidarpool.playback.schedule import Prefetcher
 from lidarpool.playback.sources import open_source
 
 SCENARIO = """
@@ -116,8 +116,8 @@ def test_an_error_of_what_is_made_ahead_comes_at_its_place():
     def refuse():
         raise LidarError("no more")
 
-    with MadeAhead([lambda: 1, refuse, lambda: 2], 4) as made_ahead:
-        ahead = iter(made_ahead)
+    with Prefetcher([lambda: 1, refuse, lambda: 2], 4) as prefetcher:
+        ahead = iter(prefetcher)
         assert next(ahead) == 1
         with pytest.raises(LidarError, match="no more"):
             next(ahead)
@@ -133,14 +133,14 @@ def test_what_several_threads_make_ahead_comes_in_order():
         return number
 
     tasks = (partial(make, number) for number in range(10))
-    with MadeAhead(tasks, 4, threads=2) as made_ahead:
-        assert list(made_ahead) == list(range(10))
+    with Prefetcher(tasks, 4, threads=2) as prefetcher:
+        assert list(prefetcher) == list(range(10))
 
 
 def test_what_is_made_ahead_is_bounded_and_dropped_at_the_end():
     started = []
-    with MadeAhead((partial(started.append, k) for k in count()), 3, threads=2) as made_ahead:
-        ahead = iter(made_ahead)
+    with Prefetcher((partial(started.append, k) for k in count()), 3, threads=2) as prefetcher:
+        ahead = iter(prefetcher)
         for _ in range(5):
             next(ahead)
     assert 5 <= len(started) <= 5 + 3

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from lidarpool import LidarError, compare, twin
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
-from lidarpool.reconstruction.lost_pulses import Answering
+from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
@@ -255,7 +255,7 @@ def test_points_are_where_they_were_fired_whatever_their_times_count_from(
     poses = find_poses(sweeps, write_poses(tmp_path / "poses.txt", START_NS * 1e-9))
     alignment = first_alignment(sweeps, poses)
     assert alignment.motion is Motion.TIMED
-    aligned = AlignedSweeps(sweeps, alignment, Answering.of_sweeps(sweeps))
+    aligned = AlignedSweeps(sweeps, alignment, SensorCoverage.from_sweeps(sweeps))
     for number in range(1, SWEEPS - 1):  # the first and the last sweep have one neighbor
         world = aligned.read(number).world[:, :2]
         off_m = np.abs(HALF_SIZE - np.abs(world)).min(axis=1)
@@ -287,7 +287,7 @@ def test_poses_by_registration_are_moved_to_the_stamps():
         poses = RecordedPoses(
             matrices, 0.1 * np.arange(4), "from registration", np.zeros(3), 0.5, first_s
         )
-        found = Alignment.unaligned(poses, 0.1, Motion.TIMED, 1)
+        found = Alignment.from_poses(poses, 0.1, Motion.TIMED, 1)
         np.testing.assert_allclose(found.poses[:, 0, 3], np.arange(4) + moved_m, atol=1e-9)
 
 

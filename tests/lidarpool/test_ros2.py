@@ -201,12 +201,12 @@ def test_messages_of_all_types_are_read(dds):
 )
 def test_a_network_that_cannot_be_is_one_line(dds, hosts, environment, message):
     with pytest.raises(LidarError, match=message):
-        dds.Network.to(hosts, environment)
+        dds.Network.for_hosts(hosts, environment)
 
 
 def test_networks_are_on_loopback_unless_told_otherwise(dds):
-    assert dds.Network.to((), {}) == dds.Network("127.0.0.1", (), 0)
-    local = dds.Network.to(("localhost",), {"ROS_DOMAIN_ID": "7"})
+    assert dds.Network.for_hosts((), {}) == dds.Network("127.0.0.1", (), 0)
+    local = dds.Network.for_hosts(("localhost",), {"ROS_DOMAIN_ID": "7"})
     assert (local.address, local.peers, local.domain) == ("127.0.0.1", ("127.0.0.1",), 7)
     assert local.configuration.count("<Peer ") == 1
 

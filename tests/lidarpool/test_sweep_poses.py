@@ -11,7 +11,7 @@ from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.labels import divided, labels_of
+from lidarpool.reconstruction.labels import labels_of, split_by_object
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
@@ -70,7 +70,7 @@ def test_points_are_compensated_to_the_stamp_of_their_sweep(world, number):
     stamp_s = STAMPS_S[number]
     alignment = Alignment(poses(), STAMPS_S, 0.1, 0.2, Motion.TIMED, np.zeros((RINGS, 3)))
     fired = in_frame(world, stamp_s + times_s)
-    points, origins = alignment.compensated(sweep(fired, times_s), number)
+    points, origins = alignment.compensate(sweep(fired, times_s), number)
     sensors = np.stack([pose_at(time_s)[:3, 3] for time_s in stamp_s + times_s])
     np.testing.assert_allclose(points, in_frame(world, stamp_s), atol=1e-9)
     np.testing.assert_allclose(origins, in_frame(sensors, stamp_s), atol=1e-9)
@@ -86,14 +86,14 @@ def test_points_without_times_are_compensated_by_their_azimuth(motion, sign):
         [(pose_at(0.1 + 0.15 * t) @ [*p, 1])[:3] for t, p in zip(turns, fired, strict=True)]
     )
     alignment = Alignment(poses(), STAMPS_S, 0.15, 0.2, motion, np.zeros((RINGS, 3)))
-    points, _ = alignment.compensated(sweep(fired, start_rad=start_rad), 1)
+    points, _ = alignment.compensate(sweep(fired, start_rad=start_rad), 1)
     np.testing.assert_allclose(points, in_frame(world, 0.1), atol=1e-9)
 
 
 def test_compensated_points_stay_and_get_the_offsets_of_their_rings(world):
     offsets = np.array([[0.1, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, -0.02]])
     alignment = Alignment(poses(), STAMPS_S, 0.1, 0.2, Motion.COMPENSATED, offsets)
-    points, origins = alignment.compensated(sweep(world), 2)
+    points, origins = alignment.compensate(sweep(world), 2)
     x, y, z = world.T
     ranges, elevation, azimuth = (
         np.linalg.norm(world, axis=1),
@@ -117,10 +117,10 @@ def test_compensated_points_stay_and_get_the_offsets_of_their_rings(world):
 def test_poses_by_registration_are_moved_to_the_stamps_of_sweeps():
     registered = np.stack([pose_at(0.1 * n + 0.02 + 0.4 * 0.1) for n in range(5)])
     found = RecordedPoses(registered, 0.1 * np.arange(5), "", np.zeros(3), share=0.4, first_s=0.02)
-    alignment = Alignment.unaligned(found, 0.2, Motion.TIMED, RINGS)
+    alignment = Alignment.from_poses(found, 0.2, Motion.TIMED, RINGS)
     expected = np.stack([pose_at(0.1 * n) for n in range(5)])
     np.testing.assert_allclose(alignment.poses[:4], expected[:4], atol=1e-9)
-    kept = Alignment.unaligned(found, 0.2, Motion.COMPENSATED, RINGS)
+    kept = Alignment.from_poses(found, 0.2, Motion.COMPENSATED, RINGS)
     np.testing.assert_array_equal(kept.poses, registered)
 
 
@@ -174,9 +174,9 @@ def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     rows = np.unique(labels)
     names = tuple(f"{CLASS_MATERIAL}{label}" for label in rows.tolist())
     index = np.repeat(np.searchsorted(rows, labels), 2).astype(np.int32)
-    mesh = SceneMesh("Place", corners, surfel_faces(5), materials=FaceMaterials(names, index))
-    parts = divided(mesh)
-    assert [part.name for part in parts] == ["object 0", "object 2", "Place"]
+    mesh = SceneMesh("SurfaceMap", corners, surfel_faces(5), materials=FaceMaterials(names, index))
+    parts = split_by_object(mesh)
+    assert [part.name for part in parts] == ["object 0", "object 2", "SurfaceMap"]
     surfels = corners.reshape(5, 4, 3)
     for part, expected in zip(parts, ([1, 4], [0, 3], [2]), strict=True):
         np.testing.assert_array_equal(part.vertices.reshape(-1, 4, 3), surfels[expected])
@@ -192,10 +192,10 @@ def test_range_images_have_a_row_around_each_ring():
     points = ranges[:, None] * np.stack(
         [np.cos(elevation), 0 * elevation, np.sin(elevation)], axis=1
     )
-    image = RangeImage.of_points(points, elevation)
+    image = RangeImage.from_points(points, elevation)
     column = np.isfinite(image.nearest_m).all(axis=0)
     assert column.sum() == 3
     np.testing.assert_allclose(image.nearest_m[:, column].T, [[10, 10, 20, 30, 40]] * 3)
     np.testing.assert_allclose(image.farthest_m[:, column].T, [[20, 30, 40, 50, 50]] * 3)
-    passed, confirmed = image.judge(points * 0.5)
+    passed, confirmed = image.classify(points * 0.5)
     assert passed.tolist() == [True, False, True, True, True] and not confirmed[2:].any()

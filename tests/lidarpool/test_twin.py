@@ -34,7 +34,7 @@ from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.rings import Rings, elevations
 from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.lost_pulses import Answering, lost_pulses
+from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
@@ -194,8 +194,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
     sweep = Sweep(points, {"row": ring[rows]})
-    answering = Answering(np.ones((16, 720), bool), 50.0)
-    lost, _ = lost_pulses(sweep, elevation, answering, 0.0)
+    coverage = SensorCoverage(np.ones((16, 720), bool), 50.0)
+    lost, _ = lost_pulses(sweep, elevation, coverage, 0.0)
     expected = ~returned & received
     assert len(lost) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
@@ -205,10 +205,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
     # Second returns of the pulses, whose azimuths are rounded.
     both = Sweep.joined([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
-    assert len(lost_pulses(both, elevation, answering, 0.0)[0]) == pytest.approx(
-        len(lost), rel=0.01
-    )
-    unknown, _ = lost_pulses(sweep, np.empty(0), answering, 0.0)
+    assert len(lost_pulses(both, elevation, coverage, 0.0)[0]) == pytest.approx(len(lost), rel=0.01)
+    unknown, _ = lost_pulses(sweep, np.empty(0), coverage, 0.0)
     assert not len(unknown)
 
 
@@ -413,7 +411,7 @@ def test_kept_sweeps_are_as_they_were_read(drive):
         return Sweep(points, columns | {"label": np.full(len(points), 50)})
 
     sweeps = RecordedSweeps.from_recording(Recording("drive", len(opened), read))
-    kept = sweeps.keeping([2, 5])
+    kept = sweeps.with_cached([2, 5])
     for number in (2, 5, 7):
         one, other = sweeps.read(number), kept.read(number)
         assert set(one.columns) == {"row", "intensity", "label", "start_rad"}
@@ -429,7 +427,7 @@ def test_kept_sweeps_need_half_the_memory(drive, tmp_path):
     sweeps = RecordedSweeps.open(tmp_path / "drive.mcap")
     sweep = sweeps.read(3)
     arrays = [sweep.points, *sweep.columns.values()]
-    kept_bytes = len(pickle.dumps(sweeps.keeping([3]))) - len(pickle.dumps(sweeps))
+    kept_bytes = len(pickle.dumps(sweeps.with_cached([3]))) - len(pickle.dumps(sweeps))
     assert kept_bytes < 0.5 * sum(values.nbytes for values in arrays)
 
 
@@ -466,7 +464,7 @@ def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
         for step_s, whole_m in ((0.1, 2.0), (0.2, 1.0)):
             times_s = np.array([0, step_s])
             alignment = Alignment(poses, times_s, 0.1, 0.1, motion, np.zeros((1, 3)))
-            moved, origins = alignment.compensated(sweep, 0)
+            moved, origins = alignment.compensate(sweep, 0)
             np.testing.assert_allclose(origins[:, 0], whole_m * np.array(expected))
             np.testing.assert_allclose(moved, points + origins)
 

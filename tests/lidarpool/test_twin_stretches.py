@@ -1,4 +1,4 @@
-"""A long drive is rebuilt stretch by stretch: anywhere, in any order, and on after a kill."""
+"""A long drive is rebuilt submap by submap: anywhere, in any order, and on after a kill."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_clo
 from lidarpool.cli.commands import cli
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.finished_steps import STEPS_FOLDER
-from lidarpool.reconstruction.motion import Motion, Step
-from lidarpool.reconstruction.submaps import AlignedStretch, divide, joined
+from lidarpool.reconstruction.motion import Motion, MotionStep
+from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -39,67 +39,67 @@ def straight(count, step_m):
     return np.arange(count)[:, None] * np.array([step_m, 0.0, 0.0])
 
 
-def test_each_sweep_of_a_drive_is_of_one_stretch_and_sees_those_around():
+def test_each_sweep_of_a_drive_is_of_one_submap_and_sees_those_around():
     positions = straight(400, 0.5)
-    stretches = divide(positions)
-    assert len(stretches) == 5
-    own = np.concatenate([stretch.own_numbers for stretch in stretches])
+    submaps = split_into_submaps(positions)
+    assert len(submaps) == 5
+    own = np.concatenate([submap.own_numbers for submap in submaps])
     np.testing.assert_array_equal(own, np.arange(400))
-    middle = stretches[2]
+    middle = submaps[2]
     assert middle.own_numbers[0] - middle.numbers[0] == pytest.approx(40, abs=2)
     assert middle.numbers[-1] - middle.own_numbers[-1] == pytest.approx(40, abs=2)
-    # Surfaces are of the stretch whose sensor came nearest.
+    # Surfaces are of the submap whose sensor came nearest.
     poses = np.tile(np.eye(4), (400, 1, 1))
     poses[:, :3, 3] = positions
     points = positions[::7] + np.array([0.1, 15.0, 2.0])
-    owners = np.array([stretch.owns(points, poses) for stretch in stretches])
-    near = np.array([np.isin(np.arange(0, 400, 7), stretch.numbers) for stretch in stretches])
+    owners = np.array([submap.owns(points, poses) for submap in submaps])
+    near = np.array([np.isin(np.arange(0, 400, 7), submap.numbers) for submap in submaps])
     assert ((owners & near).sum(axis=0) == 1).all()
 
 
-def test_a_sensor_that_stands_for_long_is_one_stretch_of_some_sweeps():
+def test_a_sensor_that_stands_for_long_is_one_submap_of_some_sweeps():
     random = np.random.default_rng(3)
     standing = random.normal(0, 0.02, (3000, 3))
     positions = np.concatenate([straight(50, 0.5) - [25, 0, 0], standing, straight(50, 0.5)])
-    stretches = divide(positions)
-    own = np.concatenate([stretch.own_numbers for stretch in stretches])
+    submaps = split_into_submaps(positions)
+    own = np.concatenate([submap.own_numbers for submap in submaps])
     assert 150 < len(own) < 200
-    assert len(stretches) <= 3
+    assert len(submaps) <= 3
     assert (np.diff(own) > 0).all()
-    assert len(divide(standing)) == 1
-    assert len(divide(straight(4, 0.0))[0].numbers) == 4
+    assert len(split_into_submaps(standing)) == 1
+    assert len(split_into_submaps(straight(4, 0.0))[0].numbers) == 4
 
 
-def test_poses_go_over_from_one_stretch_to_the_next():
+def test_poses_go_over_from_one_submap_to_the_next():
     count = 200
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, 3] = straight(count, 0.5)
     first = Alignment(poses, 0.1 * np.arange(count), 0.1, 0.2, Motion.COMPENSATED, np.zeros((4, 3)))
-    stretches = divide(poses[:, :3, 3])
-    assert len(stretches) == 2
+    submaps = split_into_submaps(poses[:, :3, 3])
+    assert len(submaps) == 2
     apart = 0.02
     aligned = []
-    for index, stretch in enumerate(stretches):
-        own = poses[stretch.numbers].copy()
+    for index, submap in enumerate(submaps):
+        own = poses[submap.numbers].copy()
         own[:, 1, 3] += index * apart
         distances = np.full(len(own), 0.01 * (index + 1))
-        aligned.append(AlignedStretch(own, np.full((4, 3), index), np.array([0.1]), distances))
-    found = joined(first, stretches, aligned)
+        aligned.append(AlignedSubmap(own, np.full((4, 3), index), np.array([0.1]), distances))
+    found = merge_alignments(first, submaps, aligned)
     y = found.poses[:, 1, 3]
     assert y[0] == 0 and y[-1] == pytest.approx(apart)
     assert np.abs(np.diff(y)).max() < 0.1 * apart
     assert (np.diff(y) > -1e-12).all()
     np.testing.assert_allclose(found.ring_offsets, 0.5)
-    border = stretches[1].own_numbers[0]
+    border = submaps[1].own_numbers[0]
     assert found.plane_distance_m[border - 1] == 0.01
     assert found.plane_distance_m[border] == 0.02
-    # A single stretch is as it was aligned, and a sweep that does not count moves with the next.
-    turn = Step(np.array([0, 0, 0.01]), np.array([0, 0.1, 0])).part(1.0)
-    (whole,) = divide(poses[:60, :3, 3])
+    # A single submap is as it was aligned, and a sweep that does not count moves with the next.
+    turn = MotionStep(np.array([0, 0, 0.01]), np.array([0, 0.1, 0])).fraction(1.0)
+    (whole,) = split_into_submaps(poses[:60, :3, 3])
     some = replace(whole, numbers=whole.numbers[:-1], own=slice(0, 59))
     moved = np.array([pose @ turn for pose in poses[:59]])
-    offsets = AlignedStretch(moved, np.zeros((4, 3)), np.array([0.1]), np.zeros(59))
-    one = joined(first.part(np.arange(60)), [some], [offsets])
+    offsets = AlignedSubmap(moved, np.zeros((4, 3)), np.array([0.1]), np.zeros(59))
+    one = merge_alignments(first.select(np.arange(60)), [some], [offsets])
     np.testing.assert_array_equal(one.poses[:59], moved)
     expected = moved[58] @ np.linalg.inv(poses[58]) @ poses[59]
     np.testing.assert_allclose(one.poses[59], expected)
@@ -107,7 +107,7 @@ def test_poses_go_over_from_one_stretch_to_the_next():
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    """Return a bag of a drive of 52 m through a city, which makes two stretches."""
+    """Return a bag of a drive of 52 m through a city, which makes two submaps."""
     scene = city(5_000)
     end_s = 0.1 * (SWEEPS + 1)
     survey = Survey(

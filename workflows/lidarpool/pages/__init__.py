@@ -1,20 +1,25 @@
-"""Runs and results in the browser and in viewers, only on this machine, without the internet."""
+"""Show runs and results in the browser and in viewers, without internet access."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # a result is viewed without the modules of runs, which take seconds to import
+if TYPE_CHECKING:  # Importing the modules of runs takes seconds, and results do not need them.
     from ..run.job_source import Jobs
     from ..run.options import Live
     from ..run.run_page import RunPage
 
 
 def page_of(jobs: Jobs, live: Live) -> AbstractContextManager[RunPage]:
-    """Show jobs in the browser, or a viewer, and import only then what either needs.
+    """Open the live page or the viewer of a run.
 
-    LidarError if the package of a viewer is missing.
+    Only the modules that the page or viewer needs are imported.
+
+    Raises
+    ------
+    LidarError
+        If the package of a viewer is not installed.
     """
     if not live:
         from ..run.run_page import RunPage

@@ -1,4 +1,4 @@
-"""Limits the processor time of an activity beside a run."""
+"""Limit the CPU time of an activity that runs alongside a run."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 
 class CpuShare:
-    """A share of a core for an activity.
+    """Limit an activity to a share of a CPU core.
 
-    Processor time, since waiting does not count.
+    Only CPU time counts, not time spent waiting.
     """
 
     def __init__(self, share: float) -> None:
@@ -19,17 +19,20 @@ class CpuShare:
 
     @property
     def due(self) -> bool:
-        """True if the activity may run again."""
+        """Whether the activity may run now."""
         return self.wait_s <= 0
 
     @property
     def wait_s(self) -> float:
-        """Seconds until the activity may run again, or 0 or less if it may now."""
+        """Seconds until the activity may run again, which is 0 or negative if it may run now."""
         return self._due_at - time.monotonic()
 
     @contextmanager
     def use(self, pause_s: float = 0.0) -> Iterator[None]:
-        """Delay the next run by the processor time of the body over the share, and by a pause."""
+        """Measure the CPU time of the body, and delay the next use accordingly.
+
+        The delay is the CPU time divided by the share, plus `pause_s`.
+        """
         started = time.thread_time()
         try:
             yield

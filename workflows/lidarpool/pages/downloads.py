@@ -1,4 +1,4 @@
-"""Formats of the points that the pages of results offer."""
+"""Point formats that the pages of results offer for download."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 
 
 def downloads() -> DownloadFormats:
-    """Return the formats of a download whose packages are installed, and their writer."""
+    """Return the download formats whose packages are installed, with their writer."""
     return DownloadFormats([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)

@@ -1,4 +1,4 @@
-"""The page of a data set: the list of its jobs, and the points of each."""
+"""Web page of a data set, which lists the jobs and shows the points of each."""
 
 from __future__ import annotations
 
@@ -27,16 +27,19 @@ from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import JobRow, Value, read_table
 from ..datasets.loader import read_index, sweeps
 from .downloads import downloads
-from .recorded import joined_cloud, shown
+from .recorded import finite_points, merge_sweeps
 
-MAX_LISTED = 1000  # rows of the table of jobs, of those done and of those that failed
-_MAX_VIEWS = 4  # jobs whose points are in memory
+MAX_LISTED = 1000  # maximum number of finished and of failed jobs in the table
+_MAX_VIEWS = 4  # maximum number of jobs whose points are kept in memory
 
 
 class JobList:
-    """Answers the questions of the page of a data set at a folder or URL.
+    """Request handler for the page of a data set at a folder or URL.
 
-    LidarError if the data set is missing, unfinished or damaged.
+    Raises
+    ------
+    LidarError
+        If the data set is missing, unfinished or damaged.
     """
 
     def __init__(self, location: Path | Storage) -> None:
@@ -52,7 +55,7 @@ class JobList:
         self.title = self.location.rstrip("/").rpartition("/")[2] or self.location
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the list, or of the viewer of a job."""
+        """Answer a request for the job list or from the viewer of a job."""
         if question == "jobs":
             return self._list(), {}
         match = re.fullmatch(r"job/(\d+)/(\w+)", question)
@@ -61,13 +64,13 @@ class JobList:
         return self.view_of(int(match[1])).answer(match[2], arguments, abandoned)
 
     def _list(self) -> dict[str, Any]:
-        """Return the state of the page and the list of jobs, for JSON."""
+        """Return the page state and the job list as JSON-compatible objects."""
         done = [row for row in self.rows if row.done]
         failed = [row for row in self.rows if not row.done]
         sums = Counter(points=0, rays=0)
         for row in done:
             sums.update(points=row.points, rays=row.rays)
-        # The first with points is shown beside the list.
+        # The page shows the first job with points next to the list.
         shown = next((row for row in done if row.points), done[0] if done else None)
         return {
             "title": self.title,
@@ -92,21 +95,24 @@ class JobList:
         }
 
     def _entry(self, row: JobRow) -> dict[str, Any]:
-        """Return a row of the table of jobs."""
+        """Return a row of the job table."""
         return {
             "number": row.number,
             "name": row.name,
             "error": row.error,
             "points": row.points,
             "seconds": self._seconds.get(row.number),
-            "values": [_in_words(row.values.get(name)) for name in self._names],
+            "values": [_format_value(row.values.get(name)) for name in self._names],
             "opens": row.done,
         }
 
     def view_of(self, number: int) -> View:
         """Return the view of a job.
 
-        Raises KeyError for an unknown or failed job.
+        Raises
+        ------
+        KeyError
+            If the job is unknown or failed.
         """
         row = self._rows[number]
         if not row.done:
@@ -125,15 +131,15 @@ class JobList:
         saved = Sweeps.load(self._storage.path(name), partial(self._storage.read, name))
         saved = replace(saved, coordinates="world")
         loaded = sweeps(self.location, jobs=[row.number])
-        read = [shown(sweep.replace(points=sweep.in_world())) for sweep in loaded]
+        read = [finite_points(sweep.replace(points=sweep.in_world())) for sweep in loaded]
         scans = saved.scans[: len(read)].astype(np.int32).repeat([len(sweep) for sweep in read])
-        cloud = joined_cloud(read, scan=scans)
+        cloud = merge_sweeps(read, scan=scans)
         title = f"job {row.name} - {self.title}"
         return View(ScanOrderedPoints(cloud), None, saved, title=title, downloads=downloads())
 
 
 def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
-    """Show the list of jobs in the browser until Ctrl-C."""
+    """Show a job list in the browser until Ctrl-C."""
     stopped = threading.Event()
     with page_server(jobs.answer, port, stopped.set, index="jobs.html") as page:
         words = f"{page.url} shows {plural(len(jobs.rows), 'job')}. Press Ctrl-C to stop."
@@ -141,8 +147,8 @@ def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
             wait_for_interrupt(stopped)
 
 
-def _in_words(value: Value | None) -> str:
-    """Return a value of a job in words, "" for None."""
+def _format_value(value: Value | None) -> str:
+    """Format a value of a job, or return an empty string for None."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Views of the jobs of a run: the only job, or the newest jobs that were read, and written jobs."""
+"""Views of the jobs of a run: the only job, recent jobs whose points were read, or written jobs."""
 
 from __future__ import annotations
 
@@ -17,45 +17,47 @@ from .cpu_share import CpuShare
 from .downloads import downloads
 from .live_job import LiveJob
 
-READING_SHARE = 0.05  # share of a core, for points
-LOOK_EVERY_S = 5.0  # at most, for the points of another job
-WATCHED_S = 10.0  # time after a question while the page counts as watched
-MAX_VIEWS = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
+READING_SHARE = 0.05  # maximum share of a CPU core for reading points
+READ_EVERY_S = 5.0  # minimum time between reading the points of two jobs
+WATCHED_S = 10.0  # time after a request during which the page counts as open
+MAX_VIEWS = 4  # maximum number of jobs with points, since a browser may show an earlier job
 
 
 class JobViews:
-    """Jobs whose points were read, and views of jobs that were written to a data set."""
+    """Views of jobs whose points were read, and of jobs that were written to a data set."""
 
     def __init__(self) -> None:
-        self.jobs: dict[int, LiveJob] = {}  # {number: its points}, the newest last
+        self.jobs: dict[int, LiveJob] = {}  # by job number, newest last
         self.reading = CpuShare(READING_SHARE)
-        self._written: Storage | None = None  # folders of jobs, which can be opened
-        self._results: dict[int, View] = {}  # {number: view of a written job}
-        self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
+        self._written: Storage | None = None  # data set whose job folders can be opened
+        self._results: dict[int, View] = {}  # views of written jobs by number
+        # time at which a browser last requested points of the newest job
+        self._requested_at = float("-inf")
 
     @property
     def opens_written(self) -> bool:
-        """True if jobs can be opened after they were written."""
+        """Whether jobs can be opened after they were written."""
         return self._written is not None
 
     def follow(self, dataset: DataSet) -> None:
-        """Open jobs of a data set, if each of its jobs has a folder on this machine."""
+        """Make the jobs of a data set available if each job has a local folder."""
         if dataset.format == "folder" and dataset.storage.is_local:
             self._written = dataset.storage
 
-    def want_newest(self) -> None:
-        """Record that a browser wants points of the newest job."""
-        self._looked_for = time.monotonic()
+    def request_newest(self) -> None:
+        """Record that a browser requested points of the newest job."""
+        self._requested_at = time.monotonic()
 
     def read(self, row: JobRow, job: StoredJob, is_only: bool) -> None:
-        """Read points of a job, if it is the only job, or a browser shows points of jobs.
+        """Read the points of a job, if it is the only job or a browser shows points of jobs.
 
-        Points of the first job are read in any case, of others if reading is due.
+        The points of the first job are always read. Those of other jobs are only read if the CPU
+        share permits it.
         """
-        watched = time.monotonic() - self._looked_for <= WATCHED_S and self.reading.due
+        watched = time.monotonic() - self._requested_at <= WATCHED_S and self.reading.due
         if self.jobs and not (is_only or watched):
             return
-        with self.reading.use(LOOK_EVERY_S):
+        with self.reading.use(READ_EVERY_S):
             live = self.jobs.get(row.number) or LiveJob(job, row.name)
             live.read_all()
             if len(live.cloud):
@@ -63,7 +65,13 @@ class JobViews:
                 self.jobs = {number: jobs[number] for number in [*jobs][-MAX_VIEWS:]}
 
     def view(self, number: int, name_of: Callable[[int], str]) -> View:
-        """Return the view of a job that was read or, with a name, written, else KeyError."""
+        """Return the view of a job that was read or written.
+
+        Raises
+        ------
+        KeyError
+            If the job is unknown or cannot be opened.
+        """
         if number in self.jobs:
             return self.jobs[number].view
         if number not in self._results and self._written is not None:

@@ -1,4 +1,4 @@
-"""Lists of the jobs of a run: jobs under way, jobs that were done last, and failed jobs."""
+"""Lists of the running, recently finished and failed jobs of a run."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from lidarsim.words import rounded
 
 from ..datasets.job_table import JobRow, Value
 
-LIST_EVERY_S = 0.5  # jobs under way
-# rows of the table
+LIST_EVERY_S = 0.5  # minimum time between updates of the running jobs
+# Maximum number of rows in the table.
 MAX_ENDED = 10
 MAX_FAILED = 6
 MAX_UNDER_WAY = 12
 
 
-class ListedJobs:
-    """Jobs of a run, few of each kind, and sums over all that have ended.
+class RecentJobs:
+    """The most recent jobs of a run, with totals over all jobs that have ended.
 
-    `names` are the names of the values that the jobs vary, in the order of the table's columns.
+    `names` are the names of the values that the jobs vary, in the order of the table columns.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -33,40 +33,47 @@ class ListedJobs:
         self._failures: deque[dict[str, Any]] = deque(maxlen=MAX_FAILED)
 
     def update(self, under_way: Callable[[], Sequence[Mapping[str, Any]]], is_last: bool) -> None:
-        """List the jobs under way, if the last list is old or the update the last one."""
+        """Update the running jobs if the last update is old or this update is the last one."""
         time_s = time.monotonic()
         if time_s >= self._list_at or is_last:
             self._list_at = time_s + LIST_EVERY_S
             self.under_way = under_way()
 
     def end(self, row: JobRow, opens: bool) -> None:
-        """Count a job, and move its entry from the jobs under way to the last jobs.
+        """Count a job, and move its entry from the running jobs to the ended jobs.
 
-        `opens` says whether a user of the page can open the job.
+        `opens` states whether the page can open the job.
         """
         self.under_way = [job for job in self.under_way if job["name"] != row.name]
         entry = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
-        entry |= {"number": row.number, "opens": opens, "values": self._words(row.values)}
+        entry |= {"number": row.number, "opens": opens, "values": self._format_values(row.values)}
         (self._ended if row.done else self._failures).append(entry)
         ended = "done" if row.done else "failed"
         self.sums.update({ended: 1, "points": row.points, "rays": row.rays})
 
     def name_of(self, number: int) -> str:
-        """Return the name of a job that was done last, else KeyError."""
+        """Return the name of a recently finished job.
+
+        Raises
+        ------
+        KeyError
+            If the job is not in the list.
+        """
         names = {job["number"]: job["name"] for job in list(self._ended)}
         return str(names[number])
 
     def news(self, readable: Container[int]) -> dict[str, Any]:
-        """Return the lists, for JSON.
+        """Return the lists as JSON-compatible objects.
 
-        Jobs with `readable` numbers can be opened as well.
+        Jobs whose numbers are in `readable` can be opened as well.
         """
         under_way = self.under_way
         return dict(self.sums) | {
             "names": list(self._names),
             "busy": len(under_way),
             "under_way": [
-                {**job, "values": self._words(job["values"])} for job in under_way[:MAX_UNDER_WAY]
+                {**job, "values": self._format_values(job["values"])}
+                for job in under_way[:MAX_UNDER_WAY]
             ],
             "failures": [*reversed(list(self._failures))],
             "ended": [
@@ -75,8 +82,8 @@ class ListedJobs:
             ],
         }
 
-    def _words(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Return values in the order of the table's columns, "" for a missing value."""
+    def _format_values(self, values: Mapping[str, Value | None]) -> list[str]:
+        """Format values in the order of the table columns. Missing values are empty strings."""
         shown = ("" if (value := values.get(name)) is None else value for name in self._names)
         words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

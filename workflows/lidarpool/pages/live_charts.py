@@ -1,4 +1,4 @@
-"""Charts of the jobs of a run, drawn within a small share of a core."""
+"""Charts of the jobs of a run, which are drawn with a small share of a CPU core."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..datasets.job_table import JobRow
 from ..report.charts import draw_results, draw_varied
 from .cpu_share import CpuShare
 
-DRAWING_SHARE = 0.06  # share of a core, for charts: they take half a second to a second
+DRAWING_SHARE = 0.06  # maximum share of a CPU core, since drawing takes 0.5 to 1 s
 
 
 class Charts:
-    """Charts of varied quantities and of results, drawn again while a browser shows the charts.
+    """Charts of varied quantities and of results, which are updated while a browser shows them.
 
-    A few numbers of each job are kept. At the end the run draws its pictures first, since
-    Matplotlib draws in one thread only.
+    Only a few numbers of each job are kept. At the end, the run draws its own pictures first,
+    because Matplotlib can only draw in one thread.
     """
 
     def __init__(self, names: Sequence[str], count: int) -> None:
@@ -34,12 +34,15 @@ class Charts:
         self._svg = ""
 
     def add(self, row: JobRow) -> None:
-        """Count a job."""
+        """Add the statistics of a job."""
         with self._lock:
             self._figures.add(row)
 
     def version(self, over: bool) -> int:
-        """Return the number of jobs in `drawn`, which draws again only if due."""
+        """Return the number of jobs that `drawn` would include.
+
+        The number only changes if the charts are due to be drawn again.
+        """
         with self._lock:
             jobs = self._figures.jobs
             done_count = self._figures.done
@@ -47,10 +50,10 @@ class Charts:
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
     def drawn(self, over: bool) -> str:
-        """Return the charts as elements of HTML, drawn again if due."""
+        """Return the charts as HTML elements, and draw them again if they are due."""
         with self._drawing:
             if self.version(over) != self._drawn:
-                with self._lock:  # shortly: the run waits for no drawing
+                with self._lock:  # held briefly, so that the run does not wait for the drawing
                     figures = deepcopy(self._figures)
                 self._drawn = figures.jobs
                 with self._share.use(), suppress(LidarError):

@@ -1,4 +1,4 @@
-"""Points and hits of a job under way, from the parts that there is time to read."""
+"""Points and hits of a running job, from those of its parts that there is time to read."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from ..run.run_result import RunResult
 from ..run.store.stored_job import StoredJob
 from .downloads import downloads
 
-LIVE_POINTS = 150_000  # points in the browser at a time
-MAX_WAITING_PARTS = 64  # parts that wait to be read; of more, every second is skipped
-PARTS_PER_READ = 8  # parts read for one drawing
-MAX_FRAMES = 40  # whose rays are shown
+LIVE_POINTS = 150_000  # maximum number of points in the browser
+MAX_WAITING_PARTS = 64  # If more parts are pending, every second part is skipped.
+PARTS_PER_READ = 8  # number of parts that are read for each update
+MAX_FRAMES = 40  # maximum number of frames whose rays are shown
 
 
 class LiveJob:
-    """Points and hits of a job, from the parts that there is time to read, and its view.
+    """View of a running job, which samples those of its parts that there is time to read.
 
-    The run's thread records parts, the page's threads read parts. At the end an evenly spaced
-    sample of the complete result replaces the points, so skipped parts do not matter.
+    The thread of the run adds parts, and the threads of the page read them. When the run ends, an
+    evenly spaced sample of the complete result replaces the points, so skipped parts do not matter.
     """
 
     def __init__(self, under_way: StoredJob, name: str = "", max_points: int = LIVE_POINTS) -> None:
@@ -46,40 +46,40 @@ class LiveJob:
         self._under_way = under_way
         self._max_points = max_points
         self._job = under_way.job
-        self._points = under_way.points()  # points of the columns of parts
-        self._waiting: list[str] = []  # names of parts
+        self._points = under_way.points()  # reader for the points of parts
+        self._waiting: list[str] = []  # names of pending parts
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
-        self._share = 1.0  # share of the points of a part that are taken
+        self._share = 1.0  # share of the points of a part that are kept
         self._counts = np.zeros(self._job.scene.counters, np.int64)
-        self._hit_count = 0  # hits of the parts that were read
-        self.cloud = replace(self._points, names=(), rows=()).load()  # no points, with the columns
-        self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # the last frames
-        self._view: View | None = None  # None before the first question
+        self._hit_count = 0  # number of hits in the parts that were read
+        self.cloud = replace(self._points, names=(), rows=()).load()  # empty, but with all columns
+        self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # most recent frames
+        self._view: View | None = None  # None before the first request
         self._making = threading.Lock()
-        self._all_read = False  # all parts were read
-        self._end_version = 0  # changes at the end of the run that the page must ask for
+        self._all_read = False  # whether all parts were read
+        self._end_version = 0  # incremented at the end of the run to make the page reload
         self.add(under_way.parts.ordered)
 
-    # -- the run's side ------------------------------------------------------------------
+    # -- called by the run --------------------------------------------------------------
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Record parts that are in storage, without reading."""
+        """Record stored parts without reading them."""
         with self._lock:
             self._waiting += [part.name for part in receipts]
             while len(self._waiting) > MAX_WAITING_PARTS:
                 del self._waiting[1::2]
 
     def read_all(self) -> None:
-        """Read all waiting parts of a job that is done, before they are removed."""
+        """Read all pending parts of a finished job before they are removed."""
         while self._waiting:
             self.gather()
         self._all_read = True
 
     def finish(self, result: RunResult | None) -> None:
-        """Take a sample of all points, and all hits.
+        """Replace the points with a sample of the result, and the hit counts with its counts.
 
-        The parts may then be removed.
+        Afterward, the parts may be removed.
         """
         if result is not None:
             with self._lock:
@@ -93,7 +93,7 @@ class LiveJob:
         self._end_version += 1
 
     def show_file(self, cloud: Path) -> None:
-        """Show the written cloud, with its sweeps: the parts are gone."""
+        """Show the written cloud with its sweeps, because the parts have been removed."""
         view = self.view
         view.sweeps = self._job.sweeps
         view.replace_points(
@@ -101,12 +101,12 @@ class LiveJob:
         )
         self._end_version += 1
 
-    # -- the page's side -----------------------------------------------------------------
+    # -- called by the page -------------------------------------------------------------
 
     def gather(self) -> None:
-        """Read a few of the waiting parts.
+        """Read some of the pending parts.
 
-        The run reports parts that cannot be read.
+        Unreadable parts are skipped, because the run reports them.
         """
         with self._lock:
             names = self._waiting[:PARTS_PER_READ]
@@ -129,7 +129,10 @@ class LiveJob:
         self._show()
 
     def hit_counts(self) -> Floats:
-        """Return hits by counters of the scene, scaled up to all hits if parts were not read."""
+        """Return the hit counts of the scene.
+
+        If some parts were not read, the counts are scaled to the total number of hits.
+        """
         with self._lock:
             return np.asarray(
                 self._counts * (self._under_way.parts.hit_count / max(self._hit_count, 1))
@@ -137,7 +140,7 @@ class LiveJob:
 
     @property
     def view(self) -> View:
-        """View of the job, created on first use."""
+        """View of the job, which is created on first use."""
         with self._making:
             if self._view is None:
                 job = self._job
@@ -152,13 +155,13 @@ class LiveJob:
             return self._view
 
     def _show(self) -> None:
-        """Show the points in the view, if there is a view."""
+        """Update the points of the view, if it has been created."""
         with self._making:
             if self._view is not None:
                 self._view.replace_points(InMemoryPoints(self.cloud))
 
     def news(self) -> Answer:
-        """Return the news of the job, under way or at its end."""
+        """Return the changes since the last request, during or after the run."""
         view = self.view
         frames = [] if self._end_version else list(self.frames)
         planning = self._job.planning
@@ -169,17 +172,17 @@ class LiveJob:
         newest = frames[-1].scan if frames else -1
         header = {
             "version": view.version,
-            # The surface is large, and changes visibly only with a tenth more hits.
+            # The surface is large, and only changes visibly after 10 % more hits.
             "hits_version": round(10 * np.log1p(self._hit_count)),
             "rays_version": newest,
             "time": self._job.survey.begins_ns(newest) / 1e9 if frames else None,
             "path": view.planned_path,
             "ends": self._end_version,
         }
-        return header, {"rays": _rays_of(frames) if frames else view.displayed_rays}
+        return header, {"rays": _sample_rays(frames) if frames else view.displayed_rays}
 
 
-def _rays_of(frames: list[ScanFrame]) -> Floats32:
-    """Return sample rays (n, 2, 3) of frames, local coordinates."""
+def _sample_rays(frames: list[ScanFrame]) -> Floats32:
+    """Return the sample rays of frames in local coordinates, of shape (n, 2, 3)."""
     pairs = ((np.full_like(frame.samples, frame.pose.position), frame.samples) for frame in frames)
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs]).astype(np.float32)

@@ -1,8 +1,9 @@
-"""The live page of a run: its jobs, or the only job, during the run and until the page is closed.
+"""Live page of a run, which shows its jobs during the run and until the page is closed.
 
-The run calls the page in the run's own thread, hands over news, and never waits for a browser.
-Parts are read when a page asks for news, or by the thread that removes the files of ended jobs, and
-charts are drawn when a page asks for charts; all within small shares of a core.
+The run calls the page in its own thread, passes updates to it, and never waits for a browser. Parts
+are read when a page requests updates, or by the thread that removes the files of ended jobs. Charts
+are drawn when a page requests them. Each of these activities is limited to a small share of a CPU
+core.
 """
 
 from __future__ import annotations
@@ -37,38 +38,39 @@ from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.stored_job import StoredJob
 from .job_views import JobViews
-from .listed_jobs import ListedJobs
+from .listed_jobs import RecentJobs
 from .live_charts import Charts
 from .live_job import LiveJob
 from .run_status import PartitionLoads, RunStatus
 
 
 class LivePage(RunPage):
-    """Connects a run and its page, in both directions: the list of jobs, or the only job."""
+    """Live page of a run with several jobs, or with a single job."""
 
     page: PageServer
 
     def __init__(self, jobs: int, names: Sequence[str], title: str) -> None:
-        self.stopped = threading.Event()  # set by a user of the page; --resume continues
+        # set by the stop button of the page; the run can be resumed
+        self.stopped = threading.Event()
         self._count = jobs
         self._title = title
         self._status = RunStatus()
         self._loads = PartitionLoads()
-        self._listed = ListedJobs(names)
+        self._listed = RecentJobs(names)
         self._charts = Charts(names, jobs)
         self._views = JobViews()
 
-    # -- the run's side ------------------------------------------------------------------
+    # -- called by the run --------------------------------------------------------------
 
     def begun(self, job: StoredJob) -> None:
-        """Show the only job: scans of an earlier run, and scans committed from now on."""
+        """Show the only job, including scans that were committed earlier."""
         if job.committed_in_words:
             self._status.progress = job.progress()
         self._views.jobs = {0: LiveJob(job)}
         self._status.state = "starting the worker processes"
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Show the jobs under way, the busy slots of partitions, and jobs that were written."""
+        """Show the running jobs, the busy slots of the partitions, and the written jobs."""
         self._loads.partitions = partitions
         if dataset is not None:
             self._views.follow(dataset)
@@ -77,11 +79,11 @@ class LivePage(RunPage):
         )
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Record parts of the only job."""
+        """Record committed parts of the only job."""
         self._views.jobs[0].add(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Record a frame, which is displayed unless many frames come at once."""
+        """Record a frame, which is shown unless many frames arrive at once."""
         self._views.jobs[0].frames.append(frame)
 
     def on_progress(
@@ -89,7 +91,10 @@ class LivePage(RunPage):
     ) -> None:
         """Record the progress.
 
-        Raises KeyboardInterrupt if a user of the page has stopped the run.
+        Raises
+        ------
+        KeyboardInterrupt
+            If a user has stopped the run on the page.
         """
         if self.stopped.is_set():
             raise KeyboardInterrupt
@@ -100,21 +105,21 @@ class LivePage(RunPage):
             self._status.state = "writing the job table and the data set card"
         elif progress.cast or any(job["stored"] for job in self._listed.under_way):
             self._status.state = "running"
-        self._loads.ask()
+        self._loads.poll()
 
     def ended(self, row: JobRow) -> None:
-        """Count a job, and move its entry from the jobs under way to the last jobs."""
+        """Count a job, and move its entry from the running jobs to the ended jobs."""
         self._listed.end(row, opens=row.done and self._views.opens_written)
         self._charts.add(row)
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Read points of a job, if a browser shows the points and reading is due."""
+        """Read the points of a job if a browser shows points and the CPU share permits it."""
         self._views.read(row, job, is_only=self._count == 1)
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show that the run is over, and the result of a survey.
+        """Show that the run has finished, and show the result of a survey.
 
-        Its parts may then be removed.
+        Afterward, the parts of the survey may be removed.
         """
         if self._count == 1 and 0 in self._views.jobs:
             self._views.jobs[0].finish(result)
@@ -123,9 +128,10 @@ class LivePage(RunPage):
         self._status.finish(seconds, None if result is None else len(result.points))
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page until Ctrl-C or its button.
+        """Keep the page open until Ctrl-C or until a user stops it.
 
-        Points of a survey are read from the written `cloud`, because the parts are gone.
+        The points of a survey are read from the written `cloud`, because the parts have been
+        removed.
         """
         if cloud is not None:
             self._views.jobs[0].show_file(cloud)
@@ -134,13 +140,13 @@ class LivePage(RunPage):
         )
         wait_for_interrupt(self.stopped)
 
-    # -- the page's side -----------------------------------------------------------------
+    # -- called by the page -------------------------------------------------------------
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the list, or of the viewer of a job."""
+        """Answer a request for the job list or from the viewer of a job."""
         if question == "jobs":
             if arguments.get("newest"):
-                self._views.want_newest()
+                self._views.request_newest()
             return self._news(), {}
         if question == "charts":
             return {"svg": self._charts.drawn(self._status.over)}, {}
@@ -154,12 +160,12 @@ class LivePage(RunPage):
                 view = self._views.view(number, self._listed.name_of)
                 return view.answer(viewer_question, arguments, abandoned)
         jobs = self._views.jobs
-        if viewer_question == "state" and number not in jobs:  # the job has not begun
+        if viewer_question == "state" and number not in jobs:  # the job has not started
             return self._news(), {}
-        return self._answer_of_only_job(jobs[number], viewer_question, arguments, abandoned)
+        return self._answer_for_only_job(jobs[number], viewer_question, arguments, abandoned)
 
-    def _answer_of_only_job(self, job: LiveJob, question: str, *arguments: Any) -> Answer:
-        """Answer a question of the viewer of the only job, also while the job is under way."""
+    def _answer_for_only_job(self, job: LiveJob, question: str, *arguments: Any) -> Answer:
+        """Answer a request from the viewer of the only job."""
         progress = self._status.progress
         points = {"points": (progress and progress.points) or self._listed.sums["points"]}
         if question == "news":
@@ -178,7 +184,7 @@ class LivePage(RunPage):
         return header, arrays
 
     def _news(self) -> dict[str, Any]:
-        """Return the state of the run and its lists of jobs, for JSON."""
+        """Return the state of the run and its job lists as JSON-compatible objects."""
         jobs = self._views.jobs
         newest = next(reversed(jobs), None)
         return {
@@ -201,7 +207,7 @@ def live_page(
     port: int = PORT,
     browser: bool = True,
 ) -> Iterator[LivePage]:
-    """Serve the page of a run while the body runs, and announce its address."""
+    """Serve the live page of a run while the body runs, and print its address."""
     live = LivePage(jobs, names, title)
     index = VIEWER if jobs == 1 else "jobs.html"
     with (

@@ -1,7 +1,7 @@
-"""Opens files that lidarpool reads or writes for the viewer, and offers points as files.
+"""Open the files that lidarpool reads or writes in the viewer, and offer points for download.
 
-Results, clouds, recordings and exports of lidarpool and other programs, meshes and scenarios are a
-view each; a data set is a list of jobs with a view each (`job_list.py`).
+Results, clouds, recordings, exports, meshes and scenarios are opened as one view each. A data set
+is opened as a list of jobs with one view each (see `job_list`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from lidarview.viewer.view import CLOUD, ProgressiveView, View
 from ..datasets.dataset import INDEX_FILE
 from .downloads import downloads
 
-if TYPE_CHECKING:  # recordings are imported when one is opened
+if TYPE_CHECKING:  # The modules of recordings are only imported when a recording is opened.
     from .recorded import OnPart
 
 _TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
 _TRAJECTORY_ADVICE = "set `trajectory: FILE` in a scenario"
-_HEADER_BYTES = 1 << 16  # bytes of a .ply that name its elements
+_HEADER_BYTES = 1 << 16  # maximum size of a .ply header, which names the elements
 
 
 def is_data_set(place: Path | Storage) -> bool:
-    """Return True if a folder or URL has a data set of many jobs, finished or not."""
+    """Return whether a folder or URL contains a data set with jobs, finished or not."""
     if isinstance(place, Storage):
         with explained(f"{place.url} cannot be read"):
             return INDEX_FILE in place.entries()
@@ -42,12 +42,20 @@ def is_data_set(place: Path | Storage) -> bool:
 
 
 def open_views(paths: Sequence[Path], **options: Any) -> View:
-    """Open files and folders of the same place as a view of all their points.
+    """Open several files and folders as one view of all their points.
 
-    The options are as in `open_view`.
+    Parameters
+    ----------
+    paths
+        Files and folders, whose coordinates must refer to the same frame.
+    **options
+        Options of `open_view`.
 
-    LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
-    others.
+    Raises
+    ------
+    LidarError
+        If a path cannot be opened, or if its points are in sensor coordinates and there are other
+        paths.
     """
     return join_views(paths, [open_view(path, **options) for path in paths])
 
@@ -60,13 +68,25 @@ def open_view(
     tell: Callable[[str], None] = lambda note: None,
     on_part: OnPart = lambda *_: None,
 ) -> View:
-    """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
+    """Open a result, cloud, recording, exported file or folder, mesh or scenario.
 
-    Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
-    `of_mesh` are the unit and up axis of a mesh; `tell` is called with each note on a scene,
-    and `on_part` with each part of a cloud of another program.
+    Parameters
+    ----------
+    path
+        File or folder.
+    keep_noise
+        Whether to include points that a cloud marks as withheld or classifies as noise.
+    of_mesh
+        Unit and up axis of a mesh.
+    tell
+        Function that is called with each note on a scene.
+    on_part
+        Function that is called with each part of a cloud from another program.
 
-    LidarError if the path has an unfinished run, or nothing that is read.
+    Raises
+    ------
+    LidarError
+        If the path contains an unfinished run, or if its format is not supported.
     """
     if not path.exists():
         raise MissingFileError(
@@ -84,23 +104,23 @@ def open_view(
         if (path / CLOUD).exists():
             return open_result(path, downloads())
         refuse_unfinished(path)
-        return _recorded(path, title, keep_noise, on_part)
+        return _open_recorded(path, title, keep_noise, on_part)
     suffix = path.suffix.lower()
     if suffix == ".ply":
         try:
             view = open_result(path, downloads())
-        except LidarError:  # text, or of another program
-            return _recorded(path, title, keep_noise, on_part)
+        except LidarError:  # a text file, or written by another program
+            return _open_recorded(path, title, keep_noise, on_part)
         if not len(view.points):
             raise LidarError(f"{path} contains no points.")
         return view
-    return _recorded(path, title, keep_noise, on_part)
+    return _open_recorded(path, title, keep_noise, on_part)
 
 
 def _is_previewed(path: Path) -> bool:
-    """Return True for a scenario or a mesh.
+    """Return whether a path is a scenario or a mesh.
 
-    Raises LidarError if its file cannot be read.
+    Raise LidarError if the file cannot be read.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -116,12 +136,12 @@ def _is_previewed(path: Path) -> bool:
     return mesh_format is not None and not mesh_format.advice
 
 
-# Modules of recordings, scenarios and runs are imported only when they are needed: the first points
-# of a result are shown two seconds earlier.
+# The modules of recordings, scenarios and runs are imported lazily, which shows the first points of
+# a result two seconds earlier.
 
 
-def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
-    """Return the view of a recording."""
+def _open_recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
+    """Open a recording."""
     from ..recordings.opening import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
@@ -145,9 +165,14 @@ def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View
 
 
 def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | None:
-    """Return the view of a large .las or .laz, which shows more points while they are read.
+    """Return a view of a large .las or .laz file that shows more points while they are read.
 
-    None for other files and folders. LidarError if the file cannot be read.
+    Return None for other files and folders.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read.
     """
     if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
         return None
@@ -164,14 +189,14 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
 
 
 def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
-    """Return the view of a scenario or mesh before its run."""
+    """Return a preview of a scenario or mesh."""
     from .preview import scenario_view
 
     return scenario_view(path, of_mesh, tell)
 
 
 def _has_faces(path: Path) -> bool:
-    """Return True if the header of a .ply file names faces, so that the file is a mesh."""
+    """Return whether the header of a .ply file declares faces, so that the file is a mesh."""
     with open_input(path) as file:
         header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
     lines = (line.split() for line in header.splitlines())
@@ -179,7 +204,7 @@ def _has_faces(path: Path) -> bool:
 
 
 def refuse_unfinished(path: Path) -> None:
-    """Raise a LidarError if a folder holds an unfinished run and no cloud."""
+    """Raise LidarError if a folder contains an unfinished run and no cloud."""
     from ..run.store.database import FILE
     from ..run.store.run_store import RUN_FOLDER
 

@@ -36,11 +36,21 @@ def scenario_view(
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
 ) -> View:
-    """Return the preview of a scenario, of the first job of a campaign, or of a mesh file.
+    """Return a preview of a scenario, of the first job of a campaign, or of a mesh file.
 
-    A mesh is scanned as `lidarpool run` scans it, with the options `of_mesh` of `mesh_data`. `tell`
-    is called with each note on the scene. LidarError if a file cannot be read, or fields of
-    the scenario contradict each other.
+    Parameters
+    ----------
+    path
+        File of the scenario, campaign or mesh. A mesh is scanned as by `lidarpool run`.
+    of_mesh
+        Options of `mesh_data` for a mesh.
+    tell
+        Function that is called with each note on the scene.
+
+    Raises
+    ------
+    LidarError
+        If a file cannot be read, or if fields of the scenario contradict each other.
     """
     is_mesh = path.suffix.lower() not in (".yaml", ".yml")
     note = _PREVIEW
@@ -53,17 +63,20 @@ def scenario_view(
         for line in advice(prepared):
             tell(line)
         job = prepared.job
-    return preview_of(job, note, f"{path.resolve().name} - lidarpool")
+    return job_preview(job, note, f"{path.resolve().name} - lidarpool")
 
 
 def _with_materials(scenario: Scenario) -> Scenario:
-    """Return a scenario whose points, and so the faces of its scene, have their materials."""
+    """Return a copy of a scenario that stores the material of each point.
+
+    The faces of the scene then have materials as well.
+    """
     columns = (*scenario.cloud.columns, MATERIAL.name)
     return scenario.model_copy(update={"cloud": replace(scenario.cloud, columns=columns)})
 
 
-def preview_of(job: Job, note: str, title: str) -> View:
-    """Return the view of a job before its run."""
+def job_preview(job: Job, note: str, title: str) -> View:
+    """Simulate the first sweeps of a job, and return their view."""
     planning = planning_picture(job.planning)
     content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
     cloud = Cloud.joined([*first_sweeps(job)])
@@ -75,7 +88,7 @@ def preview_of(job: Job, note: str, title: str) -> View:
 
 
 def first_sweeps(job: Job) -> Iterator[Cloud]:
-    """Cast the first sweep of each sensor of a job in this process, in the order of their scans."""
+    """Simulate the first sweep of each sensor of a job in this process, in scan order."""
     sweeps = job.sweeps
     survey = job.survey
     if not len(sweeps):

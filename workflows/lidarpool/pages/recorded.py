@@ -1,4 +1,4 @@
-"""Views of recordings and clouds of other programs, held in memory."""
+"""Views of recordings and of clouds from other programs, which are held in memory."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from lidarview.viewer.view import DownloadFormats, ProgressiveView, View
 
 from ..clouds.recording import Recording
 
-MAX_POINTS = 20_000_000  # points of a recording, in memory
-LARGE_POINTS = 2_000_000  # a larger cloud is shown by a sample while it is read
+MAX_POINTS = 20_000_000  # maximum number of points of a recording in memory
+LARGE_POINTS = 2_000_000  # A sample of a larger cloud is shown while the cloud is read.
 _SAMPLE_POINTS = 200_000
-_GROWING_POINTS = 1_000_000  # points that are shown before all are read, beside the sample
-# Receives a part of a cloud, and the share of the cloud that has been read.
+# points that are shown while a cloud is read, in addition to the sample
+_GROWING_POINTS = 1_000_000
+# Callback for a part of a cloud and the fraction of the cloud that has been read.
 OnPart = Callable[[Sweep, float], None]
-_SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
-_GRAY = 188  # byte of a color that is unknown: half of the light
-# Classes of ASPRS LAS 1.4 by their numbers.
+_SWEEP_NS = 1e8  # assumed time between sweeps if the recording has no times
+_GRAY = 188  # byte of an unknown color, which is 50 % of the light
+# Class names of ASPRS LAS 1.4, indexed by class number.
 ASPRS_CLASSES = (
     "never classified", "unassigned", "ground", "low vegetation", "medium vegetation",
     "high vegetation", "building", "low point", "", "water", "rail", "road surface", "",
@@ -39,8 +40,8 @@ ASPRS_CLASSES = (
 )  # fmt: skip
 
 
-def shown(sweep: Sweep) -> Sweep:
-    """Return the points at finite positions, with the columns of one number per point."""
+def finite_points(sweep: Sweep) -> Sweep:
+    """Return the points with finite coordinates, and the columns with one number per point."""
     arrays = {name: np.asarray(values) for name, values in sweep.columns.items()}
     columns = {
         name: values
@@ -52,10 +53,10 @@ def shown(sweep: Sweep) -> Sweep:
     return numbers if finite.all() else numbers.select(finite)
 
 
-def joined_cloud(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
-    """Join the points of `shown` sweeps with the columns that all of them have.
+def merge_sweeps(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
+    """Merge sweeps into a cloud with the columns that all sweeps have.
 
-    Columns that are zero throughout are omitted. Sweeps without points may lack columns. `further`
+    Columns that only contain zeros are omitted. Sweeps without points may lack columns. `further`
     are additional columns of all points.
     """
     if not sweeps:
@@ -69,23 +70,23 @@ def joined_cloud(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
         identifier = identifier if identifier.isidentifier() else f"_{identifier}"
         is_new = identifier == name or identifier not in shared
         if is_new and identifier.lower() not in "xyz" and any(part.any() for part in parts):
-            columns[identifier] = _plain(name, np.concatenate(parts))
-    # A standard name whose column is omitted goes to the next column with an alias.
+            columns[identifier] = _native(name, np.concatenate(parts))
+    # If the column with a standard name is omitted, the next column with an alias gets the name.
     columns = with_standard_names(columns) | further
-    custom = tuple(_described(name, array) for name, array in columns.items())
+    custom = tuple(_describe_column(name, array) for name, array in columns.items())
     return Cloud(np.concatenate([sweep.points for sweep in sweeps]), columns, custom)
 
 
-def _plain(name: str, values: AnyArray) -> AnyArray:
-    """Return values in native byte order, with bytes for colors and truth values."""
+def _native(name: str, values: AnyArray) -> AnyArray:
+    """Return values in native byte order, with bytes for colors and booleans."""
     if name in COLORS and values.dtype.kind == "f" and np.isnan(values).any():
         return np.nan_to_num(values, nan=_GRAY).astype(np.uint8)
     kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
     return values.astype(kind.newbyteorder("="), copy=False)
 
 
-def _described(name: str, values: AnyArray) -> Column:
-    """Return the description of a column, of the table if it has values of that type."""
+def _describe_column(name: str, values: AnyArray) -> Column:
+    """Return the description of a column, from the standard table if the type matches."""
     known = TABLE.get(name)
     if known is not None and np.dtype(known.dtype) == values.dtype:
         return known
@@ -101,19 +102,31 @@ def recorded_view(
     downloads: DownloadFormats | None,
     on_part: OnPart = lambda *_: None,
 ) -> View:
-    """Return the view of the sensors of a recording, {name: recording}, with a player of sweeps.
+    """Return a view of the sensors of a recording, with playback of its sweeps.
 
-    `on_part` is called with each part of a cloud that was read.
+    Parameters
+    ----------
+    sensors
+        Recordings by sensor name.
+    title
+        Title of the view.
+    downloads
+        Formats for downloading points, or None.
+    on_part
+        Function that is called with each part of a cloud that was read.
 
-    LidarError if a recording is damaged, or has no points.
+    Raises
+    ------
+    LidarError
+        If a recording is damaged or has no points.
     """
     first = next(iter(sensors.values()))
     notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
     if first.is_cloud:
-        cloud = _cloud_of(first, on_part)
+        cloud = _read_cloud(first, on_part)
         sweeps = None
     else:
-        cloud, sweeps, further_notes = _sweeps_of(sensors)
+        cloud, sweeps, further_notes = _read_sweeps(sensors)
         notes += further_notes
     notes += [note for recording in sensors.values() for note in recording.omission_notes]
     if not len(cloud):
@@ -137,22 +150,27 @@ def recorded_view(
 
 
 def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
-    """Return the names of the stations 0 (none), 1, 2, …, with "" for unnamed stations."""
+    """Return the names of the stations, indexed by station number.
+
+    Number 0 means that there is no station. Unnamed stations have empty names.
+    """
     numbers = sweeps.station_numbers.tolist()
     names = [""] * (max(numbers) + 1)
-    for number, name in zip(numbers, recording.stations, strict=False):  # some may not be read
+    # Some stations may not have been read.
+    for number, name in zip(numbers, recording.stations, strict=False):
         names[number] = names[number] or name
     return names
 
 
 def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
-    """Return the view of a sample of a cloud that has `Recording.sample`, and its points.
+    """Return a view of a sample of a cloud, and the points of the sample.
 
-    The sample consists of runs of points, which are read within a second.
+    The recording must have `Recording.sample`. The sample consists of runs of consecutive points,
+    which are read within a second.
     """
-    sample = shown(recording.read_sample(_SAMPLE_POINTS))
+    sample = finite_points(recording.read_sample(_SAMPLE_POINTS))
     view = View(
-        InMemoryPoints(joined_cloud([sample])),
+        InMemoryPoints(merge_sweeps([sample])),
         note=" ".join(recording.notes),
         title=title,
         names={"class": ASPRS_CLASSES},
@@ -164,7 +182,7 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
 def growing_view(
     recording: Recording, title: str, read: Callable[[OnPart], View]
 ) -> ProgressiveView:
-    """Return a view that shows a sample of a cloud, and more points while `read` reads all."""
+    """Return a view that shows a sample of a cloud, and more points while `read` reads it."""
     total = recording.point_count or 0
     sampled, sample = sampled_view(recording, title)
     parts = [sample]
@@ -173,36 +191,36 @@ def growing_view(
     def grow(show: Callable[[Points, float], None]) -> View:
         def on_part(part: Sweep, share: float) -> None:
             parts.append(part.select(slice(None, None, step)))
-            show(InMemoryPoints(joined_cloud(parts)), share)
+            show(InMemoryPoints(merge_sweeps(parts)), share)
 
         return read(on_part)
 
     return ProgressiveView(sampled, total, grow)
 
 
-def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:
-    """Read a cloud, or evenly distributed points of a large cloud."""
+def _read_cloud(recording: Recording, on_part: OnPart) -> Cloud:
+    """Read a cloud, or evenly spaced points of a large cloud."""
     total = recording.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
     parts: list[Sweep] = []
     for number in range(len(recording)):
-        part = shown(recording[number].select(slice(None, None, step)))
+        part = finite_points(recording[number].select(slice(None, None, step)))
         parts.append(part.replace(points=np.asarray(part.points, np.float64)))
         on_part(parts[-1], (number + 1) / len(recording))
-    return joined_cloud(parts)
+    return merge_sweeps(parts)
 
 
 @dataclass(frozen=True, eq=False)
 class _TimedSweep:
-    """A sweep of a recording, before it is read."""
+    """Time, sensor and number of a sweep that has not been read."""
 
     begins_ns: float
     sensor: int
     number: int
 
 
-def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
-    """Return the sweeps of all sensors in the order of times, and whether the times are known."""
+def _sort_sweeps(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
+    """Return the sweeps of all sensors in order of time, and whether their times are known."""
     sweeps: list[_TimedSweep] = []
     is_timed = True
     for sensor, recording in enumerate(sensors):
@@ -222,13 +240,13 @@ def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
     ], is_timed
 
 
-def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
-    """Read sweeps until memory is full, and return their points, the sweeps, and notes."""
+def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
+    """Read sweeps up to the point limit, and return their points, the sweeps, and notes."""
     recordings = [*sensors.values()]
-    ordered, is_timed = _order(recordings)
+    ordered, is_timed = _sort_sweeps(recordings)
     frame_poses = [_frame_poses(recording) for recording in recordings]
     if any(sensor_poses is None for sensor_poses in frame_poses):
-        frame_poses = [None] * len(recordings)  # sensors without a pose fit no others
+        frame_poses = [None] * len(recordings)  # poses cannot be combined if a sensor has none
     read: list[Sweep] = []
     poses: list[Floats | None] = []
     count = 0
@@ -238,7 +256,9 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
         if sweep.pose is None and sensor_poses is not None:
             sweep = sweep.replace(pose=sensor_poses[timed.number])
         poses.append(sweep.pose)
-        read.append(shown(sweep if sweep.pose is None else sweep.replace(points=sweep.in_world())))
+        read.append(
+            finite_points(sweep if sweep.pose is None else sweep.replace(points=sweep.in_world()))
+        )
         count += len(read[-1])
         if count > MAX_POINTS:
             break
@@ -249,13 +269,13 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     if not is_timed and len(ordered) > 1 and not are_stations:
         notes.append("The recording contains no times. A rate of 10 sweeps per second is assumed.")
     counts = [len(sweep) for sweep in read]
-    cloud = joined_cloud(read, scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
+    cloud = merge_sweeps(read, scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
     sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])
     return cloud, replace(sweeps, stations=len(sweeps) if are_stations else 1), notes
 
 
 def _frame_poses(recording: Recording) -> Floats | None:
-    """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
+    """Return the sweep poses from the frames of a bag, of shape (n, 4, 4), or None."""
     has_frames = recording.read_poses is not None
     return recording.poses(range(len(recording))) if has_frames else None
 
@@ -263,7 +283,7 @@ def _frame_poses(recording: Recording) -> Floats | None:
 def recorded_sweeps(
     ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
 ) -> Sweeps:
-    """Return sweeps of one scan each, without actors.
+    """Return sweeps that consist of one scan each, without actors.
 
     `names` are the names of the sensors.
     """

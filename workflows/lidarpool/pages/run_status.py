@@ -1,4 +1,4 @@
-"""How far a run is, in words and numbers: its state, rate and stages, and its busy partitions."""
+"""Status of a run: its state, rate, stages, and the load of its partitions."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from poolpart import Partition, PartitionStats
 
 from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, waiting_reason
 
-ASK_EVERY_S = 1.0  # how busy the partitions are
-MAX_LOADS = 6  # answers to that, over which it is averaged
+POLL_EVERY_S = 1.0  # minimum time between polls of the partition statistics
+MAX_LOADS = 6  # number of polls that are averaged
 
 
 class RunStatus:
-    """State of a run, its last progress, its rate, and the remaining time."""
+    """State of a run with its latest progress, rate, and remaining time."""
 
     def __init__(self) -> None:
         self.state = "starting"
         self.over = False
         self.progress: Progress | None = None
         self._pace = Pace()
-        # The rate, and the remaining time, in words.
+        # Formatted rate and remaining time.
         self._rate = ""
         self._time_left = ""
 
     def update(self, progress: Progress) -> None:
-        """Take a progress, and derive rate and remaining time."""
+        """Record the progress, and derive the rate and the remaining time."""
         self.progress = progress
         counts = (progress.collected, progress.scans)
         unit = ""
@@ -46,7 +46,7 @@ class RunStatus:
             self._time_left = self._pace.time_left(progress.seconds, *counts)
 
     def finish(self, seconds: float, points: int | None) -> None:
-        """Record the end of the run, and the points of the result of a survey."""
+        """Record the end of the run, and the number of points in the result of a survey."""
         if self.progress is not None:
             points = self.progress.points if points is None else points
             self.progress = replace(self.progress, seconds=seconds, points=points)
@@ -55,7 +55,7 @@ class RunStatus:
         self.over = True
 
     def news(self, is_stopping: bool) -> dict[str, Any]:
-        """Return the state in words and numbers, for JSON."""
+        """Return the status as JSON-compatible objects."""
         progress = self.progress
         state = self.state
         if not self.over:
@@ -79,43 +79,45 @@ class RunStatus:
 
 
 class PartitionLoads:
-    """How busy the partitions of a run are: their statistics at the last moments."""
+    """Recent load statistics of the partitions of a run."""
 
     def __init__(self) -> None:
         self.partitions: Mapping[str, Partition] = {}
         self._loads: deque[tuple[float, dict[str, PartitionStats]]] = deque(maxlen=MAX_LOADS)
-        self._ask_at = 0.0
+        self._poll_at = 0.0
 
-    def ask(self) -> None:
-        """Ask the partitions, if the last answer is old."""
+    def poll(self) -> None:
+        """Poll the partitions if the last statistics are old."""
         time_s = time.monotonic()
-        if time_s < self._ask_at:
+        if time_s < self._poll_at:
             return
-        self._ask_at = time_s + ASK_EVERY_S
-        with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
+        self._poll_at = time_s + POLL_EVERY_S
+        with suppress(OSError, RuntimeError):  # The run itself reports a lost cluster.
             stats = {name: part.stats() for name, part in self.partitions.items()}
             self._loads.append((time_s, stats))
 
     def clear(self) -> None:
-        """Forget the statistics of a run that is over."""
+        """Discard the statistics at the end of the run."""
         self._loads.clear()
 
     def slots(self) -> list[Any]:
-        """Return the busy slots (`busy_slots`)."""
+        """Return the busy slots (see `busy_slots`)."""
         return busy_slots(list(self._loads))
 
 
 def busy_slots(loads: Sequence[tuple[float, Mapping[str, PartitionStats]]]) -> list[Any]:
-    """Return [label, share of busy slots, slots] of each partition, over moments.
+    """Return the label, the fraction of busy slots, and the number of slots of each partition.
 
-    `loads` are (seconds, statistics) of the moments. Short tasks end between two moments, long
-    tasks after all: the larger counts, of the slots of ended tasks and the slots held at moments.
+    `loads` are pairs of a time in seconds and the statistics at that time. Short tasks may end
+    between two polls, and long tasks only end after all polls. The load is therefore estimated both
+    from the run times of ended tasks and from the slots that were busy at each poll, and the larger
+    estimate is used.
     """
     (begin, first), *_, (end, last) = [*loads, *loads] or [(0.0, {})] * 2
     shares = []
     for name, load in last.items():
         held = sum(earlier[name].busy for _, earlier in loads) / len(loads)
-        took = (load.seconds - first[name].seconds) / max(end - begin, ASK_EVERY_S)
+        took = (load.seconds - first[name].seconds) / max(end - begin, POLL_EVERY_S)
         share = min(max(held, took) / max(load.slots, 1), 1.0)
         shares.append([f"{name}, slots busy", share, load.slots])
     return shares

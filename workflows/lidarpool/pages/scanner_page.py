@@ -1,8 +1,8 @@
-"""The page of a scanner: its sweeps in the browser while a program scans.
+"""Live page of scanners, which shows their sweeps in the browser while a program runs.
 
-The program hands a sweep over and goes on. The newest sweep of each scanner is kept, and is
-prepared when a browser asks for news, within a small share of a core: sweeps in between are left
-out.
+The program hands over a sweep and continues. The page keeps only the newest sweep of each scanner,
+and prepares it when a browser requests an update, within a small share of a CPU core. Sweeps in
+between are skipped.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from ..viewers.scanner_view import ScannerView, is_present, pose_at
 from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
-SHARE = 0.02  # share of a core, for points; sending them takes as much again
-NEWS_MS = 60  # at least, from a question of a page for news to the next
-SCALES_S = 5.0  # color scales stay so long, so that colors of surfaces do not flicker
-MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
-_RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
+SHARE = 0.02  # maximum share of a CPU core for preparing points; sending them takes as much again
+NEWS_MS = 60  # minimum time between two requests for updates
+SCALES_S = 5.0  # time for which color scales are kept, so that colors do not flicker
+MAX_TRAIL = 500  # maximum number of positions in the trajectory of a sensor
+_RATE_SWEEPS = 20  # number of sweeps over which the rate is averaged
 
 
 def show(
@@ -97,7 +97,7 @@ def show(
 
 
 class ScannerPage(ScannerView):
-    """The page of scanners, in real time, made by `show`."""
+    """Live page of scanners in real time, which is created by `show`."""
 
     def __init__(self, scanners: Sequence[Scanner], to: str | None, browser: bool) -> None:
         names = [_name(scanner) for scanner in scanners]
@@ -114,7 +114,7 @@ class ScannerPage(ScannerView):
         self._page = stack.enter_context(
             page_server(self._feed.answer, address.port, host=address.host)
         )
-        # Also at the end of the process, or of a notebook's object.
+        # Also close the server when the process ends or a notebook deletes the object.
         self._server = weakref.finalize(self, stack.close)
         if cell_display() is None:
             click.echo(self.description, err=True)
@@ -123,16 +123,16 @@ class ScannerPage(ScannerView):
 
     @property
     def description(self) -> str:
-        """Line for users with the address to open."""
+        """Message for users that contains the address."""
         return f"The page is available at {self.url}"
 
     @property
     def url(self) -> str:
-        """Address of the page, with its token."""
+        """Address of the page, including its token."""
         return self._page.url
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame, for the cell of a notebook."""
+        """Return the page as a frame for a notebook cell."""
         if self._is_closed:
             return "<p>This page has been closed.</p>"
         return notebook_html(self._page, f"sweeps of {self._scanner.survey.sensor.model}")
@@ -151,17 +151,17 @@ def _name(scanner: Scanner) -> str:
 
 @dataclass(eq=False)
 class _Sensor:
-    """The newest sweep of a scanner, and where its sensor was."""
+    """Newest sweep of a scanner, and the recent positions of its sensor."""
 
     scanner: Scanner
     cloud: Cloud | None = None  # None before the first sweep
     pose: Pose = field(default_factory=lambda: Pose((0.0, 0.0, 0.0)))  # pose of the sensor
-    # (seconds since the page began, x, y, z): local, meters
+    # Rows of (seconds since the page was opened, x, y, z) in local coordinates, in meters.
     trail: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=MAX_TRAIL))
 
     @property
     def positions(self) -> SensorPositions:
-        """Where the sensor was at its last sweeps."""
+        """Positions of the sensor at its recent sweeps."""
         rows = np.array(self.trail or [(0.0, *self.pose.position)])
         (mounted,) = self.scanner.survey.carried
         return SensorPositions(
@@ -169,7 +169,7 @@ class _Sensor:
         )
 
     def points(self, columns: Sequence[str], origin: Floats) -> tuple[AnyFloats, list[AnyArray]]:
-        """Return the points of the sweep in the world, (n, 3), and some of their columns."""
+        """Return the points of the sweep in world coordinates, and some of their columns."""
         if self.cloud is None:
             kinds = {column.name: column.dtype for column in self.scanner.survey.stored_columns}
             return np.zeros((0, 3)), [np.zeros(0, kinds[name]) for name in columns]
@@ -181,26 +181,26 @@ class _Sensor:
 
 
 class SweepFeed:
-    """The newest sweeps of scanners, and their page's questions."""
+    """Newest sweeps of scanners, and the request handler of their page."""
 
     def __init__(self, scanners: Sequence[Scanner]) -> None:
         self._sensors = [_Sensor(scanner) for scanner in scanners]
         self._started = time.monotonic()
-        self._lock = threading.Lock()  # guards the newest sweeps, held for microseconds
-        self._scene = scanners[0].scene  # scene with actors as they were moved
-        self._time_ns = 0.0  # time of the newest sweep, by the clock of trajectories
-        self._count = 0  # sweeps
-        self._moments: deque[float] = deque(maxlen=_RATE_SWEEPS)  # moments of sweeps
+        self._lock = threading.Lock()  # guards the newest sweeps, and is held for microseconds
+        self._scene = scanners[0].scene  # scene with the current positions of actors
+        self._time_ns = 0.0  # time of the newest sweep on the clock of trajectories
+        self._count = 0  # number of sweeps so far
+        self._moments: deque[float] = deque(maxlen=_RATE_SWEEPS)  # arrival times of sweeps
         self._share = CpuShare(SHARE)
-        self._shown = 0  # sweeps that had come when the points were replaced
+        self._shown = 0  # value of `_count` when the displayed points were updated
         self._scales_until = 0.0
-        self._view: View | None = None  # None before the first question
+        self._view: View | None = None  # None before the first request
         self._making = threading.Lock()
 
-    # -- the program's side --------------------------------------------------------------
+    # -- called by the program ----------------------------------------------------------
 
     def put(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
-        """Keep a sweep in place of the scanner's last."""
+        """Replace the newest sweep of a scanner."""
         name = _name(scanner)
         names = [_name(sensor.scanner) for sensor in self._sensors]
         if name not in names:
@@ -220,25 +220,25 @@ class SweepFeed:
             self._count += 1
             self._moments.append(now_s)
 
-    # -- the page's side -----------------------------------------------------------------
+    # -- called by the page -------------------------------------------------------------
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page."""
-        if not self._count:  # nothing is known of the surroundings to look at
+        """Answer a request from the page."""
+        if not self._count:  # Before the first sweep, there is nothing to show.
             return self._news(), {}
         if question == "state":
             header, arrays = self.view.answer(question, arguments, abandoned)
             return header | {"live": True, "scanner": True}, arrays
-        if question not in ("news", "points"):  # once, or when a user asks
+        if question not in ("news", "points"):  # requested once, or by a user
             return self.view.answer(question, arguments, abandoned)
         with self._share.use():
             if question == "news":
-                return self._news(), self._moved()
+                return self._news(), self._moving_objects()
             return self.view.answer(question, arguments, abandoned)
 
     @property
     def view(self) -> View:
-        """View of the newest sweeps, made at the first question."""
+        """View of the newest sweeps, which is created at the first request."""
         with self._making:
             if self._view is None:
                 scanner = self._sensors[0].scanner
@@ -254,7 +254,10 @@ class SweepFeed:
             return self._view
 
     def _news(self) -> dict[str, Any]:
-        """Return the number of sweeps and their rate, for JSON, and show newer points if due."""
+        """Return the number and rate of sweeps as JSON-compatible objects.
+
+        The displayed points are updated if necessary.
+        """
         rate = ""
         with self._lock:
             moments = [*self._moments]
@@ -277,12 +280,13 @@ class SweepFeed:
             "hits_version": None,
             "path": None,
             "ends": 0,
-            "wait_ms": max(NEWS_MS, 1e3 * self._share.wait_s),  # until newer points are due
+            # time until newer points can be requested
+            "wait_ms": max(NEWS_MS, 1e3 * self._share.wait_s),
             "points": 0 if self._view is None else len(self._view.points),
         }
 
     def _version(self) -> int:
-        """Return the version of the points, newer points if there are any and these are due."""
+        """Update the displayed points if newer ones are due, and return their version."""
         if not self._count:
             return 0
         view = self.view
@@ -296,7 +300,7 @@ class SweepFeed:
         return view.version
 
     def _cloud(self) -> Cloud:
-        """Return the points of the newest sweep of each sensor, with the columns of all sensors."""
+        """Merge the newest sweeps of all sensors, with the columns that all sensors have."""
         with self._lock:
             sensors = [replace(sensor) for sensor in self._sensors]
         tables = [[column.name for column in s.scanner.survey.stored_columns] for s in sensors]
@@ -312,8 +316,8 @@ class SweepFeed:
         custom = next((s.cloud.custom_columns for s in sensors if s.cloud is not None), ())
         return Cloud(np.concatenate([positions for positions, _ in parts]), columns, custom)
 
-    def _moved(self) -> dict[str, AnyArray]:
-        """Return the positions of sensors and actors, local meters, and seconds, as arrays."""
+    def _moving_objects(self) -> dict[str, AnyArray]:
+        """Return arrays of sensor positions, in local coordinates, and of actor poses."""
         with self._lock:
             scene = self._scene
             time_ns = self._time_ns
@@ -326,7 +330,7 @@ class SweepFeed:
 
 
 def _actor_poses(scene: Scene, time_ns: float) -> dict[str, AnyArray]:
-    """Return poses, frames of animations and presence of actors at a time, nanoseconds."""
+    """Return the poses, animation frames and presence of actors at a time."""
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     rotations = np.array([pose.rotation_matrix for pose in poses]).reshape(-1, 3, 3)
     frames = np.zeros(len(poses))

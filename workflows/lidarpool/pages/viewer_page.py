@@ -1,8 +1,8 @@
-"""Shows a run in Foxglove or Rerun: sweeps as they are finished, trajectories and the path.
+"""Show a run in Foxglove or Rerun, with its trajectories, planned path, and sweeps as they finish.
 
-The run's thread notes which sweeps are finished; a thread of this module reads their parts and
-sends them, within a small share of a core. Of more sweeps than that allows, every second is left
-out.
+The thread of the run only records which sweeps are finished. A separate thread reads their parts
+and sends them, within a small share of a CPU core. If sweeps finish faster than that, every second
+sweep is skipped.
 """
 
 from __future__ import annotations
@@ -43,35 +43,38 @@ from ..run.store.stored_job import StoredJob
 from ..viewers.viewer import Viewer, open_viewer
 from .cpu_share import CpuShare
 
-READING_SHARE = 0.05  # share of a core, for surroundings and sweeps
-MAX_WAITING = 64  # finished sweeps that wait to be read; of more, every second is left out
-LAST_S = 0.3  # time to send waiting sweeps at the end of the run
-LOOK_EVERY_S = 5.0  # at most, for another job of a campaign
-JOB_SWEEPS = 10  # sweeps of a job of a campaign
-CLOUD_POINTS = 150_000  # points of the whole cloud at the end
+READING_SHARE = 0.05  # maximum share of a CPU core for the surroundings and sweeps
+MAX_WAITING = 64  # If more finished sweeps are pending, every second sweep is skipped.
+LAST_S = 0.3  # maximum time to send pending sweeps at the end of the run
+SHOW_EVERY_S = 5.0  # minimum time between two jobs of a campaign
+JOB_SWEEPS = 10  # number of sweeps that are shown per job of a campaign
+CLOUD_POINTS = 150_000  # points of the final cloud
 CLOUD_PARTS = 64
 _WAIT_S = 0.05
 
 
 class ViewerPage(RunPage):
-    """Shows the sweeps of a run in a viewer: of a survey as they finish, of a campaign by job."""
+    """Sweeps of a run in a viewer.
+
+    The sweeps of a survey are shown as they finish, and those of a campaign job by job.
+    """
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
         self._survey: SurveyFeed | None = None  # feed of the only job
-        self._looking = CpuShare(READING_SHARE)
+        self._share = CpuShare(READING_SHARE)
 
     def begun(self, job: StoredJob) -> None:
         """Show the only job of a run."""
         self._survey = SurveyFeed(job, self._viewer)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Note parts of the only job that were committed."""
+        """Record committed parts of the only job."""
         if self._survey is not None:
             self._survey.add(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Note a scan of the only job: its points, and points of earlier scans, are in storage."""
+        """Record that a scan of the only job, and all earlier scans, are in storage."""
         if self._survey is not None:
             self._survey.finish_scan(frame.scan)
 
@@ -83,31 +86,31 @@ class ViewerPage(RunPage):
             self._survey.show_path()
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Show a finished job of a campaign, before its parts are removed."""
-        if self._looking.due:
-            with self._looking.use(LOOK_EVERY_S), suppress(LidarError):
+        """Show a finished job of a campaign before its parts are removed."""
+        if self._share.due:
+            with self._share.use(SHOW_EVERY_S), suppress(LidarError):
                 reader = SweepReader(job)
                 reader.add(job.parts.ordered)
                 self._viewer.show_surroundings(reader.surroundings())
                 count = len(reader.sequence.sweeps)
                 for sweep in np.unique(np.linspace(0, count - 1, JOB_SWEEPS).astype(int)).tolist():
-                    self._viewer.show_sweep(reader.shown(sweep))
+                    self._viewer.show_sweep(reader.read_sweep(sweep))
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
         """Show the result of a survey.
 
-        Its parts may then be removed.
+        Afterward, its parts may be removed.
         """
         if self._survey is not None:
             self._survey.close(result)
 
     def close(self) -> None:
-        """Stop sending."""
+        """Stop sending sweeps."""
         if self._survey is not None:
             self._survey.stop()
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the viewer until Ctrl-C."""
+        """Keep the viewer open until Ctrl-C."""
         click.echo(f"{self._viewer.description}. Press Ctrl-C to stop.", err=True)
         wait_for_interrupt()
 
@@ -125,32 +128,35 @@ def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
 
 
 class SweepReader:
-    """Reads sweeps of a job from its parts."""
+    """Reader for the sweeps of a job, which are stored in parts."""
 
     def __init__(self, job: StoredJob) -> None:
         self._job = job.job
         self.sequence = SweepSequence(job.job.sweeps)
-        self._points = job.points()  # points of the columns of parts
-        self._parts: dict[int, Receipt] = {}  # {first scan: part}
+        self._points = job.points()  # reader for the points of parts
+        self._parts: dict[int, Receipt] = {}  # by number of the first scan
         self._lock = threading.Lock()
-        self._last: tuple[str, Cloud] | None = None  # the part that was read last
+        self._last: tuple[str, Cloud] | None = None  # most recently read part
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Note parts in storage, without reading."""
+        """Record stored parts without reading them."""
         with self._lock:
             self._parts |= {receipt.first: receipt for receipt in receipts}
 
     def surroundings(self) -> Surroundings:
-        """Return scene and trajectories of the job, which takes a moment for large scenes."""
+        """Return the scene and trajectories of the job, which takes a moment for large scenes."""
         surroundings = Surroundings.from_sweeps(self.sequence.sweeps)
         if self._job.survey.coordinates != "world":
             return surroundings
         return replace(surroundings, surface=Surface.from_scene(self._job.scene))
 
-    def shown(self, sweep: int) -> ShownSweep:
+    def read_sweep(self, sweep: int) -> ShownSweep:
         """Return a sweep whose parts are in storage.
 
-        Raises LidarError if a part cannot be read.
+        Raises
+        ------
+        LidarError
+            If a part cannot be read.
         """
         start, stop = self.sequence.sweeps.scans[sweep : sweep + 2].tolist()
         with self._lock:
@@ -164,7 +170,7 @@ class SweepReader:
     def _read(self, name: str) -> Cloud:
         """Return the points of a part.
 
-        The last part is kept, as a part may have many sweeps.
+        The most recent part is cached, because a part may contain many sweeps.
         """
         if self._last is None or self._last[0] != name:
             self._last = name, self._points.cloud_of(read_part(self._points.storage, name))
@@ -172,7 +178,7 @@ class SweepReader:
 
 
 class SurveyFeed:
-    """Sends the finished sweeps of the only job of a run to a viewer, in a thread."""
+    """Thread that sends the finished sweeps of the only job of a run to a viewer."""
 
     def __init__(self, job: StoredJob, viewer: Viewer) -> None:
         self._under_way = job
@@ -180,7 +186,7 @@ class SurveyFeed:
         self._reader = SweepReader(job)
         sweeps = self._reader.sequence.sweeps
         self._last_scans = {scan - 1: sweep for sweep, scan in enumerate(sweeps.scans[1:].tolist())}
-        self._waiting: list[int] = []  # numbers of sweeps
+        self._waiting: list[int] = []  # numbers of pending sweeps
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._share = CpuShare(READING_SHARE)
@@ -190,14 +196,14 @@ class SurveyFeed:
         self._thread = threading.Thread(target=self._send_sweeps, name="viewer", daemon=True)
         self._thread.start()
 
-    # -- the run's side ------------------------------------------------------------------
+    # -- called by the run --------------------------------------------------------------
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Note parts in storage, without reading."""
+        """Record stored parts without reading them."""
         self._reader.add(receipts)
 
     def finish_scan(self, scan: int) -> None:
-        """Note that a scan and all earlier scans are in storage."""
+        """Record that a scan and all earlier scans are in storage."""
         if scan in self._last_scans:
             with self._lock:
                 self._waiting.append(self._last_scans[scan])
@@ -215,7 +221,7 @@ class SurveyFeed:
             self._viewer.show_path(path_in_world(path, self._under_way.job.scene.origin))
 
     def close(self, result: RunResult | None) -> None:
-        """Send waiting sweeps for a moment, then path and points of the result."""
+        """Send pending sweeps until a timeout, then the path and points of the result."""
         self.stop()
         give_up_at = time.monotonic() + LAST_S
         while self._waiting and time.monotonic() < give_up_at:
@@ -227,7 +233,7 @@ class SurveyFeed:
             self._viewer.show_sweep(self._whole_cloud(result))
 
     def stop(self) -> None:
-        """End the thread, after the sweep that is being sent."""
+        """Stop the thread after the current sweep."""
         self._ended.set()
         self._thread.join()
 
@@ -243,17 +249,17 @@ class SurveyFeed:
                     self._send_next()
 
     def _send_next(self) -> None:
-        """Send the sweep that has waited longest.
+        """Send the oldest pending sweep.
 
-        The run reports parts that cannot be read.
+        Unreadable parts are skipped, because the run reports them.
         """
         with self._lock:
             sweep = self._waiting.pop(0)
         with suppress(LidarError):
-            self._viewer.show_sweep(self._reader.shown(sweep))
+            self._viewer.show_sweep(self._reader.read_sweep(sweep))
 
     def _whole_cloud(self, result: RunResult) -> ShownSweep:
-        """Return evenly chosen points of a result, in a frame at the scene's local origin."""
+        """Return evenly spaced points of a result, in a frame at the origin of the scene."""
         cloud = result.points.sample(CLOUD_POINTS, CLOUD_PARTS)
         sequence = self._reader.sequence
         end_ns = sequence.start_ns + round(float(sequence.sweeps.ends_ns.max()))

@@ -1,1 +1,1 @@
-"""Play: sweeps leave at their own time, over the protocols of sensors and messages of viewers."""
+"""Play back sweeps in real time over sensor protocols and to viewers."""

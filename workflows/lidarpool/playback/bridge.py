@@ -1,4 +1,4 @@
-"""Bridges: where played sweeps go, by the protocol of `--as`."""
+"""Interface of bridges, which send played sweeps in the protocol selected with `--as`."""
 
 from __future__ import annotations
 
@@ -22,34 +22,38 @@ from .schedule import Schedule
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """Options of the command that bridges share, or that some bridges have."""
+    """Command-line options of bridges."""
 
-    to: tuple[str, ...] = ()  # addresses; empty for the bridge's default, on the loopback interface
-    period_ns: int = 0  # period of --loop (`Played.period_ns`); 0 to play once
-    settings: Mapping[str, Any] = field(default_factory=dict)  # {option of some bridges: value}
+    # addresses; empty for the default of the bridge on the loopback interface
+    to: tuple[str, ...] = ()
+    period_ns: int = 0  # period of `--loop` (`PlaybackSource.period_ns`); 0 to play once
+    # options that only some bridges have, by name
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Bridge(ABC):
-    """Sends sweeps to receivers, as a context manager that opens and closes the connections.
+    """Context manager that sends sweeps to receivers.
 
-    A subclass checks its options when it is made, and raises LidarError, in one line, for what it
-    cannot send.
+    Entering and leaving the context opens and closes the connections. The constructor of a subclass
+    checks the options, and raises LidarError with a single-line message if it cannot send the
+    sweeps.
 
     Parameters
     ----------
     sweeps
         The sweeps that will be sent.
     schedule
-        Their times; it starts before the first `send`.
+        The times of the sweeps. It is started before the first call to `send`.
     options
-        Options of the command; `settings` are those that the class names.
+        Options of the command. Its `settings` are those that the class names in `settings`.
     note
-        Prints a note for the user.
+        Function that prints a note for the user.
     """
 
-    format: ClassVar[ExportSpec | None] = None  # clouds of it have the columns that are sent
-    settings: ClassVar[tuple[str, ...]] = ()  # options of the command beside `to`
-    lead_ns: ClassVar[float] = 0.0  # how long before `due_ns` the bridge gets a sweep
+    format: ClassVar[ExportSpec | None] = None  # format whose columns are sent
+    # supported options of the command, in addition to `to`
+    settings: ClassVar[tuple[str, ...]] = ()
+    lead_ns: ClassVar[float] = 0.0  # time before `due_ns` at which the bridge receives a sweep
 
     def __init__(
         self,
@@ -65,41 +69,45 @@ class Bridge(ABC):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec | None:
-        """Return `format`, or the format of `settings`.
+        """Return the format whose columns are sent, which may depend on `settings`.
 
-        Raises LidarError if these do not fit together.
+        Raises
+        ------
+        LidarError
+            If the settings contradict each other.
         """
         del settings
         return cls.format
 
     @classmethod  # noqa: B027 - most need none
     def check_installed(cls) -> None:
-        """Raise LidarError if a package is missing that is imported with the first bridge."""
+        """Raise LidarError if a package that the bridge imports lazily is not installed."""
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """The address where receivers find the sweeps, for the line that says «ready»."""
+        """Address at which receivers find the sweeps, for the "ready" message."""
 
     def due_ns(self, sweep: int) -> float:
-        """Return when a sweep is sent, nanoseconds since the survey's start: after its last firing.
+        """Return when a sweep is due, in nanoseconds since the start of the survey.
 
-        A bridge that spreads a sweep over its time overrides this, and gets it `lead_ns` before.
+        By default, a sweep is due after its last firing. A bridge that sends a sweep over its whole
+        duration overrides this method, and receives the sweep `lead_ns` earlier.
         """
         return float(self.sweeps.ends_ns[sweep])
 
     def prepare(self, sweep: int, points: Cloud) -> None:  # noqa: B027 - most need nothing
-        """Do what takes long the first time, such as compiling, before the schedule starts.
+        """Perform slow initialization, such as compilation, before the schedule starts.
 
-        `sweep` is the first sweep of a sensor, which `send` gets later.
+        `sweep` is the first sweep of a sensor, which is passed to `send` later.
         """
 
     def show_content(  # noqa: B027 - most receivers have no use for a scene
         self, content: Callable[[], PictureContent | None]
     ) -> None:
-        """Show scene and planned path before the first sweep.
+        """Show the scene and the planned path before the first sweep.
 
-        `content` returns both.
+        `content` is a function that returns both.
         """
 
     @abstractmethod
@@ -110,11 +118,11 @@ class Bridge(ABC):
         """
 
     def finish(self) -> None:  # noqa: B027 - messages are sent at once
-        """Send what is left after the last sweep, and wait until all is sent."""
+        """Send the remaining data after the last sweep, and wait until everything has been sent."""
 
     @property
     def summary(self) -> str:
-        """What was sent, for the user, once the context has ended, or no text."""
+        """Summary of what was sent, available after the context has ended, or an empty string."""
         return ""
 
     def __enter__(self) -> Self:
@@ -122,13 +130,16 @@ class Bridge(ABC):
 
     @abstractmethod
     def __exit__(self, *error: object) -> None:
-        """Close all connections, and end all threads and processes."""
+        """Close all connections, and stop all threads and processes."""
 
 
 def bridge_class(name: str) -> type[Bridge]:
-    """Return the class of a bridge.
+    """Import and return the class of a bridge.
 
-    LidarError if the bridge is unknown, or its packages are not installed.
+    Raises
+    ------
+    LidarError
+        If the bridge is unknown, or if its packages are not installed.
     """
     if name not in BRIDGES:
         names = ", ".join(BRIDGES)

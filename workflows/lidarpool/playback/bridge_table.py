@@ -1,4 +1,4 @@
-"""The table of bridges, quick to import for the completion of commands."""
+"""Table of bridges, which can be imported quickly for shell completion."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 
 class BridgeEntry(NamedTuple):
-    """Where a bridge is implemented, and the extra that installs its packages."""
+    """Location of a bridge class, and the extra that installs its packages."""
 
-    target: str  # module and class
+    target: str  # MODULE:CLASS
     extra: str = ""
 
 
-# {name for --as: the bridge}
+# By the name that is passed to `--as`.
 BRIDGES = {
     "packets": BridgeEntry("lidarpool.playback.live_sensor:PacketsBridge"),
     "ros2": BridgeEntry("lidarpool.playback.ros2:Ros2Bridge", "ros2"),

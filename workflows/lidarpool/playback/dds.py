@@ -1,4 +1,4 @@
-"""Topics of ROS 2 without ROS: cyclonedds sends messages that are serialized already."""
+"""Publish ROS 2 topics without ROS, by sending serialized messages with cyclonedds."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
 LOOPBACK = "127.0.0.1"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
-_MAX_DOMAIN = 232  # ports of further domains are above 65,535
-_PARTICIPANTS = 32  # participants of a machine, as ROS 2 takes it
-# Participants announce themselves once a second: readers that start later soon find the topics.
+_MAX_DOMAIN = 232  # ports of higher domains would exceed 65,535
+_PARTICIPANTS = 32  # maximum number of participants per machine, as in ROS 2
+# Participants announce themselves once per second, so readers that start later find the topics
+# quickly.
 _CONFIGURATION = """<CycloneDDS><Domain Id="{domain}">
 <General><Interfaces><NetworkInterface address="{address}"/></Interfaces>
 {sizes}</General>
@@ -39,9 +40,10 @@ _CONFIGURATION = """<CycloneDDS><Domain Id="{domain}">
 <SPDPInterval>1s</SPDPInterval><Peers>{peers}</Peers></Discovery>
 <Tracing><Verbosity>none</Verbosity></Tracing>
 </Domain></CycloneDDS>"""
-# The loopback interface takes datagrams of any size, and readers lose fewer of a few large ones.
+# The loopback interface accepts datagrams of any size, and readers lose fewer packets if there are
+# a few large ones.
 _LOOPBACK_SIZES = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
-# A reader that stops reading delays others by no more than this.
+# Maximum delay that an unresponsive reader can cause for the others.
 _MAX_BLOCKING = duration(milliseconds=20)
 _BASE_TYPES = {
     "bool": bool,
@@ -52,30 +54,32 @@ _BASE_TYPES = {
     **{f"uint{bits}": getattr(types, f"uint{bits}") for bits in (8, 16, 32, 64)},
     **{f"float{bits}": getattr(types, f"float{bits}") for bits in (32, 64)},
 }
-# Messages that late readers may get: of the last, as nodes of ROS 2 keep them.
+# Number of messages that are kept per topic, as in ROS 2 nodes.
 _DEPTHS = {"/clock": 1, "/tf": 100}
 _DEPTH = 10
 
 
 @dataclass(frozen=True)
 class Network:
-    """Where topics are: an interface of this machine, its peers, and a domain."""
+    """Network interface, peers, and domain of ROS 2 topics."""
 
-    address: str = LOOPBACK  # address of the interface
-    peers: tuple[str, ...] = ()  # machines that are told of the topics
+    address: str = LOOPBACK  # address of the network interface
+    peers: tuple[str, ...] = ()  # machines to which the topics are announced
     domain: int = 0
 
     @classmethod
-    def to(cls, hosts: Sequence[str], environment: Mapping[str, str] = os.environ) -> Network:
-        """Return the network that reaches hosts, of a single interface, or loopback without hosts.
+    def for_hosts(
+        cls, hosts: Sequence[str], environment: Mapping[str, str] = os.environ
+    ) -> Network:
+        """Return the network through which all hosts can be reached.
 
-        The domain is ROS_DOMAIN_ID.
+        Without hosts, the loopback interface is used. The domain is ROS_DOMAIN_ID.
 
         Raises
         ------
         LidarError
-            If a host is unknown, unreachable or not an IPv4 address, hosts are reached through
-            several interfaces, or the domain is not a number from 0 to 232.
+            If a host is unknown, unreachable or has no IPv4 address, if the hosts are reached
+            through different interfaces, or if the domain is not a number from 0 to 232.
         """
         peers = tuple(_ipv4_address(host) for host in hosts)
         interfaces = {_interface_to(peer) for peer in peers} or {LOOPBACK}
@@ -96,7 +100,7 @@ class Network:
 
     @property
     def configuration(self) -> str:
-        """The configuration of cyclonedds, as XML."""
+        """Configuration of cyclonedds as XML."""
         peers = dict.fromkeys((self.address, *self.peers))
         return _CONFIGURATION.format(
             domain=self.domain,
@@ -108,9 +112,9 @@ class Network:
 
 
 def _ipv4_address(host: str) -> str:
-    """Return the address of a host.
+    """Resolve the IPv4 address of a host.
 
-    Raises LidarError for an unknown host, and without IPv4.
+    Raise LidarError if the host is unknown or has no IPv4 address, or if the address is multicast.
     """
     advice = "Specify a host name or an IPv4 address, without a port."
     try:
@@ -124,7 +128,7 @@ def _ipv4_address(host: str) -> str:
 
 
 def _interface_to(address: str) -> str:
-    """Return the address of the interface of this machine through which an address is reached."""
+    """Return the address of the local interface through which an address is reached."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address, 9))  # sends nothing
@@ -136,14 +140,14 @@ def _interface_to(address: str) -> str:
 
 
 class RosPublisher:
-    """Publishes messages on topics of ROS 2, as a context manager.
+    """Context manager that publishes messages on ROS 2 topics.
 
-    Nodes find the topics on the interface of a network, and on its peers.
+    Nodes discover the topics on the interface of the network, and on its peers.
     """
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self.dropped = 0  # messages that a reader was too slow for
+        self.dropped = 0  # messages that were dropped because a reader was too slow
         self._writers: dict[str, Any] = {}
         try:
             self._domain = Domain(network.domain, network.configuration)
@@ -159,17 +163,14 @@ class RosPublisher:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Take the topics away."""
+        """Remove the topics."""
         self._writers.clear()
         for entity in (self._participant, self._domain):
             with suppress(DDSException):
                 entity._delete(entity._ref)
 
     def publish(self, message: RosMessage) -> None:
-        """Publish a message.
-
-        The topic is made with its first message.
-        """
+        """Publish a message, and create its topic if necessary."""
         if message.topic not in self._writers:
             self._writers[message.topic] = self._writer(message.topic, message.kind)
         writer = self._writers[message.topic]
@@ -181,7 +182,10 @@ class RosPublisher:
             self.dropped += 1
 
     def _writer(self, topic: str, kind: str) -> Any:
-        """Return a writer of a topic: reliable, so that readers of either reliability match."""
+        """Create a writer for a topic.
+
+        The writer is reliable, so that it matches reliable and best-effort readers.
+        """
         latched = topic in LATCHED_TOPICS
         durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
         depth = 1 if latched else _DEPTHS.get(topic, _DEPTH)
@@ -196,9 +200,9 @@ class RosPublisher:
 
 
 def _serialized(kind: Any, cdr: bytes) -> Any:
-    """Return a message of a class that is serialized already.
+    """Return a message that is already serialized.
 
-    cyclonedds would take 72 to 96 ms for a cloud of 2 MB.
+    Serialization by cyclonedds would take 72 to 96 ms for a cloud of 2 MB.
     """
     message = object.__new__(kind)
     message.serialize = lambda **_: cdr
@@ -207,9 +211,9 @@ def _serialized(kind: Any, cdr: bytes) -> Any:
 
 @cache
 def message_class(kind: str) -> Any:
-    """Return the class of cyclonedds of a message, such as sensor_msgs/msg/PointCloud2.
+    """Return the cyclonedds class of a message type, such as sensor_msgs/msg/PointCloud2.
 
-    Names of type and fields are as in the middleware of ROS 2, with an underscore at the end.
+    As in the ROS 2 middleware, the names of the type and of its fields end with an underscore.
     """
     package, _, name = kind.partition("/msg/")
     _, fields = message_store().fielddefs[kind]
@@ -221,7 +225,7 @@ def message_class(kind: str) -> Any:
 
 
 def _idl_type(description: Any) -> Any:
-    """Return the type of a field of a description of rosbags."""
+    """Return the cyclonedds type of a field, given its description by rosbags."""
     node, content = description
     if node == Nodetype.BASE:
         return _BASE_TYPES[content[0]]

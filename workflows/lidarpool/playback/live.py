@@ -1,4 +1,4 @@
-"""A scanner as a live sensor, from Python: for programs that move the sensor themselves."""
+"""Play a scanner as a live sensor, in programs that move the sensor themselves."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lidarsim.simulator import Scanner
 from lidarsim.words import joined
 
 from ..processes.fork_server import keep_freed_memory
-from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule, casting_threads
+from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 
-_AHEAD = 16  # sweeps that are cast before they are due, of a trajectory that is known
+_AHEAD = 16  # sweeps that are simulated in advance if the trajectory is known
 _START_NS = 20e6  # time between the start of the schedule and the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
 
@@ -102,12 +102,12 @@ def play(
     streams = sensor_streams([packets.encoder], [to], [api] if api else [])
     sweeps = _sweeps(scanner, trajectory, duration_s)
     with Transmitter(streams, note or (lambda words: None)) as transmitter:
-        if callable(trajectory):  # which says the next pose only when that sweep is due
+        if callable(trajectory):  # the next pose is only known when its sweep is due
             clouds = (task() for task in sweeps)
             _send_all(packets, clouds, Schedule(rate), transmitter, ready, note)
         else:
-            with MadeAhead(sweeps, _AHEAD, casting_threads()) as made_ahead:
-                _send_all(packets, iter(made_ahead), Schedule(rate), transmitter, ready, note)
+            with Prefetcher(sweeps, _AHEAD, casting_threads()) as prefetcher:
+                _send_all(packets, iter(prefetcher), Schedule(rate), transmitter, ready, note)
         transmitter.sender.finish()
     return transmitter.sender.lateness
 
@@ -115,7 +115,7 @@ def play(
 def _sweeps(
     scanner: Scanner, trajectory: Any, duration_s: float | None
 ) -> Iterator[Callable[[], _NumberedSweep]]:
-    """Yield functions that cast sweep after sweep, to the end of the trajectory or duration."""
+    """Yield functions that simulate consecutive sweeps until the trajectory or duration ends."""
     end_s = getattr(trajectory, "duration_ns", float("inf")) / 1e9
     for number in count():
         first_s, last_s = scanner.span_s(number)
@@ -126,7 +126,7 @@ def _sweeps(
 
 
 def _cast(scanner: Scanner, pose: Any, number: int, start_s: float) -> _NumberedSweep:
-    """Cast a sweep that starts at a time, seconds."""
+    """Simulate a sweep that starts at a time in seconds."""
     return number, start_s, scanner.sweep(pose, number=number)
 
 
@@ -138,14 +138,14 @@ def _send_all(
     ready: Callable[[str], Any] | None,
     note: Callable[[str], Any] | None,
 ) -> None:
-    """Hand the packets of all sweeps over, each up to a sweep before its time."""
+    """Pass the packets of all sweeps to the sender, up to one sweep before they are due."""
 
     def send(groups: list[Datagrams]) -> None:
-        """Hand datagrams over to the process that sends them."""
+        """Pass datagrams to the process that sends them."""
         transmitter.sender.send(0, groups, deadlines_ns)
 
     def deadlines_ns(due_ns: Ints) -> Ints:
-        """Return times of the schedule, which starts with the first datagrams."""
+        """Convert times with the schedule, which starts with the first datagrams."""
         if not schedule.started:
             schedule.start(float(due_ns.min()), _START_NS)
         return schedule.deadlines_ns(due_ns)
@@ -159,5 +159,5 @@ def _send_all(
             note(BEHIND)
             note = None
         send(groups)
-        schedule.wait_until(start_s * 1e9)  # the next sweep is cast, or taken, one sweep ahead
+        schedule.wait_until(start_s * 1e9)  # The next sweep is requested one sweep in advance.
     send(packets.finish())

@@ -1,4 +1,4 @@
-"""Packets: a live sensor, whose datagrams leave at their own times."""
+"""Bridge that sends packets like a live sensor, each at its own time."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 from .transmitter import Transmitter, sensor_streams
 
-_LEAD_NS = 0.3e9  # lead of a sweep before its first packet: the process that sends holds so much
+_LEAD_NS = 0.3e9  # time before its first packet at which a sweep is passed to the sender
 
 
 class PacketsBridge(Bridge):
-    """Sends the packets of each sensor in its maker's protocol, and answers the maker's software.
+    """Bridge that sends packets in the protocol of each sensor, and simulates its interface.
 
-    The settings are `api`, NAME=HOST:PORT or HOST:PORT where the sensors' interfaces listen, and
-    `lateness`, a file for how late packets were.
+    The setting `api` contains the addresses on which the sensor interfaces listen, as
+    NAME=HOST:PORT or HOST:PORT. The setting `lateness` is a file for statistics on how late packets
+    were.
     """
 
     format = ExportSpec("pcap")
@@ -41,7 +42,7 @@ class PacketsBridge(Bridge):
         super().__init__(sweeps, schedule, options, note)
         instruments = sweeps.instruments
         if options.period_ns and instruments is not None:
-            instruments = RepeatedInstruments.of(instruments, options.period_ns)
+            instruments = RepeatedInstruments.from_instruments(instruments, options.period_ns)
         sources = [
             PacketSource.for_sensor(replace(sweeps, instruments=instruments), number)
             for number in range(len(sweeps.sensors))
@@ -52,35 +53,35 @@ class PacketsBridge(Bridge):
 
     @property
     def description(self) -> str:
-        """Where the packets go, and what answers."""
+        """Destinations of the packets, and the available sensor interfaces."""
         return self._transmitter.description
 
     def due_ns(self, sweep: int) -> float:
-        """Return when the sweep starts: its first packet leaves soon after."""
+        """Return the start of the sweep, shortly before its first packet is sent."""
         return float(self.sweeps.begins_ns[sweep])
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Encode a sweep by an encoder that is thrown away, which compiles loops."""
+        """Encode a sweep with a temporary encoder, which compiles loops."""
         source = PacketSource.for_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
         encoder = encoder_of(replace(source, instruments=None))
         encoder.encode(self._shots(encoder, sweep, points))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
-        """Hand the packets of a sweep to the process that sends them."""
+        """Pass the packets of a sweep to the process that sends them."""
         number = int(self.sweeps.sensor[sweep])
         encoder = self._encoders[number]
         shots = self._shots(encoder, sweep, points).shifted(shift_ns)
         self._transmitter.sender.send(number, encoder.encode(shots), self.schedule.deadlines_ns)
 
     def finish(self) -> None:
-        """Send the packets that are left, and wait until all are sent."""
+        """Send the remaining packets, and wait until all have been sent."""
         for number, encoder in enumerate(self._encoders):
             self._transmitter.sender.send(number, encoder.finish(), self.schedule.deadlines_ns)
         self._transmitter.sender.finish()
 
     @property
     def summary(self) -> str:
-        """How many packets were sent, and how late."""
+        """Number of packets that were sent, and how late they were."""
         return self._transmitter.summary
 
     def __enter__(self) -> Self:
@@ -97,20 +98,20 @@ class PacketsBridge(Bridge):
 
 @dataclass(frozen=True)
 class RepeatedInstruments(Instruments):
-    """Instruments whose samples of the IMU are repeated without end, `period_ns` later each time.
+    """Instruments whose IMU samples repeat endlessly, `period_ns` later each time.
 
-    Positions are not: the receiver states its last position from then on.
+    Positions do not repeat. Instead, the receiver keeps reporting its last position.
     """
 
     period_ns: int = 0
 
     @classmethod
-    def of(cls, instruments: Instruments, period_ns: int) -> RepeatedInstruments:
-        """Return repeated instruments."""
+    def from_instruments(cls, instruments: Instruments, period_ns: int) -> RepeatedInstruments:
+        """Create repeated instruments."""
         return cls(instruments.imu, instruments.gnss, instruments.folder, period_ns)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, and rows of the IMU again and again, with later times."""
+        """Yield the rows of a file. Rows of the IMU are repeated with later times."""
         if name != IMU_FILE:
             yield from super().rows(name)
             return

@@ -1,4 +1,4 @@
-"""Recordings of packets: the UDP datagrams of a capture, with the times of their frames."""
+"""Play back the UDP datagrams of a packet capture with their original timing."""
 
 from __future__ import annotations
 
@@ -22,19 +22,21 @@ from .transmitter import Stream, Transmitter, streams_to
 
 
 class PcapRecording:
-    """The UDP datagrams of a capture, in the order of the file. Times start at the first datagram.
+    """UDP datagrams of a packet capture, in file order.
+
+    Times are relative to the first datagram.
 
     Raises
     ------
     LidarError
-        If the file is not a capture, is damaged, or contains no datagrams over IPv4.
+        If the file is not a capture, is damaged, or contains no IPv4 datagrams.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._capture = Capture(path)
-        self.sources: list[str] = []  # addresses of sensors, in the order of their first datagrams
-        self.ports: dict[str, list[int]] = {}  # ports of each sensor
+        self.sources: list[str] = []  # sensor addresses in order of their first datagrams
+        self.ports: dict[str, list[int]] = {}  # ports by sensor address
         last_ns = 0
         packet_count = 0
         for datagram in self._datagrams():
@@ -46,10 +48,13 @@ class PcapRecording:
             last_ns = max(last_ns, datagram.time_ns)
             packet_count += 1
         self.notes = [f"{path} {clause}." for clause in self._capture.notes]
-        self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # period of repeating it
+        self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # duration of one repetition
 
     def batches(self, length_ns: int) -> Iterator[tuple[int, dict[str, list[Datagrams]]]]:
-        """Yield start and datagrams of each span of time, {source: datagrams}."""
+        """Yield the start and the datagrams of each interval of the given length.
+
+        The datagrams are grouped by source.
+        """
         spans = groupby(self._datagrams(), lambda datagram: datagram.time_ns // length_ns)
         for span, datagrams in spans:
             groups: dict[str, dict[tuple[int, int], list[CapturedDatagram]]] = {}
@@ -59,7 +64,7 @@ class PcapRecording:
             yield (
                 span * length_ns,
                 {
-                    source: [_joined(alike) for alike in by_kind.values()]
+                    source: [_stack_datagrams(alike) for alike in by_kind.values()]
                     for source, by_kind in groups.items()
                 },
             )
@@ -72,16 +77,17 @@ class PcapRecording:
             yield datagram._replace(time_ns=max(0, datagram.time_ns - first_ns))
 
 
-_LEAD_NS = 300_000_000  # lead of datagrams that the process that sends holds
+_LEAD_NS = 300_000_000  # time by which datagrams are passed to the sender in advance
 _START_NS = 50e6  # time between the start of the schedule and the first datagram
 
 
 def recorded_streams(
     recording: PcapRecording, to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return a stream for each sensor of a recording, named by its address, as `streams_of`.
+    """Return a stream for each sensor of a recording, named after its address.
 
-    An Ouster's interface answers if the metadata are beside the recording, as a .json.
+    The streams are directed with `streams_to`. For an Ouster sensor, the sensor interface is
+    simulated if there is a .json file with its metadata next to the recording.
     """
     streams = [
         Stream(
@@ -97,7 +103,7 @@ def recorded_streams(
 
 
 def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
-    """Return a function that makes the service of the sensor of a recording, or returns None."""
+    """Return a function that creates the interface of the sensor, or returns None."""
     path = recording.path.with_suffix(".json")
     if len(recording.sources) > 1 or not path.exists():
         return lambda *_: None
@@ -113,7 +119,7 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
     def make_service(
         address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service:
-        """Return the interface of an Ouster."""
+        """Return the interface of an Ouster sensor."""
         return OusterApi(address, destination, send_to, metadata, ports)
 
     return make_service
@@ -122,7 +128,7 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
 def play_recording(
     recording: PcapRecording, transmitter: Transmitter, schedule: Schedule, *, loop: bool = False
 ) -> None:
-    """Send the datagrams of a recording at their times, with `loop` again and again."""
+    """Send the datagrams of a recording on time, and repeat them if `loop` is set."""
     schedule.start(0, _START_NS)
     for lap in count() if loop else range(1):
         shift_ns = lap * recording.period_ns
@@ -135,8 +141,8 @@ def play_recording(
     transmitter.sender.finish()
 
 
-def _joined(datagrams: list[CapturedDatagram]) -> Datagrams:
-    """Return datagrams of one size and port as arrays."""
+def _stack_datagrams(datagrams: list[CapturedDatagram]) -> Datagrams:
+    """Combine datagrams with the same size and port into arrays."""
     payloads = np.frombuffer(b"".join(datagram.payload for datagram in datagrams), np.uint8)
     times_ns = np.array([datagram.time_ns for datagram in datagrams], np.int64)
     return Datagrams(

@@ -1,4 +1,4 @@
-"""Plays sweeps through a bridge, each at its time."""
+"""Play sweeps through a bridge in real time."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.words import plural
 
 from .bridge import Bridge
-from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule
-from .sources import Played
+from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule
+from .sources import PlaybackSource
 
-# Sweeps that are cast before they are due, for each sensor: processors may be busy for a second.
+# Sweeps per sensor that are simulated in advance, since CPUs may be busy for a second.
 AHEAD = 16
-# From the start of the schedule to the first sweep, for what the bridge does before.
+# Time from the start of the schedule to the first sweep, for preparations of the bridge.
 _START_NS = 100e6
-_ShiftedSweep = tuple[int, Cloud, int]  # number, points, shift of times in nanoseconds
+_ShiftedSweep = tuple[int, Cloud, int]  # number, points, time shift in nanoseconds
 
 
 def play_sweeps(
-    played: Played,
+    played: PlaybackSource,
     bridge: Bridge,
     schedule: Schedule,
     note: Callable[[str], None],
@@ -32,16 +32,27 @@ def play_sweeps(
 ) -> None:
     """Send each sweep through a bridge when it is due.
 
-    The schedule starts with the first sweeps.
+    A sweep that is not simulated in time is sent late, and the user is notified once.
 
-    With `loop`, all sweeps are sent again and again, with times that go on. A sweep that is not
-    cast in time is sent late, and the user is told once. The schedule does not start before
-    `start_at_ns` by `time.time_ns`.
+    Parameters
+    ----------
+    played
+        Sweeps to play.
+    bridge
+        Bridge that sends the sweeps.
+    schedule
+        Schedule, which is started with the first sweeps.
+    note
+        Function that prints a note for the user.
+    loop
+        Whether to repeat all sweeps endlessly, with continuing times.
+    start_at_ns
+        Earliest start of the schedule on the clock of `time.time_ns`.
     """
     late_sweeps = 0
     sensors = len(played.sweeps.sensors)
-    with MadeAhead(_laps(played, loop=loop), AHEAD * sensors, played.threads) as made_ahead:
-        sweeps = iter(made_ahead)
+    with Prefetcher(_laps(played, loop=loop), AHEAD * sensors, played.threads) as prefetcher:
+        sweeps = iter(prefetcher)
         first = list(islice(sweeps, sensors))
         for sweep, points, _ in first:
             bridge.prepare(sweep, points)
@@ -61,14 +72,14 @@ def play_sweeps(
         note(f"{plural(late_sweeps, 'sweep')} {verb} sent late.")
 
 
-def _laps(played: Played, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:
-    """Yield functions that cast or read the sweeps, lap after lap."""
+def _laps(played: PlaybackSource, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:
+    """Yield functions that simulate or read the sweeps of each repetition."""
     period_ns = played.period_ns
     for lap in count() if loop else range(1):
         for sweep in played.order:
-            yield partial(_shifted, played, sweep, lap * period_ns)
+            yield partial(_read_sweep, played, sweep, lap * period_ns)
 
 
-def _shifted(played: Played, sweep: int, shift_ns: int) -> _ShiftedSweep:
-    """Return number and points of a sweep, and the shift of its times, nanoseconds."""
+def _read_sweep(played: PlaybackSource, sweep: int, shift_ns: int) -> _ShiftedSweep:
+    """Return the number and points of a sweep, and its time shift in nanoseconds."""
     return sweep, played.points(sweep), shift_ns

@@ -1,4 +1,4 @@
-"""Sweeps as topics of ROS 2: clouds in a driver's layout, frames, instruments and the clock."""
+"""Bridge that publishes sweeps, frames, instruments and the clock as ROS 2 topics."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ from .bridge import Bridge, BridgeOptions
 from .dds import Network, RosPublisher
 from .schedule import Schedule
 
-_CLOCK_NS = 10_000_000  # between messages of the clock, of the survey's time
+_CLOCK_NS = 10_000_000  # period of clock messages in survey time
 
 
 class Ros2Bridge(Bridge):
-    """Publishes sweeps as drivers do, each at its end, and IMU, GNSS receiver and clock between.
+    """Bridge that publishes sweeps like a driver, with navigation data and a clock.
 
-    Topics, types and layouts are as in bags (`Rosbag2`). Nodes take the time of the survey
-    from `/clock` (`use_sim_time`), unless it is played at today's time.
+    Each sweep is published when it ends. Messages of the IMU, of the GNSS receiver, and of the
+    clock are published between sweeps. Topics, types and layouts are the same as in bags
+    (`Rosbag2`). Nodes use the survey time of `/clock` with `use_sim_time`, unless the survey is
+    played with the current time.
     """
 
     settings: ClassVar[tuple[str, ...]] = ("layout", "organized", "pose_rate_hz")
@@ -43,16 +45,16 @@ class Ros2Bridge(Bridge):
         super().__init__(sweeps, schedule, options, note)
         self._format = self.format_of(options.settings)
         self._message_layout = MessageLayout(self._format.layout, organized=self._format.organized)
-        self._publisher = RosPublisher(Network.to(options.to))
-        self._messages: SurveyMessages | None = None  # messages of the sweeps of a lap
-        self._shift_ns = 0  # shift of the lap
+        self._publisher = RosPublisher(Network.for_hosts(options.to))
+        self._messages: SurveyMessages | None = None  # messages of the current repetition
+        self._shift_ns = 0  # time shift of the current repetition
         self._columns: set[str] = set()
         self._between = threading.Thread(target=self._publish_between, daemon=True)
         self._stopped = threading.Event()
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec:
-        """Return the format of bags with the same messages."""
+        """Return the bag format with the same messages."""
         organized = bool(settings.get("organized"))
         return ExportSpec(
             "mcap",
@@ -71,21 +73,24 @@ class Ros2Bridge(Bridge):
     def prepare(self, sweep: int, points: Cloud) -> None:
         """Publish static messages.
 
-        Raises LidarError if the cloud lacks columns of the layout.
+        Raises
+        ------
+        LidarError
+            If the cloud lacks columns that the layout requires.
         """
         self._format.check_columns(points)
         if self._messages is None:
             self._columns = {column.name for column in points.table}
-            self._messages = self._of_lap(0)
+            self._messages = self._lap_messages(0)
             for message in self._messages.static_messages():
                 self._publisher.publish(message)
-        for _ in self._messages.sweep_messages(sweep, points):  # compiles what it needs
+        for _ in self._messages.sweep_messages(sweep, points):  # triggers compilation
             pass
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
         """Publish the messages of a sweep."""
         if self._messages is None or shift_ns != self._shift_ns:
-            self._messages = self._of_lap(shift_ns)
+            self._messages = self._lap_messages(shift_ns)
             self._shift_ns = shift_ns
         if not self._between.is_alive() and not self._stopped.is_set():
             self._between.start()
@@ -94,7 +99,7 @@ class Ros2Bridge(Bridge):
 
     @property
     def summary(self) -> str:
-        """How many messages readers were too slow for."""
+        """Number of messages that were dropped because a subscriber was too slow."""
         dropped = self._publisher.dropped
         if not dropped:
             return ""
@@ -106,14 +111,14 @@ class Ros2Bridge(Bridge):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End the thread, and take the topics away."""
+        """Stop the thread, and remove the topics."""
         self._stopped.set()
         if self._between.is_alive():
             self._between.join()
         self._publisher.__exit__(*error)
 
-    def _of_lap(self, shift_ns: int) -> SurveyMessages:
-        """Return the messages of a lap, whose times are `shift_ns` later."""
+    def _lap_messages(self, shift_ns: int) -> SurveyMessages:
+        """Return the messages of a repetition, whose times are `shift_ns` later."""
         start_ns = survey_start_ns(self.sweeps) + shift_ns
         return SurveyMessages(
             replace(self.sweeps, start_ns=start_ns),
@@ -123,7 +128,7 @@ class Ros2Bridge(Bridge):
         )
 
     def _publish_between(self) -> None:
-        """Publish clock and instruments at their times, until the context ends."""
+        """Publish clock and instrument messages on time until the context ends."""
         survey_ns = survey_start_ns(self.sweeps)
         for message in merge(self._clock(), self._instruments(), key=lambda sent: sent.time_ns):
             deadline_s = -self.schedule.late_s(message.time_ns - survey_ns)
@@ -132,18 +137,18 @@ class Ros2Bridge(Bridge):
             self._publisher.publish(message)
 
     def _clock(self) -> Iterator[RosMessage]:
-        """Yield the messages of the clock from the start of the first sweep on, without end."""
-        messages = self._of_lap(0)
+        """Yield endless clock messages from the start of the first sweep."""
+        messages = self._lap_messages(0)
         first_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns.min())
         for time_ns in count(first_ns, _CLOCK_NS):
             yield messages.clock_message(time_ns)
 
     def _instruments(self) -> Iterator[RosMessage]:
-        """Yield the messages of IMU and GNSS receiver, of each lap, or none without instruments."""
+        """Yield the IMU and GNSS messages of each repetition."""
         period_ns = self.options.period_ns
         for lap in count() if period_ns else range(1):
             last_message = None
-            for message in self._of_lap(lap * period_ns).instrument_messages():
+            for message in self._lap_messages(lap * period_ns).instrument_messages():
                 yield message
                 last_message = message
             if last_message is None:

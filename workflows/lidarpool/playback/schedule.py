@@ -1,4 +1,4 @@
-"""When what is played leaves: deadlines by a clock that all processes share, and casting ahead."""
+"""Scheduling of playback: deadlines on a clock that all processes share, and prefetching."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..processes.processors import processor_count
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1
-# How late a sweep may be before the user reads that casting falls behind, seconds.
+# Maximum delay of a sweep in seconds before the user is warned.
 BEHIND_S = 0.005
-_MAX_THREADS = 8  # sweeps in memory are bounded as well
+_MAX_THREADS = 8  # also limits the number of sweeps in memory
 BEHIND = (
     "The simulation is slower than the sensor, so sweeps are sent late. Use fewer rays, "
     "sub-rays or actors, or reduce the rate (`--rate`)."
@@ -25,23 +25,24 @@ BEHIND = (
 
 
 def casting_threads() -> int:
-    """Return how many sweeps are cast at the same time: one on each core of this process, up to 8.
+    """Return the number of sweeps that are simulated in parallel.
 
-    The threads of a single cast share only its rays; steps on their hits, a half of the time, would
-    use one core.
+    This is the number of cores available to this process, up to 8. Multithreading within a sweep
+    would be slower, because only ray casting would be parallel. The steps on the hits, which take
+    half of the time, would use a single core.
     """
     return min(processor_count(), _MAX_THREADS)
 
 
 class Schedule:
-    """Times of a survey as times of `time.monotonic_ns`, which is the same in all processes.
+    """Conversion of survey times to `time.monotonic_ns`, which is the same in all processes.
 
-    `rate` is the speed of the survey: 2 plays two seconds of it in one.
+    `rate` is the playback speed. At a rate of 2, two seconds of the survey take one second.
     """
 
     def __init__(self, rate: float = 1.0) -> None:
         self.rate = rate
-        self._origin_ns: float | None = None  # time by the clock at the survey's time 0
+        self._origin_ns: float | None = None  # clock time at survey time 0
 
     @property
     def started(self) -> bool:
@@ -49,45 +50,49 @@ class Schedule:
         return self._origin_ns is not None
 
     def start(self, time_ns: float, delay_ns: float = 0.0) -> None:
-        """Let a time of the survey be now, or `delay_ns` later."""
+        """Start the schedule so that `time_ns` is reached after `delay_ns`."""
         self._origin_ns = time.monotonic_ns() + delay_ns - time_ns / self.rate
 
     def deadline_ns(self, time_ns: float) -> float:
-        """Return a time of the survey by the clock, nanoseconds, once the schedule has started."""
+        """Convert a survey time to a clock time in nanoseconds.
+
+        The schedule must have been started.
+        """
         assert self._origin_ns is not None
         return self._origin_ns + time_ns / self.rate
 
     def deadlines_ns(self, times_ns: Ints) -> Ints:
-        """Return times of the survey (n,) by the clock, nanoseconds: (n,)."""
+        """Convert an array of survey times to clock times in nanoseconds."""
         return (self.deadline_ns(0.0) + times_ns / self.rate).astype("<i8")
 
     def late_s(self, time_ns: float) -> float:
-        """Return by how much a time of the survey is over, seconds, negative before that time."""
+        """Return the seconds that have passed since a survey time, negative before that time."""
         return (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
 
     def wait_until(self, time_ns: float) -> None:
-        """Sleep until a time of the survey, if that is not over."""
+        """Sleep until a survey time, unless it has passed."""
         time.sleep(max(0.0, -self.late_s(time_ns)))
 
 
-class MadeAhead(Generic[Item]):
-    """Iterates over the results of tasks that threads run, up to `count` ahead: a context manager.
+class Prefetcher(Generic[Item]):
+    """Iterator over the results of tasks that run in threads in advance, as a context manager.
 
-    An error of a task is raised in the place of its result. Leaving the context waits for the tasks
-    under way, and drops the others.
+    If a task fails, its exception is raised in place of its result. Leaving the context waits for
+    running tasks, and cancels the others.
 
     Parameters
     ----------
     tasks
-        Functions without arguments; `threads` of them run at the same time.
+        Functions without arguments.
     count
-        Largest number of tasks that are ahead of the results taken, at least `threads`.
+        Maximum number of tasks in advance of the consumed results. It is increased to `threads` if
+        it is smaller.
     threads
-        Number of threads.
+        Number of tasks that run in parallel.
 
     Examples
     --------
-    >>> with MadeAhead((str, int), count=2) as results:
+    >>> with Prefetcher((str, int), count=2) as results:
     ...     list(results)
     ['', 0]
     """
@@ -96,7 +101,7 @@ class MadeAhead(Generic[Item]):
         self._tasks = iter(tasks)
         self._count = max(count, threads)
         self._futures: deque[Future[Item]] = deque()
-        self._pool = ThreadPoolExecutor(threads, "made ahead")
+        self._pool = ThreadPoolExecutor(threads, "prefetch")
 
     def __enter__(self) -> Self:
         self._start_tasks()
@@ -108,12 +113,12 @@ class MadeAhead(Generic[Item]):
     def __iter__(self) -> Iterator[Item]:
         while self._futures:
             first = self._futures.popleft()
-            while not first.done():  # Ctrl-C may not end an unlimited wait
+            while not first.done():  # An unlimited wait might not be interrupted by Ctrl-C.
                 wait([first], _CHECK_S)
             self._start_tasks()
             yield first.result()
 
     def _start_tasks(self) -> None:
-        """Start tasks until `count` are ahead, or none is left."""
+        """Submit tasks until `count` of them are pending or none remain."""
         for task in islice(self._tasks, self._count - len(self._futures)):
             self._futures.append(self._pool.submit(task))

@@ -1,4 +1,7 @@
-"""What is played: the sweeps of a result, or of a scenario, which are cast as they are due."""
+"""Sources of playback, which are the sweeps of a result or of a scenario.
+
+The sweeps of a scenario are simulated during playback.
+"""
 
 from __future__ import annotations
 
@@ -40,17 +43,17 @@ CLOUD = "cloud.ply"
 
 
 @dataclass(frozen=True, eq=False)
-class Played:
-    """Sweeps to play, and their points.
+class PlaybackSource:
+    """Sweeps to play, with their points.
 
-    Iterating yields number and points of each sweep, in the order of the starts of the sweeps.
+    Iterating yields the number and points of each sweep, in order of their start times.
     """
 
     sweeps: Sweeps
-    points: Callable[[int], Cloud]  # points of the sweep of a number; casts the sweep of a scenario
-    # Returns scene and planned path; None for a result without them.
+    points: Callable[[int], Cloud]  # Reads or simulates the points of a sweep, given its number.
+    # Returns the scene and planned path, or None for a result without them.
     content: Callable[[], PictureContent | None] = lambda: None
-    threads: int = 1  # threads that may ask for points at the same time
+    threads: int = 1  # number of threads that may call `points` at the same time
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
@@ -62,13 +65,13 @@ class Played:
 
     @property
     def order(self) -> list[int]:
-        """Numbers of the sweeps in the order of their starts."""
+        """Numbers of the sweeps in order of their start times."""
         order: list[int] = np.argsort(self.sweeps.begins_ns, kind="stable").tolist()
         return order
 
     @property
     def period_ns(self) -> int:
-        """Time from the start of the first sweep to its start when all are played again."""
+        """Time after which playback repeats with `--loop`, in nanoseconds."""
         ends_ns = []
         for number in range(len(self.sweeps.sensors)):
             rows = np.flatnonzero(self.sweeps.sensor == number)
@@ -84,12 +87,19 @@ def open_source(
     needs: ExportSpec | None = None,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
-) -> Iterator[Played]:
-    """Open a result, scenario, campaign or mesh file to be played.
+) -> Iterator[PlaybackSource]:
+    """Open a result, scenario, campaign or mesh file for playback.
 
-    Of a campaign, the first job is played. The cloud of a scenario has the columns that the format
-    `needs` holds. `of_mesh` are `mesh_data`'s options of a mesh file; `tell` is called with each
-    note on the scene.
+    Parameters
+    ----------
+    source
+        Path or URL. Only the first job of a campaign is played.
+    needs
+        Format whose columns the cloud of a scenario must have.
+    of_mesh
+        Options of `mesh_data` for a mesh file.
+    tell
+        Function that is called with each note on the scene.
 
     Raises
     ------
@@ -107,7 +117,7 @@ def open_source(
                     f"{source} contains packets. Play it with `--as packets`, or specify a "
                     "result or a scenario."
                 )
-            yield _cast(scenario_job(source, needs, of_mesh, tell), stack)
+            yield _simulated_sweeps(scenario_job(source, needs, of_mesh, tell), stack)
             return
         if of_mesh:
             raise LidarError(
@@ -116,13 +126,13 @@ def open_source(
             )
         files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
         folder = stack.enter_context(local_result(source, files))
-        yield _recorded(folder, source)
+        yield _stored_sweeps(folder, source)
 
 
-def _recorded(folder: Path, source: Path | Storage) -> Played:
+def _stored_sweeps(folder: Path, source: Path | Storage) -> PlaybackSource:
     """Return the sweeps of a result in a folder.
 
-    Raises LidarError if files are missing.
+    Raise LidarError if files are missing.
     """
     for name in (CLOUD, SWEEPS_FILE):
         if not (folder / name).exists():
@@ -134,14 +144,14 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
     cloud = CloudFile(folder / CLOUD)
 
     def read(sweep: int) -> Cloud:
-        """Read the points of a sweep, and no others."""
+        """Read only the points of a sweep."""
         first, stop = (cloud.row_of(scan) for scan in sweeps.scans[sweep : sweep + 2].tolist())
-        if stop <= first:  # the scans may still be out of order
+        if stop <= first:  # The scans may not be sorted.
             return next(sweeps.points(cloud, sweep, sweep + 1))
         points = next(cloud.chunks(stop - first, first))
         return next(sweeps.points(points, sweep, sweep + 1))
 
-    return Played(sweeps, read, lambda: PictureContent.load_from(folder))
+    return PlaybackSource(sweeps, read, lambda: PictureContent.load_from(folder))
 
 
 def scenario_job(
@@ -152,8 +162,8 @@ def scenario_job(
 ) -> Job:
     """Return the job of a scenario or mesh file, or the first job of a campaign.
 
-    Its cloud has the columns that the format `needs` holds, in place of the columns for the formats
-    that the scenario writes. `of_mesh` and `tell` as for `open_source`.
+    The cloud has the columns that the format `needs` requires, instead of those for the formats
+    that the scenario writes. For `of_mesh` and `tell`, see `open_source`.
     """
     if path.suffix.lower() in (".yaml", ".yml") and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)
@@ -172,26 +182,26 @@ def scenario_job(
     return prepared.job
 
 
-def _cast(job: Job, stack: ExitStack) -> Played:
-    """Return the sweeps of a job, which are cast when their points are asked for."""
+def _simulated_sweeps(job: Job, stack: ExitStack) -> PlaybackSource:
+    """Return the sweeps of a job, which are simulated when their points are requested."""
     survey = job.survey
     sweeps = job.sweeps
     if sweeps.instruments is not None:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
         write_instruments(folder, survey, job.scene.origin)
         sweeps = replace(sweeps, instruments=replace(sweeps.instruments, folder=folder))
-    rig = Rig(job.scene, survey, threads=1)  # sweeps are cast beside each other
+    rig = Rig(job.scene, survey, threads=1)  # sweeps are simulated in parallel
     table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
     origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
 
     def cast(sweep: int) -> Cloud:
-        """Cast a sweep in this process."""
+        """Simulate a sweep in this process."""
         start, stop = sweeps.scans[sweep : sweep + 2].tolist()
         part = columns_of([*rig.cast(start, stop)])
         return part.cloud(table, survey.precision_m, origin)
 
     def content() -> PictureContent | None:
-        """Return scene and planned path."""
+        """Return the scene and the planned path."""
         return PictureContent.before_casting(job.scene, survey)[0]
 
-    return Played(sweeps, cast, content, casting_threads())
+    return PlaybackSource(sweeps, cast, content, casting_threads())

@@ -1,4 +1,4 @@
-"""Where packets go: the addresses of sensors, the process that sends, and what answers."""
+"""Transmission of packets: destinations of sensors, the sending process, and sensor interfaces."""
 
 from __future__ import annotations
 
@@ -16,48 +16,55 @@ from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reach
 from lidarsim.packets.service import Destination, Service
 from lidarsim.words import did_you_mean, joined
 
-# Returns the service of a sensor (`PacketEncoder.service`).
+# Returns the interface of a sensor (see `PacketEncoder.service`).
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """The datagrams of a sensor: where they go, and where the sensor's interface listens."""
+    """Datagrams of a sensor, with their destination and the address of the sensor interface."""
 
     name: str
     model: str
-    kinds: Mapping[str, int]  # {kind of datagrams: port}, the returns first
+    kinds: Mapping[str, int]  # ports by kind of datagram, starting with the returns
     make_service: MakeService
     distinguished_by_receivers: bool = False  # see `PacketEncoder`
     has_own_address: bool = False
     destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
-    # Address of the interface
+    # Address on which the sensor interface listens.
     address: ReceiverAddress = field(default_factory=lambda: ReceiverAddress(LOOPBACK))
-    api_given: bool = False  # whether a user gives the address of the interface
+    api_given: bool = False  # whether the user specified the address of the interface
 
     @property
     def source_address(self) -> str:
-        """The address that datagrams come from: the interface's, or no text for any."""
+        """Address from which datagrams are sent.
+
+        This is the address of the sensor interface, or an empty string for any address.
+        """
         to_this_machine = ReceiverAddress(self.destination.host).is_loopback
         return self.address.host if to_this_machine or not self.address.is_loopback else ""
 
     @property
     def ports(self) -> list[int]:
-        """Ports of the receiver, the port of the returns first."""
+        """Ports of the receiver, starting with that of the returns."""
         return list(self.destination.ports.values())
 
     def describe(self) -> str:
-        """Return where the datagrams go, for the user."""
+        """Describe the destination of the datagrams for the user."""
         words = f"{self.model} sends to {self.destination.host}"
         ports = " and ".join(map(str, self.ports))
         return f"{words}, port {ports}" if ports else words
 
     def to(self, receiver: ReceiverAddress) -> Stream:
-        """Return the stream to a receiver.
+        """Return a copy of the stream with a new destination.
 
-        Raises LidarError if its datagrams cannot go there.
+        The port of the receiver is that of the returns. Ports of other kinds of datagrams are
+        shifted by the same amount.
 
-        A port is the port of the returns; other kinds of datagrams move by as much.
+        Raises
+        ------
+        LidarError
+            If the datagrams cannot be sent to the receiver.
         """
         if receiver.port is not None and not self.kinds:
             raise LidarError(
@@ -79,7 +86,7 @@ class Stream:
 def sensor_streams(
     encoders: Sequence[PacketEncoder], to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return the streams of sensors (`streams_to`)."""
+    """Create the streams of sensors, and direct them with `streams_to`."""
     streams = [
         Stream(
             encoder.source.name or "lidar",
@@ -95,16 +102,19 @@ def sensor_streams(
 
 
 def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
-    """Return streams to the addresses that a user gives, as [NAME=]HOST[:PORT].
+    """Direct streams to the addresses that a user specifies as [NAME=]HOST[:PORT].
 
-    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default, interfaces that need a separate
-    address from 127.0.0.2 on.
+    By default, sensor interfaces listen on 127.0.0.1, 127.0.0.2 and so on. Interfaces that require
+    a separate address start at 127.0.0.2.
 
-    LidarError if an address cannot be used, or receivers could not tell two sensors apart.
+    Raises
+    ------
+    LidarError
+        If an address cannot be used, or if receivers could not distinguish two sensors.
     """
     names = [stream.name for stream in streams]
-    receivers = _by_sensor(to, names, "--to")
-    interfaces = _by_sensor(api, names, "--api")
+    receivers = _parse_addresses(to, names, "--to")
+    interfaces = _parse_addresses(api, names, "--api")
     placed: list[Stream] = []
     for number, stream in enumerate(streams):
         name = stream.name
@@ -114,22 +124,22 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
             api_given=name in interfaces,
         )
         for other in placed:
-            _check_apart(other, moved)
+            _check_distinguishable(other, moved)
         placed.append(moved)
     return placed
 
 
 def _loopback_address(number: int, has_own_address: bool) -> ReceiverAddress:
-    """Return the default address of the interface of a sensor, by its number."""
+    """Return the default address of the interface of a sensor."""
     return ReceiverAddress(f"127.0.0.{number + (2 if has_own_address else 1)}")
 
 
-def _by_sensor(
+def _parse_addresses(
     texts: Sequence[str], names: Sequence[str], option: str
 ) -> dict[str, ReceiverAddress]:
-    """Return the address of each sensor by its name.
+    """Parse addresses, and return them by sensor name.
 
-    An address without a name is for all.
+    An address without a name applies to all sensors.
     """
     addresses: dict[str, ReceiverAddress] = {}
     for text in texts:
@@ -145,8 +155,8 @@ def _by_sensor(
     return addresses
 
 
-def _check_apart(stream: Stream, other: Stream) -> None:
-    """Raise LidarError if receivers could not tell two sensors apart."""
+def _check_distinguishable(stream: Stream, other: Stream) -> None:
+    """Raise LidarError if receivers could not distinguish two sensors."""
     shared = {*stream.ports} & {*other.ports}
     host = stream.destination.host
     if host != other.destination.host or not shared:
@@ -162,9 +172,9 @@ def _check_apart(stream: Stream, other: Stream) -> None:
 
 
 class Transmitter:
-    """The process that sends the datagrams of streams, and their services: a context manager.
+    """Context manager for the process that sends datagrams, and for sensor interfaces.
 
-    How late they were is written to the file `lateness`, if it is given, as JSON.
+    If `lateness` is set, statistics on how late datagrams were are written to this file as JSON.
     """
 
     def __init__(
@@ -173,21 +183,21 @@ class Transmitter:
         self.sender = Sender(note)
         self._streams = streams
         self._lateness_file = lateness
-        self._services: list[str] = []  # descriptions
+        self._services: list[str] = []  # descriptions of the sensor interfaces
         self._stack = ExitStack()
 
     @property
     def description(self) -> str:
-        """Where the datagrams go, and what answers."""
+        """Destinations of the datagrams, and the available sensor interfaces."""
         return "; ".join([*(stream.describe() for stream in self._streams), *self._services])
 
     @property
     def summary(self) -> str:
-        """What was sent, and how late, once the context has ended."""
+        """Number of sent datagrams and how late they were, once the context has ended."""
         return f"{self.sender.lateness}."
 
     def __enter__(self) -> Self:
-        self._write_lateness()  # a file that cannot be written is refused before it matters
+        self._write_lateness()  # Fail early if the file cannot be written.
         with ExitStack() as stack:
             stack.enter_context(self.sender)
             for number, stream in enumerate(self._streams):
@@ -211,9 +221,9 @@ class Transmitter:
         self._write_lateness()
 
     def _write_lateness(self) -> None:
-        """Write how late datagrams were.
+        """Write the statistics on late datagrams.
 
-        Raises LidarError if the file cannot be written.
+        Raise LidarError if the file cannot be written.
         """
         file = self._lateness_file
         if file is not None:
@@ -222,7 +232,7 @@ class Transmitter:
                 file.write_text(text, encoding="utf-8")
 
     def _redirect(self, number: int, destination: Destination) -> None:
-        """Send the datagrams of a stream elsewhere, for its service."""
+        """Change the destination of a stream on behalf of its sensor interface."""
         stream = replace(self._streams[number], destination=destination)
-        with suppress(LidarError):  # the next packets raise it
+        with suppress(LidarError):  # sending the next packets raises the same error
             self.sender.redirect(number, destination, stream.source_address)

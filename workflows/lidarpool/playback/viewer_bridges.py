@@ -1,4 +1,4 @@
-"""Bridges to viewers: `--as foxglove` and `--as rerun`."""
+"""Bridges that send sweeps to viewers, for `--as foxglove` and `--as rerun`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .schedule import Schedule
 
 
 class ViewerBridge(Bridge):
-    """Sends sweeps with their frames and boxes to the viewer `name`."""
+    """Bridge that sends sweeps, with their frames and boxes, to the viewer `name`."""
 
     name: str
 
@@ -39,7 +39,7 @@ class ViewerBridge(Bridge):
 
     @classmethod
     def check_installed(cls) -> None:
-        """Raise LidarError if the package of the viewer is missing."""
+        """Raise LidarError if the package of the viewer is not installed."""
         check_installed(cls.name)
 
     def _open(self, to: str | None = None) -> Viewer:
@@ -47,11 +47,11 @@ class ViewerBridge(Bridge):
 
     @property
     def description(self) -> str:
-        """What to open, for the line that says «ready»."""
+        """Address to open, for the "ready" message."""
         return self._viewer.description
 
     def show_content(self, content: Callable[[], PictureContent | None]) -> None:
-        """Show trajectories, and the scene and the path of the pictures' content."""
+        """Show the trajectories, the scene, and the planned path."""
         self._viewer.show_surroundings(Surroundings.from_sweeps(self.sweeps, content()))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
@@ -64,12 +64,12 @@ class ViewerBridge(Bridge):
         self._viewer.show_sweep(replace(shown, **times))
 
     def __exit__(self, *error: object) -> None:
-        """End the viewer's server."""
+        """Stop the server of the viewer."""
         self._viewer.close()
 
 
 class FoxgloveBridge(ViewerBridge):
-    """Sends sweeps to Foxglove, whose clock shows the times of the sweeps."""
+    """Bridge that sends sweeps to Foxglove, whose clock shows the times of the sweeps."""
 
     name = "foxglove"
 
@@ -78,6 +78,6 @@ class FoxgloveBridge(ViewerBridge):
 
 
 class RerunBridge(ViewerBridge):
-    """Sends sweeps to Rerun."""
+    """Bridge that sends sweeps to Rerun."""
 
     name = "rerun"

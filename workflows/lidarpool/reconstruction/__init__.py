@@ -1,1 +1,1 @@
-"""Places that are rebuilt from recordings, to be scanned again: twins."""
+"""Reconstruct static scenes from recordings, so that they can be scanned again."""

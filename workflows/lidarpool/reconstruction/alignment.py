@@ -1,12 +1,15 @@
-"""Aligns sweeps to the planes of a place, and calibrates the rings of the sensor by them.
+"""Align sweeps to the planes of a map, and calibrate the rings of the sensor.
 
-Odometry is exact to centimeters, and the rings of a sensor differ by as much. Both blur a place.
-Here the distances of points to the planes of the map are made small: by the pose of each sweep, and
-by an offset of range, elevation and azimuth of each ring. Points as they were fired are compensated
-by the motion from their sweep to the next or, if they were fired before the stamp of their sweep,
-from the sweep before.
+Odometry is accurate to a few centimeters, and the calibration errors of rings are about as large.
+Both blur the map. The alignment therefore minimizes the distances between points and the planes of
+the map. It adjusts the pose of each sweep, and the range, elevation and azimuth offsets of each
+ring.
 
-Arrays have s sweeps, r rings and n points.
+Points that are stored as fired are motion-compensated with the motion from their sweep to the next.
+If they were fired before the timestamp of their sweep, the motion from the previous sweep is used
+instead.
+
+In array shapes, s is the number of sweeps, r the number of rings, and n the number of points.
 """
 
 from __future__ import annotations
@@ -25,60 +28,64 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS, elevations
-from .lost_pulses import Answering, lost_pulses
+from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses
 from .recorded_sweeps import RecordedSweeps
 from .voxel_planes import VoxelPlanes
 
-_MAP_POINTS = 40_000  # points of a sweep in the map that is aligned to
-_SWEEP_POINTS = 10_000  # points of a sweep that are aligned
-_VOXEL_SHARE = 0.012  # edge of the map's voxels over the median range
+_MAP_POINTS = 40_000  # points per sweep that are added to the map
+_SWEEP_POINTS = 10_000  # points per sweep that are registered to the map
+_VOXEL_SHARE = 0.012  # edge length of the map voxels, relative to the median range
 _MIN_VOXEL_M = 0.05
 _MAX_VOXEL_M = 0.3
-_ROUNDS = 4  # of a map and an alignment to this map
-_TRIAL_ROUNDS = 2  # of each way in which points may be stored
-_TRIAL_SWEEPS = 24  # consecutive
-_RANGE_SWEEPS = 48  # that tell the ranges of the sensor
-_TURN_M = 10.0  # motion that blurs as much as a turn by a radian
-_NEAR_VOXELS = 160  # twice the median range
-_MAX_SHARE_OF_VOXELS = 0.99  # of those of the usual way, filled in another way that is right
-_SHIFTS = (0.0, 0.5)  # of the voxels that are counted, in voxels
-_STEPS = 3  # of Gauss and Newton in a round
-_MAX_VOXELS = 1.5  # distance to a plane's center beyond which a point is not compared
-_MIN_SIGMA_M = 0.005  # of distances: simulated ranges may have no noise
-_TUKEY_SIGMAS = 4.0  # distances beyond which a point does not count (Tukey's biweight)
-# Standard deviations of the offsets of rings, before the points say more.
+_ROUNDS = 4  # iterations of building a map and aligning the sweeps to it
+_TRIAL_ROUNDS = 2  # iterations for each candidate of the motion
+_TRIAL_SWEEPS = 24  # consecutive sweeps that determine the motion
+_RANGE_SWEEPS = 48  # sweeps that determine the median range
+_TURN_M = 10.0  # translation in meters that blurs a map as much as a rotation by one radian
+_NEAR_VOXELS = 160  # maximum range of counted points in voxels, twice the median range
+# Another candidate is only preferred if it fills less than this share of the voxels.
+_MAX_SHARE_OF_VOXELS = 0.99
+_SHIFTS = (0.0, 0.5)  # offsets of the grids in which voxels are counted, in voxels
+_STEPS = 3  # Gauss-Newton steps per iteration
+_MAX_VOXELS = 1.5  # maximum distance between a point and the center of its plane, in voxels
+# minimum standard deviation of distances, since simulated ranges may have no noise
+_MIN_SIGMA_M = 0.005
+_TUKEY_SIGMAS = 4.0  # distance at which the weight of a point becomes zero (Tukey's biweight)
+# Prior standard deviations of the ring offsets.
 _RANGE_PRIOR_M = 0.05
 _ANGLE_PRIOR_RAD = 0.003
-_POINT_SIGMA_M = 0.015  # of a point's distance to its plane, for the weight of these
-_MIN_PLANE_POINTS = 500  # of a sweep on planes: fewer do not fix its pose
-_MIN_ALIGNED_POINTS = 100  # of a sweep; with fewer its pose stays
+_POINT_SIGMA_M = 0.015  # standard deviation of distances to planes, which scales the prior
+_MIN_PLANE_POINTS = 500  # minimum number of points on planes to determine the pose of a sweep
+_MIN_ALIGNED_POINTS = 100  # The pose of a sweep with fewer points is not changed.
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of the sweeps, motion within them, and offsets of their rings.
+    """Poses of sweeps, the motion within them, and the offsets of their rings.
 
     Attributes
     ----------
     poses
-        float64 (s, 4, 4): from the sensor frame at the stamp of each sweep to the world.
+        Transformations from the sensor frame at the timestamp of each sweep to the world frame.
+        float64 array of shape (s, 4, 4).
     times_s
-        float64 (s,): stamps of the sweeps.
+        Timestamps of the sweeps in seconds. float64 array of shape (s,).
     sweep_s
-        Seconds that a sweep takes: from most sweeps to the next, if none was dropped.
+        Duration of a sweep in seconds, which is the median time between consecutive sweeps.
     voxel_m
-        Edge of the voxels of the map, meters.
+        Edge length of the map voxels in meters.
     motion
-        How the points of a sweep are compensated.
+        How the points of a sweep are motion-compensated.
     ring_offsets
-        float64 (r, 3): added to the range (meters), elevation and azimuth (radians) of the points
-        of a ring.
+        Offsets that are added to the range (meters), elevation and azimuth (radians) of the points
+        of each ring. float64 array of shape (r, 3).
     thickness_m
-        Median thickness of the planes of the map after each round.
+        Median thickness of the planes of the map after each iteration.
     plane_distance_m
-        float64 (s,): median distance of the points of each sweep to their planes.
+        Median distance between the points of each sweep and their planes. float64 array of shape
+        (s,).
     """
 
     poses: Floats
@@ -91,10 +98,13 @@ class Alignment:
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def unaligned(
+    def from_poses(
         cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
     ) -> Alignment:
-        """Return the alignment of poses, moved to the stamps of sweeps, without corrections."""
+        """Return an alignment with the given poses, moved to the timestamps of the sweeps.
+
+        The rings have no offsets.
+        """
         offsets = np.zeros((ring_count, 3))
         sweep_s = float(np.median(np.diff(poses.times_s)))
         alignment = cls(poses.matrices.copy(), poses.times_s, sweep_s, voxel_m, motion, offsets)
@@ -105,21 +115,22 @@ class Alignment:
             alignment,
             poses=np.stack(
                 [
-                    pose @ step.part(-(poses.first_s + poses.share * sweep_s) / step_s)
+                    pose @ step.fraction(-(poses.first_s + poses.share * sweep_s) / step_s)
                     for pose, (step, step_s) in zip(poses.matrices, steps, strict=True)
                 ]
             ),
         )
 
-    def part(self, numbers: Ints) -> Alignment:
-        """Return the poses and times of some sweeps, ascending."""
+    def select(self, numbers: Ints) -> Alignment:
+        """Select the poses and times of some sweeps, in ascending order."""
         return replace(self, poses=self.poses[numbers], times_s=self.times_s[numbers])
 
     def step(self, number: int, *, backward: bool = False) -> tuple[MotionStep, float]:
-        """Return the motion from a sweep to the next or to the previous sweep, and its seconds.
+        """Return the motion from a sweep to the next or previous sweep, and its duration.
 
-        The seconds are negative for a step backward. The last sweep has the motion of the step
-        before, and the first sweep has no step backward, so its step is the one forward.
+        The duration is in seconds, and negative for a backward step. The last sweep has no next
+        sweep, so the preceding step is used. The first sweep has no previous sweep, so its backward
+        step is the forward step.
         """
         if backward and number > 0:
             first, second = number, number - 1
@@ -129,10 +140,14 @@ class Alignment:
         step_s = float(self.times_s[second] - self.times_s[first])
         return MotionStep.between(self.poses[first], self.poses[second]), step_s
 
-    def compensated(self, sweep: Sweep, number: int) -> tuple[Floats, Floats]:
-        """Return the points (n, 3) of a sweep in the sensor frame at its stamp, calibrated.
+    def compensate(self, sweep: Sweep, number: int) -> tuple[Floats, Floats]:
+        """Calibrate and motion-compensate the points of a sweep.
 
-        The second array (n, 3) has the positions of the sensor when it fired, in the same frame.
+        Returns
+        -------
+        tuple of arrays
+            Points in the sensor frame at the timestamp of the sweep, and the positions of the
+            sensor in the same frame when it fired. Both have shape (n, 3).
         """
         points = self._calibrated(sweep)
         origins = np.zeros_like(points)
@@ -140,15 +155,15 @@ class Alignment:
         if times_s is None:
             return points, origins
         compensated = np.empty_like(points)
-        for rows, step, shares in self._moved(number, times_s):
-            compensated[rows] = step.compensated(points[rows], shares)
+        for rows, step, shares in self._split_by_step(number, times_s):
+            compensated[rows] = step.compensate(points[rows], shares)
             origins[rows] = shares[:, None] * step.translation
         return compensated, origins
 
-    def fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
-        """Return the points (n, 3) of a sweep as fired, calibrated, and the poses of their firings.
+    def points_as_fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
+        """Return the calibrated points of a sweep as fired, and their firing poses.
 
-        Returns None if the points are compensated.
+        The points have shape (n, 3). Return None if they are motion-compensated.
         """
         from scipy.spatial.transform import Rotation
 
@@ -158,22 +173,24 @@ class Alignment:
         pose = self.poses[number]
         offsets = np.zeros((len(sweep), 3))
         turns = np.zeros((len(sweep), 3))
-        for rows, step, shares in self._moved(number, times_s):
+        for rows, step, shares in self._split_by_step(number, times_s):
             offsets[rows] = shares[:, None] * (pose[:3, :3] @ step.translation)
             turns[rows] = shares[:, None] * step.rotation
         quaternions = Rotation.from_rotvec(turns).as_quat().T
         poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
         return self._calibrated(sweep), poses
 
-    def _moved(self, number: int, times_s: Floats) -> Iterator[tuple[Bools, MotionStep, Floats]]:
-        """Yield masks of the points fired at times (n,), their step, and their shares of it."""
+    def _split_by_step(
+        self, number: int, times_s: Floats
+    ) -> Iterator[tuple[Bools, MotionStep, Floats]]:
+        """Yield masks of points, with the step that moves them and their fractions of the step."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)
                 yield rows, step, times_s[rows] / step_s
 
     def _calibrated(self, sweep: Sweep) -> Floats:
-        """Return the points (n, 3) of a sweep with the offsets of their rings."""
+        """Apply the ring offsets to the points of a sweep."""
         points = sweep.points
         if not self.ring_offsets.any():
             return points
@@ -188,60 +205,69 @@ class Alignment:
 
 
 class AlignedSweep(NamedTuple):
-    """Returns of a sweep, as arrays of n points."""
+    """Returns of a sweep in world coordinates, as arrays of n points."""
 
-    points: Floats  # (n, 3): in the sensor frame at the stamp, calibrated, meters
-    world: Floats  # (n, 3): meters
-    origins: Floats  # (n, 3): of the rays, in the world
+    points: Floats  # (n, 3), meters, calibrated, in the sensor frame at the timestamp
+    world: Floats  # (n, 3), meters, in the world frame
+    origins: Floats  # (n, 3), ray origins in the world frame, meters
     ring: Ints  # (n,)
     intensities: Floats | None  # (n,)
-    labels: Ints | None  # (n,): of class and object
-    gap_range_m: Floats | None = None  # (n,): of lost pulses: ranges around their gaps, or NaN
+    labels: Ints | None  # (n,), class and object
+    gap_range_m: Floats | None = None  # (n,), ranges at the gaps of lost pulses, or NaN
 
     @property
     def range_m(self) -> Floats:
-        """Ranges (n,) along the rays, meters."""
+        """Ranges along the rays in meters, of shape (n,)."""
         return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedSweeps:
-    """The sweeps of a recording at their places, which are read one by one."""
+    """Sweeps of a recording with aligned poses, which are read one at a time."""
 
     recorded: RecordedSweeps
     alignment: Alignment
-    answering: Answering
+    coverage: SensorCoverage
 
     @property
     def name(self) -> str:
-        """Name of the recording, for messages."""
+        """Name of the recording for messages."""
         return self.recorded.recording.name
 
     def read(self, number: int) -> AlignedSweep:
-        """Read a sweep, or raise LidarError if the recording cannot be read."""
-        return self.aligned(self.recorded.read(number), number)
+        """Read a sweep.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        return self.align(self.recorded.read(number), number)
 
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
-        """Read a sweep, and return it and its lost pulses, as points a meter away."""
+        """Read a sweep, and find its lost pulses.
+
+        The lost pulses are represented by points at a range of one meter.
+        """
         step, step_s = self.alignment.step(number)
-        # Points as fired have no gaps by motion.
+        # Without motion compensation, motion does not cause gaps between points.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
         share = self.alignment.sweep_s / step_s if is_compensated else 0.0
         moved_m = share * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
         elevation_rad = self.recorded.elevation_rad
-        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.answering, moved_m)
-        aligned = self.aligned(lost, number)._replace(gap_range_m=gap_range_m)
-        return self.aligned(sweep, number), aligned
+        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.coverage, moved_m)
+        aligned = self.align(lost, number)._replace(gap_range_m=gap_range_m)
+        return self.align(sweep, number), aligned
 
-    def aligned(self, sweep: Sweep, number: int) -> AlignedSweep:
-        """Return points of a sweep at their places."""
-        points, origins = self.alignment.compensated(sweep, number)
+    def align(self, sweep: Sweep, number: int) -> AlignedSweep:
+        """Transform the points of a sweep to the world frame."""
+        points, origins = self.alignment.compensate(sweep, number)
         pose = self.alignment.poses[number]
         return AlignedSweep(
             points=points,
-            world=placed(points, pose),
-            origins=placed(origins, pose),
+            world=transform_points(points, pose),
+            origins=transform_points(origins, pose),
             ring=sweep.columns["row"],
             intensities=sweep.intensity,
             labels=sweep.columns.get("label"),
@@ -249,56 +275,61 @@ class AlignedSweeps:
 
 
 def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
-    """Return the poses of all sweeps before these are aligned, and how points were stored.
+    """Determine how the points were stored, and return the initial poses of all sweeps.
 
-    LidarError if the recording shows hardly any planes, or is mirrored.
+    Raises
+    ------
+    LidarError
+        If the recording contains hardly any planes or is mirrored.
     """
     numbers = even_indices(sweeps.count, _RANGE_SWEEPS).tolist()
     voxel_m = _voxel_m([_sample(sweeps.read(number), number) for number in numbers])
     motion = _motion(sweeps, poses, voxel_m)
-    return Alignment.unaligned(poses, voxel_m, motion, sweeps.ring_count)
+    return Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count)
 
 
 def align(
     sweeps: RecordedSweeps, first: Alignment, numbers: Ints, mapped: Collection[int]
 ) -> Alignment:
-    """Align some sweeps to a map of those that are `mapped`.
+    """Align some sweeps to a map of the sweeps in `mapped`.
 
     Parameters
     ----------
     sweeps
-        The sweeps.
+        All sweeps of the recording.
     first
-        First estimates of the poses of all sweeps.
+        Initial estimates of the poses of all sweeps.
     numbers
-        (k,): of the sweeps that are aligned, ascending.
+        Numbers of the sweeps to align, in ascending order. Array of shape (k,).
     mapped
-        Numbers of the sweeps whose points make the map, and calibrate the rings.
+        Numbers of the sweeps whose points form the map and calibrate the rings.
 
     Returns
     -------
     Alignment
-        Of the k sweeps.
+        Alignment of the k sweeps.
 
     Raises
     ------
     LidarError
-        If the sweeps show hardly any planes.
+        If the sweeps contain hardly any planes.
     """
     samples = [_sample(sweeps.read(number), number) for number in numbers.tolist()]
     rows = [row for row, number in enumerate(numbers.tolist()) if number in mapped]
-    return _rounds(sweeps.recording.name, samples, first.part(numbers), rows, _ROUNDS)
+    return _align_iteratively(sweeps.recording.name, samples, first.select(numbers), rows, _ROUNDS)
 
 
 def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Motion:
-    """Return how points are stored: the way in which some consecutive sweeps fill few voxels.
+    """Determine how the points are stored.
 
-    Surfaces that several sweeps saw at the same place share voxels. The thickness of planes does
-    not tell: of a blurred wall no plane is found, and a level road stays thin.
+    Surfaces that several sweeps observe share voxels if the points are compensated correctly. The
+    candidate is chosen for which some consecutive sweeps fill the fewest voxels. The thickness of
+    the planes is not a useful criterion, because a blurred wall is not detected as a plane, and a
+    level road stays thin.
 
-    LidarError if points fit the poses better with their y axis turned.
+    Raise LidarError if the points fit the poses better with an inverted y axis.
     """
-    window = _fastest(poses)
+    window = _fastest_window(poses)
     numbers = range(sweeps.count)[window]
     samples = [_sample(sweeps.read(number), number) for number in numbers]
     is_timed = all("time_s" in sample.columns for sample in samples)
@@ -311,7 +342,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     else:
         candidates = [Motion.COMPENSATED]
     name = sweeps.recording.name
-    local = poses.part(window)
+    local = poses.select(window)
     trial = partial(_filled_voxels, name, samples, local, sweeps.ring_count, voxel_m)
     filled = {motion: trial(motion) for motion in candidates}
     best = min(candidates, key=filled.__getitem__)
@@ -335,30 +366,32 @@ def _filled_voxels(
     motion: Motion,
     scale: tuple[int, int, int] = (1, 1, 1),
 ) -> int:
-    """Return the number of voxels that hold points of sweeps, times `scale`, at their poses.
+    """Count the voxels that contain points of the sweeps at their poses.
 
-    Poses by registration are aligned first. Poses that are given are not: alignment would bring
-    even mirrored sweeps together. Far points, which are alone in their voxels, do not count.
+    The points are multiplied by `scale` first. Poses from registration are aligned before the
+    voxels are counted. Given poses are not, because alignment would make even mirrored sweeps
+    consistent. Points at long range do not count, because each of them fills its own voxel.
     """
     scaled = [sample.replace(points=sample.points * scale) for sample in samples]
-    alignment = Alignment.unaligned(poses, voxel_m, motion, ring_count)
+    alignment = Alignment.from_poses(poses, voxel_m, motion, ring_count)
     numbers = range(len(scaled))
     rounds = 0 if poses.are_given else _TRIAL_ROUNDS
-    alignment = _rounds(name, scaled, alignment, numbers, rounds)
+    alignment = _align_iteratively(name, scaled, alignment, numbers, rounds)
     parts = []
     for number, sample in enumerate(scaled):
-        points, _ = alignment.compensated(sample, number)
+        points, _ = alignment.compensate(sample, number)
         near = np.linalg.norm(sample.points, axis=1) < _NEAR_VOXELS * voxel_m
-        parts.append(placed(points[near], alignment.poses[number]))
-    # A level floor on a boundary is in two layers of voxels: of other voxels it is in one.
+        parts.append(transform_points(points[near], alignment.poses[number]))
+    # A level floor on a voxel boundary fills two layers of voxels, but only one layer of a shifted
+    # grid.
     cells = np.concatenate(parts) / voxel_m
     return sum(
         len(np.unique(np.floor(cells + shift).astype(np.int64), axis=0)) for shift in _SHIFTS
     )
 
 
-def _fastest(poses: RecordedPoses) -> slice:
-    """Return consecutive sweeps in which the sensor moves and turns most."""
+def _fastest_window(poses: RecordedPoses) -> slice:
+    """Return the window of consecutive sweeps with the most motion."""
     steps = np.diff(poses.matrices, axis=0)
     size = np.linalg.norm(steps[:, :3, 3], axis=1)
     size += _TURN_M * np.linalg.norm(steps[:, :3, :3], axis=(1, 2))
@@ -368,44 +401,47 @@ def _fastest(poses: RecordedPoses) -> slice:
     return slice(start, start + count)
 
 
-def _rounds(
+def _align_iteratively(
     name: str,
     samples: Sequence[Sweep],
     alignment: Alignment,
     mapped: Sequence[int],
     rounds: int,
 ) -> Alignment:
-    """Make a map and align all sweeps to it, several times; LidarError without planes."""
+    """Alternate between building a map and aligning all sweeps to it.
+
+    Raise LidarError if the map has no planes.
+    """
     for _ in range(rounds):
-        planes = _planes(name, samples, alignment, mapped)
-        alignment = _aligned(alignment, samples, planes, mapped)
+        planes = _map_planes(name, samples, alignment, mapped)
+        alignment = _align_to_planes(alignment, samples, planes, mapped)
     return alignment
 
 
 def _sample(sweep: Sweep, number: int) -> Sweep:
-    """Return some points of a sweep, in an order without a pattern."""
+    """Return a reproducible random sample of the points of a sweep."""
     order = np.random.default_rng(number).permutation(len(sweep))[:_MAP_POINTS]
     return sweep.select(order)
 
 
 def _voxel_m(samples: Sequence[Sweep]) -> float:
-    """Return the edge of the voxels of the map, meters."""
+    """Return the edge length of the map voxels in meters, based on the median range."""
     ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
 
 
-def _planes(
+def _map_planes(
     name: str,
     samples: Sequence[Sweep],
     alignment: Alignment,
     mapped: Sequence[int],
 ) -> VoxelPlanes:
-    """Return the planes of the map of some sweeps, or raise LidarError without planes."""
+    """Return the planes of a map of the `mapped` sweeps, or raise LidarError if it has none."""
     parts = [
-        placed(alignment.compensated(samples[number], number)[0], alignment.poses[number])
+        transform_points(alignment.compensate(samples[number], number)[0], alignment.poses[number])
         for number in mapped
     ]
-    planes = VoxelPlanes.of_points(name, np.concatenate(parts), alignment.voxel_m)
+    planes = VoxelPlanes.from_points(name, np.concatenate(parts), alignment.voxel_m)
     if planes is None:
         raise LidarError(
             f"{name} contains no planar surfaces, such as a floor or walls, which the "
@@ -416,59 +452,64 @@ def _planes(
 
 @dataclass(frozen=True, eq=False)
 class _PlanePoints:
-    """Points of a sweep on planes of the map."""
+    """Points of a sweep that lie on planes of the map."""
 
-    rows: Bools  # (n,): of the sample
-    points: Floats  # (k, 3): in the sensor frame
-    distances: Floats  # (k,): to the planes, signed, meters
-    normals: Floats  # (k, 3): of the planes, in the world
-    weights: Floats  # (k,): 0 to 1
+    rows: Bools  # (n,), mask of the points of the sample
+    points: Floats  # (k, 3), in the sensor frame
+    distances: Floats  # (k,), signed distances to the planes, meters
+    normals: Floats  # (k, 3), plane normals in the world frame
+    weights: Floats  # (k,), 0 to 1
 
     @classmethod
-    def of_sweep(
+    def from_sweep(
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
-        """Find the points (n, 3) of a sweep, at a pose, that are near planes."""
-        distances, plane, rows = planes.distances(placed(points, pose), _MAX_VOXELS * voxel_m)
+        """Find the points of a sweep that are close to planes."""
+        distances, plane, rows = planes.distances(
+            transform_points(points, pose), _MAX_VOXELS * voxel_m
+        )
         spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
         sigma = max(spread_m, _MIN_SIGMA_M)
         weights = np.maximum(1 - (distances / (_TUKEY_SIGMAS * sigma)) ** 2, 0) ** 2
         return cls(rows, points[rows], distances, planes.normals[plane], weights)
 
 
-def _registered(
+def _register_to_planes(
     alignment: Alignment, sample: Sweep, planes: VoxelPlanes, number: int
 ) -> tuple[Floats, _PlanePoints]:
-    """Return the pose of a sweep that brings its points to planes, and these points."""
+    """Register a sweep to the planes.
+
+    Return its pose and its points on planes.
+    """
     from scipy.spatial.transform import Rotation
 
     some = sample.select(slice(_SWEEP_POINTS))
-    points, _ = alignment.compensated(some, number)
+    points, _ = alignment.compensate(some, number)
     pose = alignment.poses[number].copy()
     voxel_m = alignment.voxel_m
     for _ in range(_STEPS):
-        on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
+        on_planes = _PlanePoints.from_sweep(points, pose, planes, voxel_m)
         enough = min(_MIN_PLANE_POINTS, len(points) / 10)
         if len(points) < _MIN_ALIGNED_POINTS or on_planes.weights.sum() < enough:
-            return pose, on_planes  # too few surfaces: odometry knows better
+            return pose, on_planes  # With too few surfaces, odometry is more accurate.
         arms = on_planes.points @ pose[:3, :3].T
         design = np.hstack([np.cross(arms, on_planes.normals), on_planes.normals])
         weighted = design * on_planes.weights[:, None]
-        # A slight pull to the estimate, in directions that no plane shows.
+        # A weak prior keeps the estimate in directions that no plane constrains.
         normal = weighted.T @ design + np.eye(6)
         change = np.linalg.solve(normal, -weighted.T @ on_planes.distances)
         pose[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[3:]
-    return pose, _PlanePoints.of_sweep(points, pose, planes, voxel_m)
+    return pose, _PlanePoints.from_sweep(points, pose, planes, voxel_m)
 
 
-def _aligned(
+def _align_to_planes(
     alignment: Alignment,
     samples: Sequence[Sweep],
     planes: VoxelPlanes,
     mapped: Sequence[int],
 ) -> Alignment:
-    """Return poses and offsets of rings that bring points to planes."""
+    """Align the sweeps to the planes, and calibrate the rings with the `mapped` sweeps."""
     poses = alignment.poses.copy()
     ring_count = len(alignment.ring_offsets)
     normal = np.zeros((ring_count, 3, 3))
@@ -476,7 +517,7 @@ def _aligned(
     distance_m = np.full(len(samples), np.nan)
     calibrating = set(mapped)
     for number, sample in enumerate(samples):
-        poses[number], on_planes = _registered(alignment, sample, planes, number)
+        poses[number], on_planes = _register_to_planes(alignment, sample, planes, number)
         if len(on_planes.distances):
             distance_m[number] = np.median(np.abs(on_planes.distances))
         if number in calibrating and ring_count >= MIN_RINGS:
@@ -504,16 +545,22 @@ def _aligned(
 
 
 def _ring_design(on_planes: _PlanePoints, pose: Floats) -> Floats:
-    """Return changes (k, 3) of distances to planes with range, elevation and azimuth."""
-    outward, upward, leftward = _axes(on_planes.points)
+    """Return the derivatives of distances to planes.
+
+    The array has shape (k, 3), for range, elevation and azimuth.
+    """
+    outward, upward, leftward = _spherical_derivatives(on_planes.points)
     normals = on_planes.normals @ pose[:3, :3]
     return np.stack(
         [np.einsum("ij,ij->i", axis, normals) for axis in (outward, upward, leftward)], axis=1
     )
 
 
-def _axes(points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return how points (n, 3) move with range, elevation and azimuth: (n, 3) each."""
+def _spherical_derivatives(points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the derivatives of points with respect to range, elevation and azimuth.
+
+    Each array has shape (n, 3).
+    """
     ranges = np.linalg.norm(points, axis=1)
     outward = points / ranges[:, None]
     level = np.hypot(points[:, 0], points[:, 1])
@@ -525,6 +572,6 @@ def _axes(points: Floats) -> tuple[Floats, Floats, Floats]:
     return outward, upward, leftward
 
 
-def placed(points: Floats, pose: Floats) -> Floats:
-    """Return points (n, 3) moved by a pose (4, 4)."""
+def transform_points(points: Floats, pose: Floats) -> Floats:
+    """Transform points of shape (n, 3) with a pose of shape (4, 4)."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])

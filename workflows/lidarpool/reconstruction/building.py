@@ -1,4 +1,4 @@
-"""Rebuilds a place from a recording: the scene, the drive, the sensor, and how near they come."""
+"""Reconstruct a scene, the drive and the sensor from a recording, and measure the accuracy."""
 
 from __future__ import annotations
 
@@ -41,20 +41,27 @@ from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
-from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, draw_sweep
-from .finished_steps import FinishedSteps, Map, TwinStep
-from .held_out import HeldOut
-from .labels import divided
-from .lost_pulses import Answering, firings_per_turn
+from .charts import (
+    STATIONARY_DOTS,
+    SweepImages,
+    TopViewPoints,
+    draw_errors,
+    draw_sweep,
+    draw_top_view,
+)
+from .finished_steps import FinishedSteps, MapFunction, TwinStep
+from .held_out import HeldOutRays
+from .labels import split_by_object
+from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
-from .processes import mapping
+from .processes import parallel_map
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
-from .submap_tasks import BuildTask, StretchSurfels, StretchTask, align_stretch, build_stretch
-from .submaps import AlignedStretch, Stretch, divide, joined
+from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
+from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
-from .surfels import joined_surfels, surfel_centers, surfel_mesh
+from .surfels import merge_surfels, surfel_centers, surfel_mesh
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -63,25 +70,26 @@ SENSOR_FILE = "sensor.yaml"
 SCENARIO_FILE = "scenario.yaml"
 FIGURES_FILE = "twin.json"
 PAGE_FILE = "report.html"
-_COLUMNS = ["time", "intensity", "reflectivity", "class"]  # that the export to KITTI requires, too
+# includes the columns that the KITTI export requires
+_COLUMNS = ["time", "intensity", "reflectivity", "class"]
 DEFAULT_VOXEL_M = 0.1
-_FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
-_COMPARED_SWEEPS = 12  # of the held-out sweeps
+_FIT_SWEEPS = 13  # sweeps to which the sensor noise is fitted
+_COMPARED_SWEEPS = 12  # held-out sweeps that are compared
 _POSE_DECIMALS = 6
-_RESPONSE_STRETCHES = 4  # that tell the response of the sensor
+_RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
 _POSES = TwinStep("poses", (RecordedPoses,))
-_ALIGN = TwinStep("align", (AlignedStretch,))
-_BUILD = TwinStep("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
-NO_RETURN = "no return"  # name of the object of dark surfels
-_ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # which are written even by default
+_ALIGN = TwinStep("align", (AlignedSubmap,))
+_BUILD = TwinStep("build", (SubmapSurfels, Observations, HeldOutRays, SweepImages, TopViewPoints))
+NO_RETURN = "no return"  # object name of surfels that return no pulses
+_ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
 _RATE_DECIMALS = 4
-_MIN_STEP_S = 1e-5  # between poses of the trajectory
-_MIN_LEAD = 0.01  # of a revolution, by which a stamp is after the first point
-_MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
+_MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
+_MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
+_MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
 
 
 class TwinPose(NamedTuple):
-    """Pose at a time."""
+    """Pose of the sensor at a time."""
 
     pose: Floats  # (4, 4)
     time_s: float
@@ -89,27 +97,29 @@ class TwinPose(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """A place that was reconstructed from a recording, with the recorded drive and the sensor.
+    """Static scene that was reconstructed from a recording, with the recorded drive and sensor.
 
     Attributes
     ----------
     scene
-        The place as surfels, with reflectances as colors and classes as materials.
+        The scene as surfels, with reflectances as colors and classes as materials.
     poses
-        Transformations from the sensor frame at the stamp of each sweep to the scene frame. float64
-        array of shape (s, 4, 4).
+        Transformations from the sensor frame at the timestamp of each sweep to the scene frame.
+        float64 array of shape (s, 4, 4).
     times_s
-        Stamps of the sweeps in seconds since the first. float64 array of shape (s,).
+        Timestamps of the sweeps in seconds since the first. float64 array of shape (s,).
     start, stop
-        Poses as in `poses`, and times as in `times_s`, of the first point of the first sweep and
-        of the end of the last sweep.
+        Pose and time of the first point of the first sweep, and of the end of the last sweep, in
+        the same frames as `poses` and `times_s`.
     origin
         Origin of the scene frame in the world frame of the recorded poses, in meters. float64 array
         of shape (3,).
     model
-        The recorded sensor, with the fitted noise.
+        The recorded sensor with the fitted noise.
     figures
         Statistics and texts of the report. Lengths are in meters.
+    pictures
+        Charts of the report by name.
     """
 
     scene: Scene
@@ -129,6 +139,11 @@ class Twin:
         """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
 
         The folder is created if it does not exist.
+
+        Returns
+        -------
+        list of Path
+            The written files.
 
         Raises
         ------
@@ -159,16 +174,16 @@ class Twin:
             return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
 
     def _classes(self) -> dict[int, str]:
-        """Return the names of the materials of surfels with a class of the recording."""
+        """Return the material names of surfels with a recorded class, by class number."""
         materials = self.scene.materials
         names = () if materials is None else sorted({*chain.from_iterable(materials.names)})
         numbers = {int(name.removeprefix(CLASS_MATERIAL)): name for name in names if name}
         return {number: numbers[number] for number in sorted(numbers) if number >= 0}
 
     def _trajectory(self) -> str:
-        """Return the table of the poses, from the start of the first sweep to the end of the last.
+        """Format the trajectory as CSV, from the start of the first sweep to the end of the last.
 
-        Otherwise a simulation would lack the last sweep.
+        If the trajectory ended at the last timestamp, a simulation would omit the last sweep.
         """
         before = [self.start] if self.start.time_s < self.times_s[0] else []
         after = [self.stop] if self.stop.time_s > self.times_s[-1] + _MIN_STEP_S else []
@@ -181,7 +196,7 @@ class Twin:
         return "\n".join(lines) + "\n"
 
     def _scenario(self) -> str:
-        """Return a scenario of the recording's sensor on its drive through the place."""
+        """Format a scenario that simulates the recorded sensor on its drive through the scene."""
         scenario: dict[str, Any] = {
             "scene": SCENE_FILE,
             "sensor": SENSOR_FILE,
@@ -289,7 +304,7 @@ def twin(
         if not isinstance(recording, Recording):
             recording = open_recording(recording, sensor, intensity, name="the recording")
         recorded = RecordedSweeps.from_recording(recording)
-    _check(recorded)
+    _check_sweeps(recorded)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
@@ -298,15 +313,15 @@ def twin(
     with ExitStack() as stack:
         if folder is None:
             folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
-        made_of = (_stated(recorded, track), voxel_m)
+        made_of = (_fingerprint_inputs(recorded, track), voxel_m)
         steps = FinishedSteps.begin(Path(folder), made_of, resume=resume)
         built = _Building(recorded, base, voxel_m, steps, client, tell).twin(track)
         steps.remove()
     return built
 
 
-def _check(recorded: RecordedSweeps) -> None:
-    """Raise LidarError if a place cannot be made of the sweeps."""
+def _check_sweeps(recorded: RecordedSweeps) -> None:
+    """Raise LidarError if the sweeps cannot be reconstructed."""
     recording = recorded.recording
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
@@ -318,10 +333,10 @@ def _check(recorded: RecordedSweeps) -> None:
         )
 
 
-def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
-    """Return what was chosen, and names, sizes and times of change of files that twins are of.
+def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
+    """Return what determines a twin: its source, and the names, sizes and change times of files.
 
-    Nothing is the same as a recording in memory.
+    A recording in memory has no such identity, so it never matches a previous one.
     """
     source = recorded.source
     if isinstance(source, Recording):
@@ -340,7 +355,7 @@ def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
 
 @dataclass(frozen=True, eq=False)
 class _Building:
-    """What a twin is built of, and how."""
+    """Steps that reconstruct a twin, with their settings."""
 
     recorded: RecordedSweeps
     base: SensorModel | None
@@ -350,36 +365,34 @@ class _Building:
     tell: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
-        """Build the twin."""
+        """Reconstruct the twin."""
         recorded = self.recorded
         self.tell(f"estimating the poses of {plural(recorded.count, 'sweep')}")
-        poses = self._poses(trajectory)
+        poses = self._find_poses(trajectory)
         self.tell(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
-        stretches = divide(first.poses[:, :3, 3])
-        counting = np.concatenate([stretch.own_numbers for stretch in stretches])
+        submaps = split_into_submaps(first.poses[:, :3, 3])
+        counting = np.concatenate([submap.own_numbers for submap in submaps])
         others = counting[1::2]
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)]
         task = BuildTask(
             recorded=recorded,
             alignment=first,
-            stretch=stretches[0],
+            submap=submaps[0],
             mapped=counting[::2],
-            answering=Answering.of_sweeps(recorded),
+            coverage=SensorCoverage.from_sweeps(recorded),
             compared=compared,
             voxel_m=self.voxel_m,
             drawn_share=0.0,
         )
         is_shared = not isinstance(recorded.source, Recording)
-        with mapping(self.client, len(stretches) if is_shared else 1) as run:
-            task = replace(task, alignment=self._aligned(run, task, stretches))
-            built = self._built(run, task, stretches)
-            sweeps = AlignedSweeps(recorded, task.alignment, task.answering)
-            return self._finished(built, sweeps, poses)
+        with parallel_map(self.client, len(submaps) if is_shared else 1) as run:
+            task = replace(task, alignment=self._align_submaps(run, task, submaps))
+            built = self._build_submaps(run, task, submaps)
+            sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
+            return self._assemble(built, sweeps, poses)
 
-    def _poses(self, trajectory: Path | None) -> RecordedPoses:
-        """Return the poses of all sweeps."""
-
+    def _find_poses(self, trajectory: Path | None) -> RecordedPoses:
         def find() -> tuple[RecordedPoses]:
             return (find_poses(self.recorded, trajectory),)
 
@@ -388,54 +401,57 @@ class _Building:
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
 
-    def _aligned(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> Alignment:
-        """Align all sweeps."""
-        self.tell(f"aligning the sweeps in {plural(len(stretches), 'submap')}")
+    def _align_submaps(
+        self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
+    ) -> Alignment:
+        """Align all sweeps, submap by submap."""
+        self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
-            StretchTask(task.recorded, task.alignment, stretch, task.mapped)
-            for stretch in stretches
+            SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
         ]
-        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_stretch, tasks)]
-        return joined(task.alignment, stretches, aligned)
+        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
+        return merge_alignments(task.alignment, submaps, aligned)
 
-    def _built(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> _Built:
-        """Build the places of all stretches."""
-        sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in stretches]
-        count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in stretches)
-        share = STANDING_DOTS / max(count, 1.0)
-        tasks = [replace(task, stretch=one, drawn_share=share) for one in stretches]
+    def _build_submaps(
+        self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
+    ) -> _Built:
+        """Build the surface maps of all submaps."""
+        sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
+        count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
+        share = STATIONARY_DOTS / max(count, 1.0)
+        tasks = [replace(task, submap=one, drawn_share=share) for one in submaps]
         parts = []
-        for number, part in enumerate(self.steps.each(_BUILD, run, build_stretch, tasks), 1):
-            self.tell(f"built {number} of {plural(len(stretches), 'submap')}")
+        for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
+            self.tell(f"built {number} of {plural(len(submaps), 'submap')}")
             surfels, _, *others = part
-            parts.append(_BuiltStretch(surfels, *others))
-        return _Built(parts, stretches)
+            parts.append(_BuiltSubmap(surfels, *others))
+        return _Built(parts, submaps)
 
-    def _seen(self, index: int) -> Observations:
-        """Return the rays that end on surfels of a stretch."""
-        seen: Observations = self.steps.load(_BUILD, index)[1]
-        return seen
+    def _load_observations(self, index: int) -> Observations:
+        """Load the rays that end on the surfels of a submap."""
+        observations: Observations = self.steps.load(_BUILD, index)[1]
+        return observations
 
-    def _finished(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
-        """Fit the response and the noise of the sensor, and make the twin."""
+    def _assemble(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
+        """Fit the response and the noise of the sensor, and assemble the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
         self.tell("fitting the sensor model")
-        some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
+        some = even_indices(len(built.parts), _RESPONSE_SUBMAPS).tolist()
         response = fit_response(
-            [self._seen(index) for index in some],
+            [self._load_observations(index) for index in some],
             recorded.ring_count,
             are_energies=recorded.recording.energies,
         )
         name = Path(recorded.recording.name).name
-        # The points of a stretch may all belong to its neighbors.
+        # All points of a submap may belong to its neighbors.
         meshes = {
             index: part.surfels.mesh(name)
             for index, part in enumerate(built.parts)
             if len(part.surfels.corners)
         }
-        timing = SweepTiming.of_sweeps(sweeps)
-        model, notes = self._sensor(built, sweeps, meshes, response, timing)
+        timing = SweepTiming.from_sweeps(sweeps)
+        model, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
@@ -447,21 +463,28 @@ class _Building:
                 *recorded.recording.notes,
                 *recorded.notes,
                 *notes,
-                *_drive_notes(alignment),
+                *_stationary_notes(alignment),
             ],
         }
         pictures = {
             "sweep": draw_sweep(built.images()),
-            "above": draw_above([part.above for part in built.parts], alignment.poses[:, :3, 3]),
+            "above": draw_top_view(
+                [part.top_view for part in built.parts], alignment.poses[:, :3, 3]
+            ),
             "errors": draw_errors(figures),
         }
         if response is not None:
             meshes = {
-                index: colored(mesh, response.reflectances(self._seen(index), surfel_centers(mesh)))
+                index: colored(
+                    mesh,
+                    response.reflectances(self._load_observations(index), surfel_centers(mesh)),
+                )
                 for index, mesh in meshes.items()
             }
         return Twin(
-            scene=Scene.from_meshes([*divided(joined_surfels([*meshes.values()])), *built.dark()]),
+            scene=Scene.from_meshes(
+                [*split_by_object(merge_surfels([*meshes.values()])), *built.dark()]
+            ),
             poses=alignment.poses,
             times_s=poses.times_s,
             start=timing.start(alignment),
@@ -472,7 +495,7 @@ class _Building:
             pictures=pictures,
         )
 
-    def _sensor(
+    def _fit_sensor(
         self,
         built: _Built,
         sweeps: AlignedSweeps,
@@ -480,16 +503,16 @@ class _Building:
         response: Response | None,
         timing: SweepTiming,
     ) -> tuple[SensorModel, list[str]]:
-        """Return the sensor with the noise of its pulses on a part of the place, and notes."""
+        """Return the sensor with noise that is fitted to the middle of the drive, and notes."""
         middle = len(built.parts) // 2
-        numbers = built.stretches[middle].own_numbers
+        numbers = built.submaps[middle].own_numbers
         sizes = built.parts[middle].surfels.points
         near = [mesh for index, mesh in meshes.items() if abs(index - middle) <= 1]
         sensor = self.base or timing.sensor(sweeps, int(numbers[sizes.argmax()]))
         model, notes = fit_sensor(
             sweeps,
             dict(zip(numbers.tolist(), sizes.tolist(), strict=True)),
-            Scene.from_meshes([joined_surfels(near)]),
+            Scene.from_meshes([merge_surfels(near)]),
             response,
             sensor,
         )
@@ -501,7 +524,7 @@ class _Building:
         return model, notes
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
-        """Return the figures of the place and of the drive."""
+        """Return statistics of the reconstruction and of the drive."""
         path = alignment.poses[:, :3, 3]
         surfels = [part.surfels for part in built.parts]
         return {
@@ -524,33 +547,38 @@ class _Building:
         }
 
 
-class _BuiltStretch(NamedTuple):
-    """What is kept of a stretch in memory."""
+class _BuiltSubmap(NamedTuple):
+    """Results of a submap that are kept in memory."""
 
-    surfels: StretchSurfels
-    held_out: HeldOut | None
+    surfels: SubmapSurfels
+    held_out: HeldOutRays | None
     images: SweepImages | None
-    above: Above
+    top_view: TopViewPoints
 
 
 @dataclass(frozen=True, eq=False)
 class _Built:
-    """The places of all stretches."""
+    """Results of all submaps."""
 
-    parts: Sequence[_BuiltStretch]
-    stretches: Sequence[Stretch]
+    parts: Sequence[_BuiltSubmap]
+    submaps: Sequence[Submap]
 
-    def held_out(self) -> HeldOut:
+    def held_out(self) -> HeldOutRays:
         """Return the rays of all held-out sweeps that were compared."""
-        return HeldOut.joined([part.held_out for part in self.parts if part.held_out is not None])
+        return HeldOutRays.concatenate(
+            [part.held_out for part in self.parts if part.held_out is not None]
+        )
 
     def dark(self) -> list[SceneMesh]:
-        """Return the surfels that return nothing as at most one mesh."""
+        """Return at most one mesh, which contains the surfels that return no pulses."""
         corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
         return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
     def images(self) -> SweepImages:
-        """Return the images of a held-out sweep in the middle, or raise LidarError without one."""
+        """Return the images of a held-out sweep in the middle of the drive.
+
+        Raise LidarError if there is none.
+        """
         images = [part.images for part in self.parts if part.images is not None]
         if not images:
             raise LidarError(
@@ -561,20 +589,21 @@ class _Built:
 
 
 class SweepTiming(NamedTuple):
-    """When sweeps start, relative to their stamps, and how the sensor rotates."""
+    """Start times of sweeps relative to their timestamps, and the rotation of the sensor."""
 
-    rate_hz: float  # revolutions in a second
-    revolutions: int  # with those whose sweeps were dropped
-    first_s: float  # from the stamp of a sweep to its start, at most 0
+    rate_hz: float  # revolutions per second
+    revolutions: int  # includes dropped sweeps
+    first_s: float  # time from the timestamp of a sweep to its start, at most 0
     rotation: Rotation | None  # None if unknown
 
     @classmethod
-    def of_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
-        """Find the timing of sweeps."""
+    def from_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
+        """Determine the timing of sweeps."""
         recorded = sweeps.recorded
         alignment = sweeps.alignment
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
-        # Stamps jitter, and their mean step does not, if steps with dropped sweeps count as many.
+        # Timestamps jitter, but their mean interval does not. An interval with dropped sweeps
+        # counts as several intervals.
         steps = max(round(span_s / alignment.sweep_s), 1)
         rate_hz = round(steps / span_s, _RATE_DECIMALS)
         period_s = 1 / rate_hz
@@ -586,23 +615,23 @@ class SweepTiming(NamedTuple):
         return cls(rate_hz, steps + 1, first_s, rotation)
 
     def start(self, alignment: Alignment) -> TwinPose:
-        """Return the start of the first sweep."""
+        """Return the pose and time at the start of the first sweep."""
         step, step_s = alignment.step(0)
-        pose = alignment.poses[0] @ step.part(self.first_s / step_s)
+        pose = alignment.poses[0] @ step.fraction(self.first_s / step_s)
         return TwinPose(pose, float(alignment.times_s[0]) + self.first_s)
 
     def stop(self, alignment: Alignment) -> TwinPose:
-        """Return the end of the last sweep, to which its motion goes on."""
+        """Return the pose and time at the end of the last sweep, extrapolating its motion."""
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
         rest_s = self.first_s + self.revolutions / self.rate_hz - span_s
         step, step_s = alignment.step(len(alignment.poses) - 1)
-        pose = alignment.poses[-1] @ step.part(rest_s / step_s)
+        pose = alignment.poses[-1] @ step.fraction(rest_s / step_s)
         return TwinPose(pose, float(alignment.times_s[-1]) + rest_s)
 
     def sensor(self, sweeps: AlignedSweeps, number: int) -> SensorModel | None:
-        """Return a sensor with the recorded rings and rotation, or None without rings.
+        """Return a sensor with the recorded rings and rotation, or None if there are no rings.
 
-        The steps of azimuth are those of a sweep.
+        The azimuth step is determined from the sweep `number`.
         """
         recorded = sweeps.recorded
         if not len(recorded.elevation_rad):
@@ -618,7 +647,7 @@ class SweepTiming(NamedTuple):
             **known,
             firings_per_turn=firings_per_turn(recorded.read(number)),
             rate_hz=self.rate_hz,
-            range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
+            range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
             beams={"elevation_deg": elevation_deg.tolist()},
         )
 
@@ -630,39 +659,41 @@ def fit_sensor(
     response: Response | None,
     sensor: SensorModel | None,
 ) -> tuple[SensorModel, list[str]]:
-    """Fit the noise of a sensor to its pulses on a place.
+    """Fit the noise of a sensor to its pulses on reconstructed surfaces.
 
     Parameters
     ----------
     sweeps
-        Sweeps, at their places.
+        Aligned sweeps.
     sizes
-        Numbers of points of the sweeps that may be read: {number of the sweep: points}.
+        Number of points by sweep number, for the sweeps that may be read.
     scene
-        The place.
+        The reconstructed surfaces.
     response
-        How intensities follow from reflectances; None without intensities.
+        Response of the sensor, or None if there are no intensities.
     sensor
-        The sensor without noise, which may only be None for a recording with rings.
+        The sensor without noise. It must not be None if the recording has no rings.
 
     Returns
     -------
     tuple
-        The sensor, and notes.
+        The sensor with noise, and notes for the user.
     """
     assert sensor is not None
     if not len(sweeps.recorded.elevation_rad):
         return sensor, ["without rings, the sensor noise is that of the sensor model"]
-    # A sweep with few points, as with lost packets, looks like one of another sensor.
+    # A sweep with few points, for example due to lost packets, would look as if it came from a
+    # different sensor.
     counts = np.array([*sizes.values()])
     whole = np.array([*sizes])[counts >= np.median(counts) / 2]
     some = whole[even_indices(len(whole), 2 * _FIT_SWEEPS)]
-    # Compensated sweeps may be tilted against the sensor, so that their rings are no cones.
+    # Motion-compensated sweeps may be tilted relative to the sensor, in which case their rings are
+    # not cones.
     spread_rad = [sweeps.recorded.cone_spread_rad(number) for number in some.tolist()]
     chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]])
     try:
-        fitted = _fitted(sweeps, chosen, scene, response)
-    except LidarError as error:  # the place is there, and a scan of it needs no noise
+        fitted = _fit_to_sweeps(sweeps, chosen, scene, response)
+    except LidarError as error:  # The reconstruction is usable without fitted noise.
         return sensor, [f"the sensor noise is unknown: {error}"]
     performance = fitted.model.performance
     if performance is None:
@@ -677,11 +708,13 @@ def fit_sensor(
     return SensorModel.model_validate(sensor.model_dump() | changes), []
 
 
-def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None) -> Fit:
-    """Fit a sensor to chosen sweeps on a place, or raise LidarError.
+def _fit_to_sweeps(
+    sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None
+) -> Fit:
+    """Fit a sensor to the chosen sweeps, or raise LidarError.
 
-    Points as fired have a pose for each pulse. Compensated ones have none: their rings are blurred,
-    and steps of azimuth beside near things look like lost pulses.
+    Points as fired have a firing pose for each pulse. Motion-compensated points have none, so their
+    rings are blurred, and parallax at close objects looks like lost pulses.
     """
     recorded = sweeps.recorded
     poses = sweeps.alignment.poses[chosen]
@@ -690,7 +723,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
 
     def with_points(sweep: Sweep, points: Floats, **fields: Any) -> Sweep:
         intensity = sweep.intensity
-        if intensity is not None:  # as an energy, white at 10 m is 1
+        if intensity is not None:  # convert to energy, where white at 10 m is 1
             intensity = intensity / (white if are_energies and white else 1)
         channel = recorded.ring_count - 1 - sweep.columns["row"]
         return sweep.with_columns(channel=channel, intensity=intensity).replace(
@@ -700,7 +733,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     def fired(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
-        as_fired = sweeps.alignment.fired(sweep, number)
+        as_fired = sweeps.alignment.points_as_fired(sweep, number)
         assert as_fired is not None
         points, firing_poses = as_fired
         return with_points(sweep, points, firing_poses=firing_poses)
@@ -708,7 +741,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     def compensated(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
-        return with_points(sweep, sweeps.aligned(sweep, number).points)
+        return with_points(sweep, sweeps.align(sweep, number).points)
 
     is_compensated = sweeps.alignment.motion is Motion.COMPENSATED
     recording = Recording(
@@ -724,8 +757,8 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)
 
 
-def _drive_notes(alignment: Alignment) -> list[str]:
-    """Return a note on a sensor that stood."""
+def _stationary_notes(alignment: Alignment) -> list[str]:
+    """Return a note if the sensor was stationary."""
     if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
         return []
     return [
@@ -737,13 +770,13 @@ def _drive_notes(alignment: Alignment) -> list[str]:
 
 
 def _median(values: Floats) -> float | None:
-    """Return the median of the values that are known, or None."""
+    """Return the median of the finite values, or None if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
 
 
 def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
-    """Return the mesh of surfels, whose colors are their reflectances."""
+    """Color the surfels of a mesh by their reflectances."""
     if reflectances is None:
         return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)

@@ -1,4 +1,4 @@
-"""Pictures of a twin: a held-out sweep beside its simulation, the place, and errors on the way."""
+"""Charts of a reconstruction: a held-out sweep and its simulation, a top view, and range errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarview.render.picture_page import Page, label_logarithms
 from ..clouds.rings import elevations
 from .alignment import AlignedSweep, AlignedSweeps
 from .reflectances import Reflectances
-from .surface_map import Place
+from .surface_map import SurfaceMap
 
 _WIDTH = 1600
 _LEFT = 0.075
@@ -23,13 +23,13 @@ _CHART_WIDTH = 0.77
 _IMAGE_HEIGHT = 190
 _GAP = 62
 _ABOVE_HEIGHT = 1000
-_ABOVE_FRAME = (_LEFT, 0.09, 0.86, 0.76)  # left, bottom, width and height, shares of the page
+_ABOVE_FRAME = (_LEFT, 0.09, 0.86, 0.76)  # left, bottom, width and height relative to the page
 _TOP = 150
 _BOTTOM = 90
-_COLUMNS = 720  # of the images, at most: 0.5° each
-_ROWS = 64  # of the images of a sensor without rings
-_DIFFERENCE_M = 0.1  # end of the scale of differences
-STANDING_DOTS = 150_000
+_COLUMNS = 720  # maximum number of image columns, 0.5° each
+_ROWS = 64  # number of image rows for a sensor without rings
+_DIFFERENCE_M = 0.1  # limit of the color scale for differences
+STATIONARY_DOTS = 150_000
 _MOVED_DOTS = 40_000
 _NO_RETURN = theme.rgb("#c8cbd0")
 _MOVED_COLOR = "#d7301f"
@@ -37,42 +37,50 @@ _PATH_COLOR = "#08519c"
 
 
 class _Image(NamedTuple):
-    """A picture of the values of a sweep."""
+    """Image of a sweep with its caption and colors."""
 
     words: str
     values: Floats32  # (r, c)
-    scale: Any  # of Matplotlib
-    colors: str  # name of a color map
+    scale: Any  # Matplotlib norm
+    colors: str  # name of a colormap
 
 
 class SweepImages(NamedTuple):
-    """Images (r, c) of a sweep by ring and azimuth, recorded and in the twin; NaN for no return."""
+    """Images of a recorded sweep and of its simulation.
 
-    number: Ints  # (1,): of the sweep
+    The images have a row for each ring and a column for each azimuth. Their shape is (r, c), and
+    pixels without a return are NaN.
+    """
+
+    number: Ints  # (1,), number of the sweep
     range_m: Floats32
     simulated_m: Floats32
     intensity: Floats32 | None
     simulated_intensity: Floats32 | None
 
     @classmethod
-    def of_sweep(
-        cls, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None, number: int
+    def from_sweep(
+        cls,
+        sweeps: AlignedSweeps,
+        surface_map: SurfaceMap,
+        reflectances: Reflectances | None,
+        number: int,
     ) -> SweepImages:
-        """Make the images of a sweep and of its rays in a place."""
+        """Render a sweep and its simulation on a surface map."""
         sweep = sweeps.read(number)
         cells = _cells(sweep, sweeps)
-        seen = place.see(sweep)
+        hits = surface_map.cast(sweep)
         simulated_m = np.full(len(sweep.points), np.nan)
-        simulated_m[seen.rays] = seen.distance_m
+        simulated_m[hits.rays] = hits.distance_m
         range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))
         if reflectances is None or sweep.intensities is None:
             return cls(np.array([number]), range_m, in_twin_m, None, None)
-        simulated = reflectances.intensities(sweep, seen)
+        simulated = reflectances.intensities(sweep, hits)
         intensity, in_twin = (_image(values, cells) for values in (sweep.intensities, simulated))
         return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
 
     def pictures(self) -> list[_Image]:
-        """Return the pictures to draw."""
+        """Return the images to draw."""
         near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
         ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
@@ -91,21 +99,25 @@ class SweepImages(NamedTuple):
         return images
 
 
-class Above(NamedTuple):
-    """Some points of some sweeps, in the world."""
+class TopViewPoints(NamedTuple):
+    """Horizontal positions of some points in world coordinates."""
 
-    still: Floats32  # (n, 2): of what stands, meters
-    moved: Floats32  # (k, 2)
+    still: Floats32  # (n, 2), stationary points, meters
+    moved: Floats32  # (k, 2), points on moving objects, meters
 
     @classmethod
-    def of_sweeps(
-        cls, sweeps: AlignedSweeps, standing: Mapping[int, Bools], numbers: Ints, share: float
-    ) -> Above:
-        """Choose a share of the points of some sweeps."""
+    def from_sweeps(
+        cls, sweeps: AlignedSweeps, stationary: Mapping[int, Bools], numbers: Ints, share: float
+    ) -> TopViewPoints:
+        """Sample points of some sweeps.
+
+        `share` is the fraction of the stationary points that are chosen. The number of points on
+        moving objects is limited for each sweep.
+        """
         still: list[Floats] = []
         moved: list[Floats] = []
         for number in numbers.tolist():
-            mask = standing[number]
+            mask = stationary[number]
             world = sweeps.read(number).world[:, :2]
             chosen = np.random.default_rng(number).random(len(world)) < share
             still.append(world[mask & chosen])
@@ -115,7 +127,7 @@ class Above(NamedTuple):
 
 
 def draw_sweep(sweep: SweepImages) -> Page:
-    """Draw ranges and intensities of a sweep, recorded and in the twin, and their differences."""
+    """Draw the ranges and intensities of a recorded sweep, its simulation, and the differences."""
     images = sweep.pictures()
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))
@@ -136,7 +148,7 @@ def draw_sweep(sweep: SweepImages) -> Page:
 
 
 def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int, int]]:
-    """Return the cells (n,) of the points of a sweep in an image, and the image's shape."""
+    """Return the pixel index of each point of a sweep, and the shape of the image."""
     row_count = sweeps.recorded.ring_count
     row = sweep.ring
     if not len(sweeps.recorded.elevation_rad):
@@ -145,7 +157,7 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
         row_count = _ROWS
         share = (high - elevation) / max(high - low, 1e-9)
         row = (share * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
-    # More columns than a ring has pulses would leave stripes.
+    # If there were more columns than pulses per ring, the image would have empty stripes.
     column_count = min(_COLUMNS, int(np.bincount(row).max()))
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
     column = (turns * column_count).astype(np.int64) % column_count
@@ -153,15 +165,21 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
 
 
 def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
-    """Return the image (r, c) of values (n,): the last value of each cell, or NaN."""
+    """Return an image of the values at their pixels.
+
+    If several values share a pixel, the last one is used. Empty pixels are NaN.
+    """
     cell, shape = cells
     image = np.full(shape[0] * shape[1], np.nan, np.float32)
     image[cell] = values
     return image.reshape(shape)
 
 
-def draw_above(parts: Sequence[Above], path: Floats) -> Page:
-    """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
+def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
+    """Draw a top view of stationary and moving points and the path of the sensor.
+
+    `path` has the sensor positions, of shape (s, 3).
+    """
     page = Page((_WIDTH, _ABOVE_HEIGHT))
     page.title(
         "Top view", "gray: stationary points; red: points removed because rays passed through them"
@@ -169,12 +187,12 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     near = np.concatenate([part.still for part in parts])
     moved = np.concatenate([part.moved for part in parts])
     low, high = np.quantile(near, (0.01, 0.99), axis=0)
-    # A meter is as long in x as in y.
+    # Use an equal aspect ratio.
     sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
     half = ((high - low) / sides).max() * sides / 2
     axes = page.map_chart(_ABOVE_FRAME, (low + high) / 2 + [-half, half])
     for points, color, size, most in (
-        (near, theme.UNSEEN, 1.0, STANDING_DOTS),
+        (near, theme.UNSEEN, 1.0, STATIONARY_DOTS),
         (moved, _MOVED_COLOR, 1.6, _MOVED_DOTS),
     ):
         some = points[:: max(-(-len(points) // most), 1)]
@@ -185,7 +203,7 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
 
 
 def draw_errors(figures: Mapping[str, Any]) -> Page:
-    """Draw the differences of ranges along the drive, and by range."""
+    """Draw the range errors over the sweep number and over the range."""
     page = Page((_WIDTH, 560))
     page.title(
         "Range differences",

@@ -1,7 +1,7 @@
-"""Results of the steps of a twin, kept in a folder until the twin is written.
+"""Store the results of reconstruction steps in a folder until the reconstruction is complete.
 
-A step is done for each stretch of the drive, or once. What is done is read again, so the memory of
-a drive is that of a stretch, and a command that was killed goes on.
+A step runs for each submap of the drive, or once. Its results are loaded when they are needed, so
+only one submap has to fit in memory, and an interrupted command can be resumed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from lidarsim.errors import LidarError, explained
 from ..identity.fingerprint import fingerprint
 
 STEPS_FOLDER = ".lidarpool-twin"
-_OF_FILE = "of.json"  # of what the steps are results
+_OF_FILE = "of.json"  # identifies the inputs of the steps
 
-Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class TwinStep(NamedTuple):
-    """What a step is called, and the classes of the arrays that it returns."""
+    """Name of a step, and the types of its results."""
 
     name: str
     kinds: tuple[type, ...]  # NamedTuples or dataclasses whose fields are arrays or None
@@ -35,15 +35,28 @@ class TwinStep(NamedTuple):
 
 @dataclass(frozen=True)
 class FinishedSteps:
-    """The folder of the results of steps."""
+    """Folder that contains the results of finished steps."""
 
     folder: Path
 
     @classmethod
     def begin(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
-        """Make the folder, or go on with one whose steps were `made_of` the same.
+        """Create the folder, or resume from a folder whose steps have the same inputs.
 
-        LidarError if the folder has steps of something else, or `resume` is not given.
+        Parameters
+        ----------
+        folder
+            Folder for the results.
+        made_of
+            Inputs that determine the results.
+        resume
+            Whether to resume from an existing folder.
+
+        Raises
+        ------
+        LidarError
+            If the folder contains steps with other inputs, if it exists and `resume` is False, or
+            if it cannot be written to.
         """
         own = {"lidarpool": __version__, "made_of": fingerprint(made_of)}
         file = folder / _OF_FILE
@@ -66,15 +79,16 @@ class FinishedSteps:
         return cls(folder)
 
     def remove(self) -> None:
-        """Remove the folder."""
+        """Remove the folder and its results."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def each(
-        self, step: TwinStep, run: Map, function: Callable[[Any], Any], items: Sequence[Any]
+        self, step: TwinStep, run: MapFunction, function: Callable[[Any], Any], items: Sequence[Any]
     ) -> Iterator[tuple[Any, ...]]:
-        """Yield what a function returns for each item: of earlier calls, or called by `run`.
+        """Yield the results of a step for each item.
 
-        The function returns a record, or None, for each of the step's kinds.
+        Items without a stored result are processed by `run`, which has the signature of `map`. The
+        function returns a record or None for each type of the step.
         """
         done = [self._file(step, index).exists() for index in range(len(items))]
         results = iter(
@@ -86,13 +100,13 @@ class FinishedSteps:
             yield self.load(step, index)
 
     def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
-        """Return what a call returns: of an earlier call, or of this."""
+        """Return the results of a step that runs once, from the folder or by calling `call`."""
         if not self._file(step, 0).exists():
             self._save(step, 0, call())
         return self.load(step, 0)
 
     def load(self, step: TwinStep, index: int) -> tuple[Any, ...]:
-        """Return the records of a step for an item."""
+        """Load the results of a step for an item."""
         with np.load(self._file(step, index)) as arrays:
             return tuple(
                 _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
@@ -119,13 +133,12 @@ class FinishedSteps:
 
 
 def _record(kind: type, prefix: str, arrays: Any) -> Any:
-    """Return the record of a kind among arrays, or None."""
+    """Create a record from arrays, or return None if the record has none."""
     found = {name: arrays.get(prefix + name) for name in _names(kind)}
     return None if all(value is None for value in found.values()) else kind(**found)
 
 
 def _names(kind: type) -> list[str]:
-    """Return the names of the fields of a record."""
     if is_dataclass(kind):
         return [field.name for field in fields(kind)]
     names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
@@ -133,7 +146,7 @@ def _names(kind: type) -> list[str]:
 
 
 def _replace(file: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file whole, or not at all."""
+    """Write a file atomically."""
     part = file.with_name(f"{file.name}.part")
     write(part)
     Path(part).replace(file)

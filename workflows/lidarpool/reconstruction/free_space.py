@@ -1,8 +1,8 @@
-"""What stands: points through which rays of other sweeps pass are not part of the place.
+"""Detect points on moving objects, which are not part of the static scene.
 
-The rays of a sweep are a range image. A point of another sweep is in front of the surfaces that the
-image has around its direction, or among them, or behind them. In front: a ray of the image passed
-where the point was, so the point was on something that moved.
+The rays of a sweep form a range image. A point of another sweep is in front of, among, or behind
+the surfaces in the image around its direction. If the point is in front of them, a ray passed
+through its position, so the point was on an object that moved.
 """
 
 from __future__ import annotations
@@ -17,33 +17,36 @@ from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from ..clouds.rings import elevations
 from .alignment import AlignedSweeps
 
-_COLUMNS = 1024  # of an image: wider than the step of azimuth of nearly all sensors
-_ROW_RAD = np.radians(0.5)  # of an image of a sensor without rings
-_MARGIN_RAD = 0.003  # above the highest and below the lowest ring: divergence of a beam
-# Distance of a point in front of the surfaces around its direction: at least, and for each meter.
+_COLUMNS = 1024  # number of image columns, more than the pulses per ring of nearly all sensors
+_ROW_RAD = np.radians(0.5)  # height of an image row for a sensor without rings
+_MARGIN_RAD = 0.003  # margin beyond the highest and lowest rings, for the beam divergence
+# Tolerance for points in front of a surface, as a constant and relative to the range.
 _TOLERANCE_M = 0.2
 _TOLERANCE_PER_M = 0.01
-# Sweeps before and after a sweep that are asked, in numbers of sweeps.
+# Offsets of the earlier and later sweeps that a sweep is compared with, in sweeps.
 _OFFSETS = (1, 2, 3, 5, 8, 13, 21, 34)
-_MIN_PASSING = 2  # as many passing rays as confirming ones are enough from here on
+_MIN_PASSING = 2  # From this number of passing rays, a tie counts as motion.
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """Nearest and farthest surfaces of a sweep around each direction.
+    """Ranges of the nearest and farthest surfaces of a sweep around each direction.
 
-    A direction's surroundings are three rows and three columns: the beams are wide, and a point
-    beside an edge is neither in front nor behind.
+    The neighborhood of a direction is three rows by three columns. Beams are wide, so a point next
+    to an edge is neither in front of nor behind it.
     """
 
-    edges_rad: Floats  # (r - 1,): negated elevations between the rows, ascending
-    limits_rad: tuple[float, float]  # lowest and highest elevation of its rays
-    nearest_m: Floats32  # (r, c): inf without a return
-    farthest_m: Floats32  # (r, c): -inf without a return
+    edges_rad: Floats  # (r - 1,), negated elevations of the boundaries between rows, ascending
+    limits_rad: tuple[float, float]  # lowest and highest elevation of the rays
+    nearest_m: Floats32  # (r, c), inf without a return
+    farthest_m: Floats32  # (r, c), -inf without a return
 
     @classmethod
-    def of_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
-        """Make the image of points (n, 3) in the sensor frame, with rows (r,), highest first."""
+    def from_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
+        """Create an image of points in the sensor frame.
+
+        The points have shape (n, 3). The row elevations have shape (r,), highest first.
+        """
         from scipy.ndimage import maximum_filter, minimum_filter
 
         edges_rad = -(row_elevation_rad[1:] + row_elevation_rad[:-1]) / 2
@@ -63,31 +66,36 @@ class RangeImage:
             maximum_filter(farthest, 3, mode=modes),
         )
 
-    def judge(self, points: Floats) -> tuple[Bools, Bools]:
-        """Return which points (n, 3) in the sensor frame rays pass, and which they confirm."""
+    def classify(self, points: Floats) -> tuple[Bools, Bools]:
+        """Compare points in the sensor frame with the image.
+
+        Return two masks of shape (n,). The first marks points that a ray passed through, and the
+        second marks points that the image confirms.
+        """
         elevation = elevations(points)
         cells = _cells(points, self.edges_rad)
         range_m = np.linalg.norm(points, axis=1)
         tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * range_m
         nearest = self.nearest_m[cells]
         low, high = self.limits_rad
-        seen = np.isfinite(nearest) & (elevation > low) & (elevation < high)
-        passing = seen & (nearest > range_m + tolerance_m)
+        observed = np.isfinite(nearest) & (elevation > low) & (elevation < high)
+        passing = observed & (nearest > range_m + tolerance_m)
         behind = self.farthest_m[cells] < range_m - tolerance_m
-        return passing, seen & ~passing & ~behind
+        return passing, observed & ~passing & ~behind
 
 
 def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
-    """Return the rows and columns (n,) of points (n, 3) in an image."""
+    """Return the image rows and columns of points."""
     turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     rows = np.searchsorted(edges_rad, -elevations(points))
     return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
 
 
-def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
-    """Return a mask of the points of each sweep that stand: {number: (n,)}.
+def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
+    """Return a mask of the stationary points of each sweep, by sweep number.
 
-    `numbers` name the sweeps that are compared with each other, ascending.
+    `numbers` are the sweeps to compare with each other, in ascending order. The masks have shape
+    (n,).
     """
     row_elevation_rad = sweeps.recorded.elevation_rad
     if not len(row_elevation_rad):
@@ -95,7 +103,7 @@ def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, 
         high = float(elevation.max())
         row_elevation_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
     images = {
-        number: RangeImage.of_points(sweeps.read(number).points, row_elevation_rad)
+        number: RangeImage.from_points(sweeps.read(number).points, row_elevation_rad)
         for number in numbers
     }
     masks = {}
@@ -108,7 +116,7 @@ def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, 
                 continue
             other = numbers[index + offset]
             pose = sweeps.alignment.poses[other]
-            passed, confirmed = images[other].judge((world - pose[:3, 3]) @ pose[:3, :3])
+            passed, confirmed = images[other].classify((world - pose[:3, 3]) @ pose[:3, :3])
             passing += passed
             confirming += confirmed
         moved = (passing > confirming) | ((passing >= _MIN_PASSING) & (passing >= confirming))

@@ -1,8 +1,8 @@
-"""Figures of a twin: sweeps that were held out, beside what a scan of the twin gives.
+"""Accuracy statistics of a reconstruction, from sweeps that were held out.
 
-The rays of a held-out sweep are cast at the place that the other sweeps made. So a figure tells how
-a sensor would see the place, and not how well the place repeats what it was made of. The poses of
-held-out sweeps are registered to the others' map, which hides a part of the errors of poses.
+The rays of a held-out sweep are cast in the map that was built from the other sweeps. The
+statistics therefore measure how well a sensor can be simulated, not how well the map fits its own
+data. Held-out sweeps are registered to the map, which hides part of the pose errors.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .alignment import AlignedSweep, AlignedSweeps
 from .reflectances import Reflectances
-from .surface_map import Place
+from .surface_map import SurfaceMap
 
-_RANGE_MARGIN_M = 0.5  # beyond the largest recorded range
-_RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
+_RANGE_MARGIN_M = 0.5  # margin beyond the maximum recorded range
+_RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # boundaries of the range classes
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Rays of held-out sweeps, and what they meet in the twin, as arrays of n rays.
+class HeldOutRays:
+    """Rays of held-out sweeps, recorded and simulated, as arrays of n rays.
 
     Attributes
     ----------
     sweep, ring
-        Number of the sweep, and row of the ring, of each ray.
+        Sweep number and ring index of each ray.
     range_m
-        As recorded, meters; NaN of a lost pulse.
+        Recorded range in meters, NaN for a lost pulse.
     simulated_m
-        Range in the twin, meters; NaN where the twin has nothing.
+        Simulated range in meters, NaN if the ray hits nothing.
     intensity, simulated_intensity
-        As recorded, and in the twin; NaN if unknown.
+        Recorded and simulated intensity, NaN if unknown.
     standing
-        Whether the recorded point stands, by all sweeps; False for lost pulses.
+        Whether the recorded point is stationary according to all sweeps. False for lost pulses.
     """
 
     sweep: Ints
@@ -51,8 +51,8 @@ class HeldOut:
     standing: Bools
 
     @classmethod
-    def joined(cls, parts: Sequence[HeldOut]) -> HeldOut:
-        """Join rays."""
+    def concatenate(cls, parts: Sequence[HeldOutRays]) -> HeldOutRays:
+        """Concatenate rays."""
         return cls(
             *(
                 np.concatenate([getattr(part, column.name) for part in parts])
@@ -62,15 +62,15 @@ class HeldOut:
 
     @property
     def returned(self) -> Bools:
-        """Mask (n,) of the rays that returned in the recording."""
+        """Mask of shape (n,) of the rays that have a recorded return."""
         return np.isfinite(self.range_m)
 
-    def select(self, rays: Bools) -> HeldOut:
-        """Return selected rays."""
-        return HeldOut(*(getattr(self, column.name)[rays] for column in fields(self)))
+    def select(self, rays: Bools) -> HeldOutRays:
+        """Select rays by a mask."""
+        return HeldOutRays(*(getattr(self, column.name)[rays] for column in fields(self)))
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of all rays, of those whose points stand, and by class of range."""
+        """Return statistics of all rays, of stationary points, by range class, and by sweep."""
         classes = [
             {"from_m": low, "to_m": None if np.isinf(high) else high}
             | self._figures((self.range_m >= low) & (self.range_m < high))
@@ -91,22 +91,23 @@ class HeldOut:
         }
 
     def _points(self, low_m: float, high_m: float) -> float | None:
-        """Return the number of points at some ranges in the twin, over the recorded number."""
+        """Return the ratio of simulated to recorded points within a range interval."""
         recorded = ((self.range_m >= low_m) & (self.range_m < high_m)).sum()
         simulated = ((self.simulated_m >= low_m) & (self.simulated_m < high_m)).sum()
         return float(simulated / recorded) if recorded else None
 
     def _points_by_ring(self) -> float:
-        """Return the median, over rings, of how far the share of points is from 1."""
+        """Return the median deviation from 1 of the simulated-to-recorded point ratios of rings."""
         recorded = np.bincount(self.ring, self.returned)
         simulated = np.bincount(self.ring, np.isfinite(self.simulated_m))
         known = recorded > 0
         return float(np.median(np.abs(simulated[known] / recorded[known] - 1)))
 
     def _no_return(self) -> dict[str, Any] | None:
-        """Return the shares of rays without a return, and their F1; None if no pulse is lost.
+        """Compare recorded and simulated rays without a return.
 
-        F1 is the harmonic mean of precision and recall of "no return".
+        F1 is the harmonic mean of precision and recall of missing returns. Return None if no pulse
+        was lost in the recording.
         """
         recorded = ~self.returned
         if not recorded.any():
@@ -119,7 +120,7 @@ class HeldOut:
         }
 
     def _figures(self, rays: Bools) -> dict[str, Any]:
-        """Return figures of selected rays that returned."""
+        """Return statistics of selected rays that have a recorded return."""
         difference_m = self.simulated_m[rays] - self.range_m[rays]
         met = np.isfinite(difference_m)
         size_m = np.abs(difference_m[met])
@@ -145,60 +146,69 @@ class HeldOut:
         return figures
 
 
-def hold_out(
+def simulate_held_out(
     sweeps: AlignedSweeps,
-    place: Place,
+    surface_map: SurfaceMap,
     reflectances: Reflectances | None,
-    standing: Mapping[int, Bools],
+    stationary: Mapping[int, Bools],
     numbers: Sequence[int],
-) -> HeldOut:
-    """Cast the rays of held-out sweeps at a place that other sweeps made.
+) -> HeldOutRays:
+    """Simulate held-out sweeps on a map that was built from other sweeps.
 
     Parameters
     ----------
     sweeps
-        The sweeps.
-    place, reflectances
-        The place, and its reflectances; None without intensities.
-    standing
-        Which points of the held-out sweeps stand, by all sweeps: {number: (n,)}.
+        All sweeps.
+    surface_map, reflectances
+        The map and its reflectances. The reflectances are None without intensities.
+    stationary
+        Masks of the stationary points of the held-out sweeps, by sweep number.
     numbers
         Numbers of the held-out sweeps.
+
+    Returns
+    -------
+    HeldOutRays
+        The rays of the held-out sweeps, including lost pulses.
     """
     parts = []
     for number in numbers:
         sweep, lost = sweeps.read_with_lost(number)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
-        parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
-        parts.append(_rays(place, None, lost, number, no_ranges, no_points))
-    rays = HeldOut.joined(parts)
-    # What was seen from nearer is out of reach here.
-    in_reach = rays.simulated_m <= sweeps.answering.max_range_m + _RANGE_MARGIN_M
+        parts.append(
+            _rays(surface_map, reflectances, sweep, number, sweep.range_m, stationary[number])
+        )
+        parts.append(_rays(surface_map, None, lost, number, no_ranges, no_points))
+    rays = HeldOutRays.concatenate(parts)
+    # Surfaces that were only observed at closer range are beyond the range of the sensor.
+    in_reach = rays.simulated_m <= sweeps.coverage.max_range_m + _RANGE_MARGIN_M
     return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan))
 
 
 def _rays(
-    place: Place,
+    surface_map: SurfaceMap,
     reflectances: Reflectances | None,
     sweep: AlignedSweep,
     number: int,
     range_m: Floats,
-    standing: Bools,
-) -> HeldOut:
-    """Cast the rays of a sweep, with recorded ranges (n,), at a place."""
-    seen = place.see(sweep)
+    stationary: Bools,
+) -> HeldOutRays:
+    """Cast the rays of a sweep, and combine them with the recorded ranges."""
+    hits = surface_map.cast(sweep)
     simulated_m = np.full(len(sweep.points), np.nan)
-    simulated_m[seen.rays] = np.where(place.surfels.dark[seen.surfel], np.nan, seen.distance_m)
+    simulated_m[hits.rays] = np.where(
+        surface_map.surfels.dark[hits.surfel], np.nan, hits.distance_m
+    )
     unknown = np.full(len(sweep.points), np.nan)
-    return HeldOut(
+    return HeldOutRays(
         sweep=np.full(len(sweep.points), number),
         ring=sweep.ring,
         range_m=range_m,
         simulated_m=simulated_m,
         intensity=unknown if sweep.intensities is None else sweep.intensities,
         simulated_intensity=(
-            unknown if reflectances is None else reflectances.intensities(sweep, seen)
+            unknown if reflectances is None else reflectances.intensities(sweep, hits)
         ),
-        standing=standing,
+        standing=stationary,
     )

@@ -1,7 +1,8 @@
-"""Labels of a recording: class and object of each point, carried to surfels as one number.
+"""Labels that transfer the class and object of each point to the surfels.
 
-A label has the class in its lower 16 bits and the object's number + 1 above, as in SemanticKITTI.
-So the most frequent label of the points of a surfel is of an object that has this class.
+As in SemanticKITTI, the lower 16 bits of a label are the class. The upper bits are the object
+number plus 1. Class and object are combined in one number, so the most frequent label of the points
+of a surfel always has a consistent class and object.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..scenario.point_scene import CLASS_MATERIAL, surfel_faces
 
-OBJECT_NAME = "object "  # and the number in the recording
+OBJECT_NAME = "object "  # followed by the object number in the recording
 _CLASS_BITS = 16
 _MAX_CLASS = (1 << _CLASS_BITS) - 1
 
 
 def labels_of(sweep: Sweep) -> Ints | None:
-    """Return the labels (n,) of the points of a sweep, or None without classes and objects."""
+    """Return the labels of the points of a sweep, or None without classes and objects."""
     classes, objects = sweep.classes, sweep.objects
     known = objects if classes is None else classes
     if known is None:
@@ -37,11 +38,11 @@ def labels_of(sweep: Sweep) -> Ints | None:
     return label
 
 
-def divided(mesh: SceneMesh) -> list[SceneMesh]:
-    """Divide surfels by the objects of their labels, and name their materials by classes.
+def split_by_object(mesh: SceneMesh) -> list[SceneMesh]:
+    """Split a mesh of surfels by object, and name the materials by class.
 
-    Objects are in the order of their numbers. Surfels of no object keep the name of the mesh, and
-    are last. A class 0, of none, has no material.
+    Objects are in ascending order of their numbers. Surfels without an object are last, and keep
+    the name of the mesh. Class 0 means that there is no class, so it has no material.
     """
     if mesh.materials is None:
         return [mesh]
@@ -60,7 +61,7 @@ def divided(mesh: SceneMesh) -> list[SceneMesh]:
 
 
 def _part(mesh: SceneMesh, name: str, faces: Ints, classes: Ints) -> SceneMesh:
-    """Return surfels, by their faces (f,), as a mesh with materials by classes (f,)."""
+    """Return the surfels of some faces as a mesh with materials by class."""
     corners = mesh.vertices.reshape(-1, 4, 3)[faces[::2] // 2]
     present, rows = np.unique(classes, return_inverse=True)
     names = tuple(f"{CLASS_MATERIAL}{number}" if number else "" for number in present.tolist())

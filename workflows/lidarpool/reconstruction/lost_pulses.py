@@ -1,9 +1,9 @@
-"""Pulses of a sweep that returned nothing: the steps of a ring at which no return is.
+"""Find pulses without a return, from gaps between the returns of a ring.
 
-A ring fires at even steps of azimuth, so a gap of several steps between two returns holds lost
-pulses. Two gaps are none. Dropped packets leave gaps in all rings at once. And where points are
-compensated for the motion within their sweep, near and far surfaces are moved apart: a sensor that
-moves by d meters sees them turn by up to d/r.
+A ring fires at even azimuth steps, so a gap of several steps between two returns contains lost
+pulses. There are two exceptions. Dropped packets leave gaps in all rings at once. In
+motion-compensated sweeps, parallax separates near and far surfaces. If the sensor moves by d
+meters, the direction to a surface at range r changes by up to d/r.
 """
 
 from __future__ import annotations
@@ -19,48 +19,50 @@ from lidarsim.numerics.even_samples import even_indices
 from ..clouds.rings import elevations
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
-_MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
-_MAX_STEPS = 3.0  # of a ring's own step, over the typical step
-_MIN_STEP_RAD = np.radians(0.02)  # closer returns are of one pulse
-_MIN_RETURNS = 8  # of a ring whose steps are known
-_MAX_GAP_M = 5.0  # wide, of lost pulses on a surface that returns nothing: a side of a car
-# Step of range between the ends of such a gap: at most, and for each meter of range.
+_MIN_STEPS = 1.6  # minimum gap in steps, since motion within a sweep stretches steps
+_MAX_STEPS = 3.0  # maximum step of a ring relative to the typical step
+_MIN_STEP_RAD = np.radians(0.02)  # Closer returns belong to the same pulse.
+_MIN_RETURNS = 8  # minimum number of returns to determine the step of a ring
+_MAX_GAP_M = 5.0  # maximum width of a gap on a surface without returns, such as the side of a car
+# Maximum range difference across such a gap, as a constant and per meter of range.
 _MAX_STEP_M = 0.5
 _MAX_STEP_PER_M = 0.2
-_COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
-_ANSWERING_SWEEPS = 100  # that show these cells
-_LOW_RAD = np.radians(-3)  # elevation of rings that see the ground
-_MIN_ANSWERING = 0.1  # share of the sweeps in which a cell of such a ring has a return
-_SECTORS = 360  # of azimuth, in which all rings may be empty
-_MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no packet came
+_COLUMNS = 720  # azimuth cells per ring, which may be hidden from the sensor
+_COVERAGE_SWEEPS = 100  # sweeps that determine the coverage
+_LOW_RAD = np.radians(-3)  # Rings below this elevation observe the ground.
+_MIN_RETURN_SHARE = 0.1  # minimum share of sweeps with a return in a cell of such a ring
+_SECTORS = 360  # azimuth sectors, in which all rings may be empty
+_MIN_RINGS = 0.05  # minimum share of rings with returns in a sector that received packets
 
 
 def lost_pulses(
-    sweep: Sweep, elevation_rad: Floats, answering: Answering, moved_m: float
+    sweep: Sweep, elevation_rad: Floats, coverage: SensorCoverage, moved_m: float
 ) -> tuple[Sweep, Floats]:
-    """Return the lost pulses of a sweep, as points a meter away, and the ranges around their gaps.
+    """Find the lost pulses of a sweep.
 
     Parameters
     ----------
     sweep
         The returns.
     elevation_rad
-        (r,): of the rings, radians; empty for a sensor without rings, whose lost pulses are
-        unknown.
-    answering
-        Where the sensor has returns at all.
+        Elevations of the rings in radians, of shape (r,). Empty for a sensor without rings, whose
+        lost pulses are unknown.
+    coverage
+        Directions in which the sensor can have returns.
     moved_m
-        How far the sensor moved during the sweep, if points are compensated; else 0.
+        Distance in meters that the sensor moved during the sweep if the points are
+        motion-compensated, otherwise 0.
 
     Returns
     -------
     tuple
-        The k pulses, without intensities, and the ranges (k,) that surfaces have there which end
-        where the gap does, meters; NaN of a wide gap, or between different surfaces.
+        The k lost pulses as points at a range of one meter, without intensities, and the ranges of
+        the surfaces at their gaps. The ranges have shape (k,) and are in meters. They are NaN if
+        the gap is wide or lies between different surfaces.
     """
     if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
         return sweep.select(slice(0)), np.empty(0)
-    gaps = _Gaps.of_sweep(sweep)
+    gaps = _Gaps.from_sweep(sweep)
     lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
     circle = np.arange(-np.pi, np.pi, np.median(gaps.step_rad))
@@ -79,12 +81,12 @@ def lost_pulses(
         columns["start_rad"] = ring_starts(sweep, len(elevation_rad))[ring]
     pulses = Sweep(directions, columns)
     received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    chosen = received & answering.cells[_cells(pulses)]
+    chosen = received & coverage.cells[_cells(pulses)]
     return pulses.select(chosen), range_m[chosen]
 
 
 def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
-    """Return the times (k,) of pulses of azimuths (k,): of the returns nearest in azimuth."""
+    """Return the times of pulses, which are taken from the returns with the closest azimuths."""
     azimuths = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
     order = np.argsort(azimuths)
     turned = (azimuth + np.pi) % (2 * np.pi) - np.pi
@@ -93,12 +95,15 @@ def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
 
 
 def firings_per_turn(sweep: Sweep) -> int:
-    """Return the number of steps of a revolution, by the typical step between returns of a ring."""
-    return round(2 * np.pi / float(np.median(_Gaps.of_sweep(sweep).step_rad)))
+    """Return the number of firings per revolution, based on the typical azimuth step."""
+    return round(2 * np.pi / float(np.median(_Gaps.from_sweep(sweep).step_rad)))
 
 
 class _Lost(NamedTuple):
-    """Lost pulses (k,): azimuths and elevations, radians, rings, and ranges around their gaps."""
+    """Lost pulses, as arrays of k pulses.
+
+    Angles are in radians. `range_m` has the ranges of surfaces at the gaps in meters.
+    """
 
     azimuth: Floats
     elevation: Floats
@@ -107,19 +112,18 @@ class _Lost(NamedTuple):
 
 
 class _Gaps(NamedTuple):
-    """Returns of a sweep, ring by ring with ascending azimuths, and the gaps between them."""
+    """Returns of a sweep, sorted by ring and azimuth, and the gaps between them."""
 
-    azimuth: Floats  # (n,): radians
-    elevation: Floats  # (n,): radians
-    range_m: Floats  # (n,)
+    azimuth: Floats  # (n,), radians
+    elevation: Floats  # (n,), radians
+    range_m: Floats  # (n,), meters
     ring: Ints  # (n,)
-    following: Ints  # (n,): next return of the ring; the first follows the last
-    gap_rad: Floats  # (n,): to the next return of the ring
-    step_rad: Floats  # (n,): between the azimuths of neighboring pulses of the ring
+    following: Ints  # (n,), index of the next return in the ring, where the first follows the last
+    gap_rad: Floats  # (n,), azimuth difference to the next return
+    step_rad: Floats  # (n,), azimuth step between consecutive pulses of the ring
 
     @classmethod
-    def of_sweep(cls, sweep: Sweep) -> _Gaps:
-        """Sort the returns of a sweep."""
+    def from_sweep(cls, sweep: Sweep) -> _Gaps:
         azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
         order = np.lexsort((azimuth, sweep.columns["row"]))
         azimuth = azimuth[order]
@@ -131,7 +135,8 @@ class _Gaps(NamedTuple):
         following[lasts] = starts
         gap_rad = azimuth[following] - azimuth
         gap_rad[lasts] += 2 * np.pi
-        # Rings of some sensors fire half as often as others. A ring with few returns tells nothing.
+        # In some sensors, certain rings fire at half the rate of the others. A ring with few
+        # returns is uninformative.
         parts = np.split(gap_rad, starts[1:])
         steps_rad = np.array([_step_rad(part) for part in parts])
         typical_rad = float(np.median(steps_rad[counts >= counts.max() / 2]))
@@ -142,7 +147,7 @@ class _Gaps(NamedTuple):
         return cls(azimuth, elevation, range_m, ring, following, gap_rad, step_rad)
 
     def between(self, moved_m: float) -> _Lost:
-        """Return the pulses at the steps within gaps."""
+        """Return the lost pulses within the gaps."""
         parallax_rad = moved_m * np.abs(1 / self.range_m - 1 / self.range_m[self.following])
         steps = np.rint(self.gap_rad / self.step_rad).astype(np.int64)
         is_gap = self.gap_rad > _MIN_STEPS * self.step_rad + parallax_rad
@@ -156,9 +161,9 @@ class _Gaps(NamedTuple):
         return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, share))
 
     def _ranges(self, before: Ints, share: Floats) -> Floats:
-        """Return the ranges (k,) at shares of gaps that begin at returns (k,).
+        """Interpolate the ranges at fractions of gaps, which begin at the returns `before`.
 
-        NaN where the gap is wide, or its ends are of different surfaces.
+        The ranges are NaN if the gap is wide or its ends lie on different surfaces.
         """
         from_m = self.range_m[before]
         to_m = self.range_m[self.following[before]]
@@ -170,34 +175,39 @@ class _Gaps(NamedTuple):
 
 
 def _step_rad(gap_rad: Floats) -> float:
-    """Return the median of the gaps (k,) of a ring that are between pulses, not within one."""
+    """Return the median gap between the pulses of a ring, ignoring gaps within a pulse."""
     return float(np.median(gap_rad[gap_rad > _MIN_STEP_RAD]))
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:
-    """Return in which sectors packets came: some rings have returns there."""
+    """Mark the sectors in which enough rings have returns, so that packets were received."""
     cells = np.unique(_sectors(gaps.azimuth) * ring_count + gaps.ring)
     rings = np.bincount(cells // ring_count, minlength=_SECTORS)
     return np.asarray(rings >= max(_MIN_RINGS * ring_count, 1))
 
 
 def _sectors(azimuth: Floats) -> Ints:
-    """Return the sectors of azimuths, radians."""
     return np.asarray(np.floor(azimuth / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS)
 
 
-class Answering(NamedTuple):
-    """Where a sensor has returns at all."""
+class SensorCoverage(NamedTuple):
+    """Directions in which a sensor can have returns."""
 
-    cells: Bools  # (r, c): rings and columns; in the others the carrier hides all
-    max_range_m: float  # of a return
+    cells: Bools  # (r, c), rings and azimuth cells that the vehicle does not block
+    max_range_m: float  # maximum range of a return, meters
 
     @classmethod
-    def of_sweeps(cls, sweeps: RecordedSweeps) -> Answering:
-        """Look where any sweep has a return; LidarError if the recording cannot be read."""
+    def from_sweeps(cls, sweeps: RecordedSweeps) -> SensorCoverage:
+        """Determine the directions in which sweeps have returns.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
         returned = np.zeros((sweeps.ring_count, _COLUMNS), np.int64)
         max_range_m = 0.0
-        numbers = even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist()
+        numbers = even_indices(sweeps.count, _COVERAGE_SWEEPS).tolist()
         for number in numbers:
             sweep = sweeps.read(number)
             cells = np.zeros_like(returned, bool)
@@ -205,14 +215,14 @@ class Answering(NamedTuple):
             returned += cells
             if len(sweep):
                 max_range_m = max(max_range_m, float(np.linalg.norm(sweep.points, axis=1).max()))
-        # Below the horizon is the ground, unless the carrier hides it in most sweeps.
+        # Rings below the horizon observe the ground in most sweeps, unless the vehicle blocks them.
         is_low = np.zeros(sweeps.ring_count, bool)
         is_low[: len(sweeps.elevation_rad)] = sweeps.elevation_rad < _LOW_RAD
-        least = np.where(is_low, _MIN_ANSWERING * len(numbers), 0)
+        least = np.where(is_low, _MIN_RETURN_SHARE * len(numbers), 0)
         return cls(returned > least[:, None], max_range_m)
 
 
 def _cells(sweep: Sweep) -> tuple[Ints, Ints]:
-    """Return the rings and columns (n,) of the rays of a sweep."""
+    """Return the rings and azimuth cells of the rays of a sweep."""
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
     return sweep.columns["row"], (turns * _COLUMNS).astype(np.int64) % _COLUMNS

@@ -1,9 +1,10 @@
-"""Motion of the sensor within a sweep: what the points of a recording need to be compensated by.
+"""Motion of the sensor within a sweep, which the points are compensated for.
 
-Points are stored as they were fired, each in the sensor frame of its own time, or compensated: all
-in the sensor frame of the start of the sweep. Files do not say which. As fired, a point has a share
-of the motion from its sweep to the next, or from the sweep before: by its time relative to the
-stamp of the sweep or, without times, by its azimuth. The pose of a sweep holds at its stamp.
+Recordings store points either as fired, in the sensor frame at the time of each firing, or
+motion-compensated, in the sensor frame at the start of the sweep. Files do not state which. The
+compensation of a point as fired is a fraction of the motion to the next or from the previous sweep.
+The fraction follows from the time of the point relative to the timestamp of the sweep or, without
+point times, from its azimuth. The pose of a sweep is valid at its timestamp.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ class Motion(StrEnum):
 
     @property
     def is_turning(self) -> bool:
-        """Whether points are compensated by their azimuths."""
+        """Whether firing times are derived from azimuths."""
         return self in (Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE)
 
     def times_s(self, sweep: Sweep, sweep_s: float) -> Floats | None:
-        """Return the times of points (n,) relative to the stamp of their sweep.
+        """Return the times of points in seconds relative to the timestamp of their sweep.
 
-        `sweep_s` is the duration of a sweep. Returns None if points are compensated.
+        `sweep_s` is the duration of a sweep. Return None if the points are motion-compensated.
         """
         if self is Motion.TIMED:
             return sweep.columns.get("time_s")
@@ -42,19 +43,19 @@ class Motion(StrEnum):
         azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
         turn: Floats = ((azimuth - sweep.columns["start_rad"]) / (2 * np.pi)) % 1
         if self is Motion.CLOCKWISE:
-            turn = -turn % 1  # the first points are at 0, and not at 1
+            turn = -turn % 1  # The first points are at 0, not at 1.
         return turn * sweep_s
 
 
 class MotionStep(NamedTuple):
-    """Motion of the sensor from the stamp of a sweep to that of another, in the sensor frame."""
+    """Motion of the sensor between the timestamps of two sweeps, in the first sensor frame."""
 
-    rotation: Floats  # (3,): rotation vector, radians
-    translation: Floats  # (3,): meters
+    rotation: Floats  # (3,), rotation vector, radians
+    translation: Floats  # (3,), meters
 
     @classmethod
     def between(cls, pose: Floats, following: Floats) -> MotionStep:
-        """Return the step from a pose (4, 4) to another."""
+        """Return the motion between two poses of shape (4, 4)."""
         from scipy.spatial.transform import Rotation
 
         turned = pose[:3, :3].T @ following[:3, :3]
@@ -63,8 +64,8 @@ class MotionStep(NamedTuple):
             pose[:3, :3].T @ (following[:3, 3] - pose[:3, 3]),
         )
 
-    def part(self, share: float) -> Floats:
-        """Return the motion (4, 4) of a share of the step."""
+    def fraction(self, share: float) -> Floats:
+        """Return a fraction of the motion as a transformation of shape (4, 4)."""
         from scipy.spatial.transform import Rotation
 
         moved = np.eye(4)
@@ -72,8 +73,12 @@ class MotionStep(NamedTuple):
         moved[:3, 3] = share * self.translation
         return moved
 
-    def compensated(self, points: Floats, shares: Floats) -> Floats:
-        """Return points (n, 3), fired at shares (n,) of the step, in its first frame."""
+    def compensate(self, points: Floats, shares: Floats) -> Floats:
+        """Transform points into the first frame of the step.
+
+        The points have shape (n, 3) and were fired at the given fractions of the step, of shape
+        (n,).
+        """
         from scipy.spatial.transform import Rotation
 
         turned = Rotation.from_rotvec(shares[:, None] * self.rotation).apply(points)

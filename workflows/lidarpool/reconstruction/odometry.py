@@ -1,4 +1,4 @@
-"""Poses of the sweeps of a recording: recorded, of a file, or by registration."""
+"""Poses of the sweeps of a recording: recorded, read from a file, or estimated by registration."""
 
 from __future__ import annotations
 
@@ -16,44 +16,48 @@ from lidarsim.words import plural
 from ..clouds.kitti import CALIBRATION_FILE, lidar_poses
 from .recorded_sweeps import RecordedSweeps
 
-_VOXELS_OF_REACH = 75  # voxels of the map in the range of the sensor
+_VOXELS_OF_REACH = 75  # range of the sensor in voxels of the map
 _MIN_VOXEL_M = 0.25
 _MAX_VOXEL_M = 1.0
-_POINTS_OF_VOXEL = 4  # points that are registered in the length of a voxel
-_MAX_DISTANCE_M = 1.0  # of a point from its voxel's plane
-_MAP_SWEEPS = 100  # since a voxel was last met, after which the map forgets it
-_MIN_POINTS = 100  # of a sweep that is registered; with fewer the motion goes on
-_FIRST_SWEEPS = 4  # that tell the reach of the sensor
-_MAX_LOCAL_M = 10_000.0  # coordinates of a place that single precision holds
-_MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
-_MAX_ROUNDING_S = 1e-3  # by which stamps may lie outside a trajectory
-_MIN_CAMERA_M = 1.0  # motion that shows the axes of poses
-_CAMERA_SHARE = 0.9  # of the motion along z, which is forward for a camera and upward for a lidar
-DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
+_POINTS_OF_VOXEL = 4  # registered points per voxel edge
+_MAX_DISTANCE_M = 1.0  # maximum distance between a point and the plane of its voxel
+_MAP_SWEEPS = 100  # sweeps after which unobserved voxels are removed from the map
+_MIN_POINTS = 100  # A sweep with fewer points is not registered. Its motion is extrapolated.
+_FIRST_SWEEPS = 4  # sweeps that determine the range of the sensor
+_MAX_LOCAL_M = 10_000.0  # maximum coordinate that single precision can represent accurately enough
+_MAX_STEP_M = 5.0  # maximum distance between sweeps, which is 180 km/h at 10 Hz
+_MAX_ROUNDING_S = 1e-3  # maximum time by which timestamps may lie outside a trajectory
+_MIN_CAMERA_M = 1.0  # minimum distance to detect the axes of poses
+# minimum share of motion along z, which is forward for a camera and upward for a lidar
+_CAMERA_SHARE = 0.9
+DEFAULT_PERIOD_S = 0.1  # for recordings without times, since most lidars rotate at 10 Hz
 
 
 class RecordedPoses(NamedTuple):
     """Poses of the sweeps of a recording."""
 
-    matrices: Floats  # (s, 4, 4): from the sensor frame to the frame of the place, meters
-    times_s: Floats  # (s,): ascending, from 0
-    source: str  # a clause, such as "of the recording"
-    origin: Floats  # (3,): of the frame of the place in the world, whole meters
-    share: float = 0.0  # of the motion of a sweep as fired, at which its pose holds
-    first_s: float = 0.0  # from the stamp of a sweep to its first point, of poses with a share
+    matrices: Floats  # (s, 4, 4), from the sensor frame to the scene frame, meters
+    times_s: Floats  # (s,), ascending from 0
+    source: str  # a phrase such as "from the recording"
+    origin: Floats  # (3,), origin of the scene frame in the world frame, whole meters
+    share: float = 0.0  # fraction of the motion within a sweep as fired at which its pose is valid
+    first_s: float = 0.0  # time from the timestamp to the first point, if the share is not 0
 
     @property
     def are_given(self) -> bool:
-        """Whether the poses are not found by registration of the points."""
+        """Whether the poses come from the recording or a file, not from registration."""
         return not self.share
 
-    def part(self, window: slice) -> RecordedPoses:
-        """Return the poses of some consecutive sweeps."""
+    def select(self, window: slice) -> RecordedPoses:
+        """Select the poses of consecutive sweeps."""
         return self._replace(matrices=self.matrices[window], times_s=self.times_s[window])
 
     @classmethod
     def in_world(cls, matrices: Floats, times_s: Floats, source: str) -> RecordedPoses:
-        """Make poses (s, 4, 4) in the world local, if they are far from zero."""
+        """Create poses from matrices in world coordinates.
+
+        Large coordinates are reduced by a local origin. `matrices` has shape (s, 4, 4).
+        """
         first = matrices[0, :3, 3]
         origin = np.rint(first) if np.abs(first).max() > _MAX_LOCAL_M else np.zeros(3)
         local = matrices.copy()
@@ -69,22 +73,22 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     sweeps
         The sweeps.
     trajectory
-        A file with poses of the sensor, with times or as rows of KITTI, one for each sweep. By
-        default the poses are the recording's, and without these VGICP (Koide et al., 2021)
-        registers each sweep to a map of the earlier sweeps.
+        File with sensor poses, either with times or as KITTI rows, one for each sweep. By default,
+        the poses of the recording are used. If it has none, VGICP (Koide et al., 2021) registers
+        each sweep to a map of the earlier sweeps.
 
     Raises
     ------
     LidarError
-        If the trajectory does not fit the sweeps, small_gicp is needed and not installed, or the
-        poses jump.
+        If the trajectory does not match the sweeps, small_gicp is required but not installed, or
+        the poses jump.
     """
     times_s = sweeps.stamps_s
     if times_s is None:
         period_s = DEFAULT_PERIOD_S if sweeps.point_times is None else sweeps.point_times.sweep_s
         times_s = period_s * np.arange(sweeps.count, dtype=np.float64)
     if trajectory is not None:
-        poses, times_s = _of_file(sweeps, trajectory, times_s)
+        poses, times_s = _read_poses(sweeps, trajectory, times_s)
         return RecordedPoses.in_world(poses, times_s, f"from {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
     if recorded is not None and not np.isfinite(recorded).all():
@@ -95,13 +99,15 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         )
     share = 0.0
     first_s = 0.0
-    # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
-    is_known = sweeps.recording.fired is not None  # of a result, which may stand
+    # In recordings with one file per sweep, many files state the same default pose, such as
+    # VIEWPOINT in PCD files.
+    # a lidarpool result, whose sensor may be stationary
+    is_known = sweeps.recording.fired is not None
     if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
         poses = recorded
         source = "from the recording"
     else:
-        poses = _registered(sweeps)
+        poses = _register_sweeps(sweeps)
         source = "from registration"
         share = 0.5
         first_s = 0.0 if sweeps.point_times is None else sweeps.point_times.first_s
@@ -117,15 +123,16 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     return located._replace(share=share, first_s=first_s)
 
 
-def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:
-    """Return the poses (s, 4, 4) of a file, and the times (s,) of the sweeps.
+def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:
+    """Read the poses of a file, and return them with the times of the sweeps.
 
-    A file without times has one pose for each sweep. Poses with times are looked up at the stamps
-    of the sweeps; if the recording has no stamps, there is one pose for each sweep.
+    A file without times must have one pose for each sweep. Poses with times are interpolated at the
+    timestamps of the sweeps. If the recording has no timestamps, there must be one pose for each
+    sweep.
     """
     rows = read_kitti_poses(trajectory)
     if rows is not None:
-        return _of_rows(sweeps, trajectory, rows), times_s
+        return _sensor_poses(sweeps, trajectory, rows), times_s
     track = load_trajectory(trajectory)
     name = sweeps.recording.name
     first_s, last_s = (float(track.times_s[k]) for k in (0, -1))
@@ -151,11 +158,11 @@ def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple
     return poses, times_s
 
 
-def _of_rows(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
-    """Return the poses (s, 4, 4) of the sensor, given KITTI's rows (k, 3, 4).
+def _sensor_poses(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
+    """Return the sensor poses, of shape (s, 4, 4), from KITTI rows of shape (k, 3, 4).
 
-    The rows are poses of a camera if the recording, or else the folder of the file, has KITTI's
-    calibration.
+    The rows are camera poses if the recording, or otherwise the folder of the file, contains a
+    KITTI calibration.
     """
     name = sweeps.recording.name
     if len(rows) != sweeps.count:
@@ -182,18 +189,19 @@ def _of_rows(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
     return poses
 
 
-def _registered(sweeps: RecordedSweeps) -> Floats:
-    """Register each sweep to a map of the earlier sweeps, in one thread: threads change results.
+def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
+    """Register each sweep to a map of the earlier sweeps.
 
-    Each voxel of the map and each point has a covariance, so that points move along planes freely.
-    Odometry from point to point finds hardly any motion on level ground, where the rings of all
-    sweeps are the same circles. Points are not compensated for the motion within sweeps: all sweeps
-    are distorted alike, and to compensate by a motion that is estimated so makes estimates swing.
+    Each voxel of the map and each point has a covariance, so points can slide along planes.
+    Point-to-point odometry finds hardly any motion on level ground, because the rings of all sweeps
+    form the same circles there. Points are not motion-compensated. All sweeps are distorted in the
+    same way, and compensation with an estimated motion makes the estimates oscillate. Registration
+    uses one thread, because multithreading changes the results.
     """
     need("small_gicp", "twin", "Registering sweeps without poses")
     import small_gicp
 
-    # The first sweeps may be empty, or parts of one.
+    # The first sweeps may be empty or incomplete.
     sizes = [np.linalg.norm(sweeps.read(number).points, axis=1) for number in range(_FIRST_SWEEPS)]
     reach_m = float(np.quantile(np.concatenate(sizes), 0.98)) if any(map(len, sizes)) else 0.0
     voxel_m = float(np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M))

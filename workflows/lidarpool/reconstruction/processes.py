@@ -1,4 +1,4 @@
-"""Processes that rebuild the stretches of a drive: of a cluster, of this machine, or this one."""
+"""Worker processes that reconstruct submaps, on a cluster or on this machine."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from poolpart.deploy import forked_workers
 from ..processes.fork_server import start_fork_server
 from ..run.cluster.connection import check_starts_workers
 from ..run.pipeline.stage_names import OTHER
-from .finished_steps import Map
+from .finished_steps import MapFunction
 
-_STRETCH_BYTES = 3 << 30  # that a process takes for a stretch, of a sensor with 64 rings
-# Dask would stop processes that take more than their share of the memory, and so would lose them.
+_SUBMAP_BYTES = 3 << 30  # memory per process for a submap of a sensor with 64 rings
+# Dask would terminate workers that exceed their share of the memory, and lose their tasks.
 _UNLIMITED = dict.fromkeys(
     (f"distributed.worker.memory.{limit}" for limit in ("target", "spill", "pause", "terminate")),
     False,
@@ -30,7 +30,7 @@ _UNLIMITED = dict.fromkeys(
 
 
 @contextmanager
-def mapping(client: Client | None, count: int) -> Iterator[Map]:
+def parallel_map(client: Client | None, count: int) -> Iterator[MapFunction]:
     """Yield a `map` function that runs in worker processes and keeps the order of the items.
 
     Parameters
@@ -46,7 +46,7 @@ def mapping(client: Client | None, count: int) -> Iterator[Map]:
     LidarError
         If this process cannot start worker processes.
     """
-    workers = min(count, CPU_COUNT, max(1, memory() // _STRETCH_BYTES))
+    workers = min(count, CPU_COUNT, max(1, memory() // _SUBMAP_BYTES))
     if client is not None:
         yield partial(_map, Partition(OTHER, client))
     elif workers == 1:

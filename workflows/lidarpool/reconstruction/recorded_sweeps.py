@@ -77,7 +77,13 @@ class RecordedSweeps:
     def open(
         cls, path: Path, sensor: str | None = None, intensity: str | None = None
     ) -> RecordedSweeps:
-        """Open a recording, or raise LidarError if it cannot be read."""
+        """Open a recording.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
         file = (path, sensor, intensity)
         return replace(cls.from_recording(_opened(file)), source=file)
 
@@ -85,7 +91,10 @@ class RecordedSweeps:
     def from_recording(cls, recording: Recording) -> RecordedSweeps:
         """Determine the rings and times of a recording.
 
-        Raises LidarError if the recording has no sweeps or no points.
+        Raises
+        ------
+        LidarError
+            If the recording has no sweeps or no points.
         """
         if recording.is_cloud or not len(recording):
             raise LidarError(
@@ -138,7 +147,7 @@ class RecordedSweeps:
         """Whether the points are known to be motion-compensated, as in results of lidarpool."""
         return self.recording.fired is not None
 
-    def keeping(self, numbers: Iterable[int]) -> RecordedSweeps:
+    def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
         """Return a copy that holds some sweeps in memory.
 
         `numbers` are in ascending order, because bags can only be read from their start.
@@ -148,10 +157,8 @@ class RecordedSweeps:
     def read(self, number: int) -> Sweep:
         """Read the returns of a sweep whose rings are known.
 
-        Raises LidarError if the recording cannot be read.
-
         The sweep has the following columns. All except `row` are omitted if they are unknown, and
-        `time_s` and `start_rad` are also omitted if the points are known to be compensated.
+        `time_s` and `start_rad` are also omitted if the points are known to be motion-compensated.
 
         - `row`: index of the ring in `rings`, or 0 for a sensor without rings.
         - `intensity`: on the scale of the recording.
@@ -159,6 +166,11 @@ class RecordedSweeps:
         - `time_s`: time relative to the timestamp of the sweep, which may be that of its last
           point.
         - `start_rad`: azimuth at which the ring of the point starts.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
         """
         sweep = _wide(self._kept[number]) if number in self._kept else self._read(number)
         if not len(self.rings) or self.is_compensated:
@@ -218,7 +230,7 @@ class RecordedSweeps:
         return Rotation(best == 1, float(np.degrees(np.angle(sums[best])) % 360))
 
     def starts(self, *, is_clockwise: bool) -> Rotation:
-        """Determine the rotation from the azimuths at which rings start, given its direction."""
+        """Determine the rotation from its direction and the azimuths at which rings start."""
         numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
         starts_rad = [ring_starts(self.read(number), self.ring_count) for number in numbers]
         mean = float(np.angle(np.exp(1j * np.stack(starts_rad)).sum()))

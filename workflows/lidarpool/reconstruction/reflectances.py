@@ -1,10 +1,11 @@
-"""Reflectances of surfels from intensities, freed from range, incidence and ring.
+"""Estimate the reflectances of surfels from intensities.
 
-A recorded intensity is modeled as the product of the reflectance of the surface, a law of range and
-incidence (`IntensityModel`), and three factors of the sensor: of the range, as of optics that see
-near surfaces in part, of the incidence, and of the ring. Each factor is the one that explains the
-intensities of surfels that were seen from several places. A simulation applies its own law of range
-and incidence to the reflectances, and none of the factors.
+A recorded intensity is modeled as the product of the surface reflectance, a law of range and
+incidence (`IntensityModel`), and three sensor factors. The factors depend on the range, on the
+incidence, and on the ring. The range factor describes optics that see only part of a surface at
+close range, for example. The factors are fitted to the intensities of surfels that were observed
+from several positions. A simulation applies its own law of range and incidence to the reflectances,
+and none of the factors.
 """
 
 from __future__ import annotations
@@ -19,37 +20,37 @@ import numpy as np
 from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
 
 from .alignment import AlignedSweep
-from .surface_map import Observations, Seen
+from .surface_map import Observations, SurfelHits
 
-_ROUNDS = 12  # of factors and reflectances in turn
+_ROUNDS = 12  # iterations of fitting the factors and the reflectances
 _RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100, 130, 200, np.inf)
-_INCIDENCE_BINS = 10  # of the cosine
-_MIN_RAYS = 200  # of a factor; fewer do not change it
-_WHITE_QUANTILE = 0.999  # of the intensities: what is brighter is as bright as white
-_WHITE_SHARE = 0.99  # of the rays, which end on surfaces up to white
-_MIN_REFLECTANCE = 0.01  # surfaces that were recorded as black
-_MAX_DIFFERENCE = 0.9  # of energies, over that of intensities that are compensated for range
-_MIN_COSINE = 1e-3  # of the incidence of rays that the factors are fitted to
-_WHITE_RANGE_M = 10.0  # range at which a white surface has the simulated intensity 1
+_INCIDENCE_BINS = 10  # bins of the cosine
+_MIN_RAYS = 200  # A factor with fewer rays is not changed.
+_WHITE_QUANTILE = 0.999  # quantile of the intensities above which a surface counts as white
+_WHITE_SHARE = 0.99  # quantile of the reflectances, weighted by rays, that counts as white
+_MIN_REFLECTANCE = 0.01  # for surfaces that were recorded as black
+_MAX_DIFFERENCE = 0.9  # maximum error of the energy model relative to the compensated model
+_MIN_COSINE = 1e-3  # minimum cosine of the incidence of rays that are used for the fit
+_WHITE_RANGE_M = 10.0  # range at which a white surface has a simulated intensity of 1
 
 
 class IntensityModel(StrEnum):
-    """How intensities depend on range and incidence, apart from the factors of the sensor."""
+    """How intensities depend on range and incidence, apart from the sensor factors."""
 
     COMPENSATED = "compensated for range"
     ENERGIES = "energies"
 
     def law(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return the intensities (k,) of equally bright surfaces."""
+        """Return the relative intensities of surfaces with the same reflectance."""
         if self is IntensityModel.COMPENSATED:
             return np.ones(len(range_m))
         return self.simulated(range_m, cosine)
 
     def simulated(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return what a simulation writes for white surfaces (k,).
+        """Return the intensities that a simulation writes for white surfaces.
 
-        Energies are compared with its column `intensity`, and intensities that are compensated for
-        range with its column `reflectance`, to which `reflectivity` is proportional.
+        Energies correspond to the simulated column `intensity`. Intensities that are compensated
+        for range correspond to the column `reflectance`, to which `reflectivity` is proportional.
         """
         level = np.asarray(cosine, np.float64)
         if self is IntensityModel.COMPENSATED:
@@ -59,24 +60,25 @@ class IntensityModel(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """How the intensities of a sensor follow from reflectances.
+    """Relationship between the intensities of a sensor and surface reflectances.
 
     Attributes
     ----------
     model
         How intensities depend on range and incidence.
     by_range, by_incidence, by_ring
-        float64: factors of intensities, of the ranges between `_RANGE_EDGES_M`, of evenly spaced
-        cosines, and of each ring.
+        Intensity factors for the ranges between `_RANGE_EDGES_M`, for evenly spaced cosines, and
+        for the rings. float64 arrays.
     white
-        Intensity of a white surface; of energies at 10 m and normal incidence.
+        Intensity of a white surface. If intensities are energies, this is the intensity at 10 m and
+        normal incidence.
     brightest
-        Intensity over the law of the model as which all that is brighter counts, such as a
-        reflector.
+        Maximum ratio of intensity to the law of the model. Brighter surfaces, such as
+        retroreflectors, are clipped to it.
     typical
         Median reflectance.
     scale
-        Recorded over simulated intensity, in the mean of the rays.
+        Mean ratio of recorded to simulated intensities.
     """
 
     model: IntensityModel
@@ -89,24 +91,25 @@ class Response:
     scale: float
 
     def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
-        """Return the intensities (k,) of white surfaces."""
+        """Return the expected intensities of white surfaces, of shape (k,)."""
         factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
         law = self.model.law(range_m, cosine)
         return np.asarray(factors * self.by_ring[ring] * self.white * law)
 
-    def reflectances(self, seen: Observations, centers: Floats) -> Reflectances:
-        """Return the reflectances of surfels with centers (m, 3).
+    def reflectances(self, observations: Observations, centers: Floats) -> Reflectances:
+        """Estimate the reflectances of surfels with centers of shape (m, 3).
 
-        Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
+        A surfel that no ray hits, for example because it is occluded, has the reflectance of the
+        nearest surfel with observations.
         """
         from scipy.spatial import cKDTree
 
-        seen = seen.part(np.isfinite(seen.intensity))
+        observations = observations.select(np.isfinite(observations.intensity))
         count = len(centers)
-        expected = self.factors(seen.range_m, seen.cosine, seen.ring)
-        law = self.model.law(seen.range_m, seen.cosine)
-        intensity = np.minimum(seen.intensity, self.brightest * law)
-        surfels = _ratios(seen.surfel, intensity, expected, np.full(count, np.nan))
+        expected = self.factors(observations.range_m, observations.cosine, observations.ring)
+        law = self.model.law(observations.range_m, observations.cosine)
+        intensity = np.minimum(observations.intensity, self.brightest * law)
+        surfels = _ratios(observations.surfel, intensity, expected, np.full(count, np.nan))
         known = np.isfinite(surfels)
         if known.any():
             _, nearest = cKDTree(centers[known]).query(centers[~known])
@@ -116,7 +119,7 @@ class Response:
         return Reflectances(np.clip(surfels, _MIN_REFLECTANCE, 1.0), self)
 
     def figures(self) -> dict[str, Any]:
-        """Return the response of the sensor for the report."""
+        """Return the response for the report."""
         return {
             "model": self.model.value,
             "white": self.white,
@@ -128,49 +131,64 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Reflectances:
-    """Reflectances of surfels, and the response of the sensor, by which intensities follow."""
+    """Reflectances of surfels, with the sensor response from which intensities are computed."""
 
-    surfels: Floats  # (m,): 0.01 to 1
+    surfels: Floats  # (m,), 0.01 to 1
     response: Response
 
-    def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
-        """Return the simulated intensities (n,) of the rays of a sweep, on the recorded scale.
+    def intensities(self, sweep: AlignedSweep, hits: SurfelHits) -> Floats:
+        """Simulate the intensities of the rays of a sweep, on the scale of the recording.
 
-        They are NaN for rays that meet nothing.
+        The array has shape (n,), and is NaN for rays that hit nothing.
         """
-        law = self.response.model.simulated(seen.distance_m, seen.cosine)
+        law = self.response.model.simulated(hits.distance_m, hits.cosine)
         intensities = np.full(len(sweep.points), np.nan)
-        intensities[seen.rays] = self.surfels[seen.surfel] * law * self.response.scale
+        intensities[hits.rays] = self.surfels[hits.surfel] * law * self.response.scale
         return intensities
 
 
 def fit_response(
     parts: Sequence[Observations], ring_count: int, *, are_energies: bool
 ) -> Response | None:
-    """Fit the response of a sensor to rays that end on surfels, or return None without intensities.
+    """Fit the response of a sensor to rays that end on surfels.
 
-    Each of the `parts` has surfels of its own. Unless it is known that the intensities
-    `are_energies`, they are taken as compensated for range, if the other model does not explain
-    them clearly better: surfaces that were seen from one distance fit both models. Differences are
-    relative, because energies span several decades, and near surfaces would decide alone. Sums, not
-    logarithms, are compared: many sensors report dark surfaces as 0.
+    Return None if there are no intensities.
+
+    Parameters
+    ----------
+    parts
+        Observations of distinct surfels.
+    ring_count
+        Number of rings.
+    are_energies
+        Whether intensities are known to be energies. Otherwise, they are assumed to be compensated
+        for range, unless the energy model fits clearly better. Surfaces that were observed from a
+        single distance fit both models.
+
+    Notes
+    -----
+    Model errors are relative, because energies span several decades and close surfaces would
+    otherwise dominate. The fit compares sums instead of logarithms, because many sensors report 0
+    for dark surfaces.
     """
-    seen = Observations.joined(parts)
-    seen = seen.part(np.isfinite(seen.intensity) & (seen.cosine > _MIN_COSINE))
-    if not (seen.intensity > 0).any():
+    observations = Observations.concatenate(parts)
+    observations = observations.select(
+        np.isfinite(observations.intensity) & (observations.cosine > _MIN_COSINE)
+    )
+    if not (observations.intensity > 0).any():
         return None
     models = (IntensityModel.ENERGIES,) if are_energies else tuple(IntensityModel)
-    fits = [_Factors.of_rays(seen, model, ring_count) for model in models]
+    fits = [_Factors.from_rays(observations, model, ring_count) for model in models]
     best = fits[0]
     if fits[-1].difference < _MAX_DIFFERENCE * best.difference:
         best = fits[-1]
-    # Reflectances of 1 are white: the factors take what is above. Surfels that few rays met
-    # scatter, so rays count.
-    reflectance = best.reflectance[seen.surfel]
+    # A reflectance of 1 is white, and the factors absorb larger values. Reflectances of surfels
+    # with few rays are noisy, so they are weighted by rays.
+    reflectance = best.reflectance[observations.surfel]
     white = max(float(np.quantile(reflectance, _WHITE_SHARE)), 1e-6 * best.brightest)
     typical = float(np.nanmedian(best.reflectance)) / white
     simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
-    simulated *= best.model.simulated(seen.range_m, seen.cosine)
+    simulated *= best.model.simulated(observations.range_m, observations.cosine)
     scale = float(best.intensity.sum() / simulated.sum())
     by_range, by_incidence, by_ring = best.factors
     return Response(
@@ -179,53 +197,63 @@ def fit_response(
 
 
 class _Factors(NamedTuple):
-    """Factors by range, incidence and ring, and reflectances of surfels, NaN if not seen."""
+    """Fitted sensor factors and surfel reflectances, which are NaN for unobserved surfels."""
 
     model: IntensityModel
-    intensity: Floats  # (k,): those of reflectors as those of white surfaces
+    intensity: Floats  # (k,), where retroreflectors are clipped to white
     factors: list[Floats]
-    reflectance: Floats  # intensity over the law of the model and the factors
+    reflectance: Floats  # intensity divided by the law of the model and the factors
     brightest: float
-    difference: float  # mean, of intensities, over their sum
+    difference: float  # mean relative difference between modeled and recorded intensities
 
     @classmethod
-    def of_rays(cls, seen: Observations, model: IntensityModel, ring_count: int) -> _Factors:
-        """Fit factors and reflectances in turn to the intensities of rays.
+    def from_rays(
+        cls, observations: Observations, model: IntensityModel, ring_count: int
+    ) -> _Factors:
+        """Fit factors and reflectances alternately to the intensities of rays.
 
-        A surface is met by few ranges, incidences and rings: what these do not tell stays.
+        A surface is observed at few ranges, incidences and rings, so what they do not determine
+        remains unchanged.
         """
-        law = model.law(seen.range_m, seen.cosine)
-        brightest = float(np.quantile(seen.intensity / law, _WHITE_QUANTILE))
-        intensity = np.minimum(seen.intensity, brightest * law)
-        unknown = np.full(int(seen.surfel.max()) + 1, np.nan)
-        rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
+        law = model.law(observations.range_m, observations.cosine)
+        brightest = float(np.quantile(observations.intensity / law, _WHITE_QUANTILE))
+        intensity = np.minimum(observations.intensity, brightest * law)
+        unknown = np.full(int(observations.surfel.max()) + 1, np.nan)
+        rows: list[Integers] = [
+            _range_bin(observations.range_m),
+            _incidence_bin(observations.cosine),
+            observations.ring,
+        ]
         counts = (len(_RANGE_EDGES_M) - 1, _INCIDENCE_BINS, ring_count)
         factors = [np.ones(count) for count in counts]
         reflectance = unknown
         product = law
         for _ in range(_ROUNDS):
             product = law * np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
-            reflectance = _ratios(seen.surfel, intensity, product, unknown)
+            reflectance = _ratios(observations.surfel, intensity, product, unknown)
             for index, row in enumerate(rows):
                 others = product / factors[index][row]
-                expected = others * reflectance[seen.surfel]
+                expected = others * reflectance[observations.surfel]
                 factors[index] = _ratios(row, intensity, expected, factors[index])
                 factors[index] /= np.average(
                     factors[index], weights=np.bincount(row, minlength=len(factors[index]))
                 )
                 product = others * factors[index][row]
-        expected = reflectance[seen.surfel] * product
+        expected = reflectance[observations.surfel] * product
         difference = np.abs(expected - intensity) / np.maximum(expected + intensity, 1e-300)
         return cls(model, intensity, factors, reflectance, brightest, float(difference.mean()))
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
-    """Return ratios of sums of values (k,) to sums of expected values, by row, or `before`."""
+    """Return the ratio of summed values to summed expected values in each row.
+
+    Rows with too little data keep their value in `before`.
+    """
     count = len(before)
     sums = np.bincount(row, values, count)
     sums_expected = np.bincount(row, expected, count)
     enough = sums_expected > 0
-    if np.isfinite(before).all():  # a factor, not a reflectance
+    if np.isfinite(before).all():  # factors, not reflectances
         enough &= np.bincount(row, minlength=count) >= _MIN_RAYS
     return np.divide(sums, sums_expected, out=before.copy(), where=enough)
 

@@ -1,4 +1,4 @@
-"""What processes do with the stretches of a drive: they align the sweeps, and rebuild the place."""
+"""Tasks of worker processes, which align the sweeps of a submap and build its surface map."""
 
 from __future__ import annotations
 
@@ -13,86 +13,86 @@ from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from .alignment import AlignedSweeps, Alignment, align
-from .charts import Above, SweepImages
-from .free_space import standing_points
-from .held_out import HeldOut, hold_out
-from .lost_pulses import Answering
+from .charts import SweepImages, TopViewPoints
+from .free_space import find_stationary_points
+from .held_out import HeldOutRays, simulate_held_out
+from .lost_pulses import SensorCoverage
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
-from .submaps import AlignedStretch, Stretch
-from .surface_map import Observations, Place, build_place
+from .submaps import AlignedSubmap, Submap
+from .surface_map import Observations, SurfaceMap, build_surface_map
 from .surfels import Surfels, surfel_mesh
 
 
 @dataclass(frozen=True, eq=False)
-class StretchTask:
-    """A stretch of a drive.
+class SubmapTask:
+    """A submap to align.
 
     Attributes
     ----------
     recorded
         All sweeps.
     alignment
-        Of all sweeps.
-    stretch
-        Sweeps of the stretch, and around.
+        Alignment of all sweeps.
+    submap
+        Sweeps of the submap and its surroundings.
     mapped
-        int64, ascending: sweeps of the drive whose points make the map.
+        Numbers of all sweeps whose points form the map, in ascending order. int64 array.
     """
 
     recorded: RecordedSweeps
     alignment: Alignment
-    stretch: Stretch
+    submap: Submap
     mapped: Ints
 
 
 @dataclass(frozen=True, eq=False)
-class BuildTask(StretchTask):
-    """A stretch whose place is built.
+class BuildTask(SubmapTask):
+    """A submap whose surface map is built.
 
     Attributes
     ----------
-    answering
-        Where the sensor has returns at all.
+    coverage
+        Directions in which the sensor can have returns.
     compared
-        int64, ascending: held-out sweeps of the drive that are compared.
+        Numbers of all held-out sweeps that are compared, in ascending order. int64 array.
     voxel_m
-        Edge of the voxels of which surfels are made.
+        Edge length in meters of the voxels from which surfels are created.
     drawn_share
-        Share of the points that are drawn from above.
+        Share of the points that are drawn in the top view.
     """
 
-    answering: Answering
+    coverage: SensorCoverage
     compared: Ints
     voxel_m: float
     drawn_share: float
 
     def read(self) -> AlignedSweeps:
-        """Read the sweeps of the stretch and around, and keep these."""
-        recorded = self.recorded.keeping(self.stretch.numbers.tolist())
-        return AlignedSweeps(recorded, self.alignment, self.answering)
+        """Read the sweeps of the submap and its surroundings into memory."""
+        recorded = self.recorded.with_cached(self.submap.numbers.tolist())
+        return AlignedSweeps(recorded, self.alignment, self.coverage)
 
 
-class StretchSurfels(NamedTuple):
-    """Surfels of a stretch, and numbers of the points of its own sweeps."""
+class SubmapSurfels(NamedTuple):
+    """Surfels of a submap, with point counts of its own sweeps."""
 
-    corners: Floats  # (m, 4, 3): meters
-    dark_corners: Floats  # (d, 4, 3): of surfels that return nothing
+    corners: Floats  # (m, 4, 3), meters
+    dark_corners: Floats  # (d, 4, 3), meters, of surfels that return no pulses
     materials: AnyArray | None  # names
-    material: Ints32 | None  # (m,): rows of `materials`
-    points: Ints  # (k,): of each of its own sweeps
-    moved: Ints  # (k,): of these, on things that moved
+    material: Ints32 | None  # (m,), indices of `materials`
+    points: Ints  # (k,), points in each of its own sweeps
+    moved: Ints  # (k,), how many of them are on moving objects
 
     @classmethod
-    def of_surfels(
-        cls, surfels: Surfels, chosen: Bools, standing: Mapping[int, Bools], own: Ints
-    ) -> StretchSurfels:
-        """Return the arrays of chosen surfels (m,), and numbers of points of its `own` sweeps."""
+    def from_surfels(
+        cls, surfels: Surfels, chosen: Bools, stationary: Mapping[int, Bools], own: Ints
+    ) -> SubmapSurfels:
+        """Extract the chosen surfels, and count the points of the sweeps in `own`."""
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         lit = chosen & ~surfels.dark
         materials = surfels.mesh.materials
         index = None if materials is None else materials.index
-        masks = [standing[number] for number in own.tolist()]
+        masks = [stationary[number] for number in own.tolist()]
         return cls(
             corners[lit],
             corners[chosen & surfels.dark],
@@ -103,7 +103,7 @@ class StretchSurfels(NamedTuple):
         )
 
     def mesh(self, name: str) -> SceneMesh:
-        """Return the mesh of the surfels that return light."""
+        """Return a mesh of the surfels that return pulses."""
         materials = None
         if self.materials is not None:
             index = None if self.material is None else self.material.repeat(2)
@@ -111,82 +111,104 @@ class StretchSurfels(NamedTuple):
         return replace(surfel_mesh(name, self.corners), materials=materials)
 
 
-BuiltStretch = tuple[StretchSurfels, Observations, HeldOut | None, SweepImages | None, Above]
+BuiltSubmap = tuple[
+    SubmapSurfels, Observations, HeldOutRays | None, SweepImages | None, TopViewPoints
+]
 
 
-def align_stretch(task: StretchTask) -> tuple[AlignedStretch]:
-    """Align the sweeps of a stretch; LidarError if these show hardly any planes."""
-    aligned = align(task.recorded, task.alignment, task.stretch.numbers, set(task.mapped.tolist()))
-    return (AlignedStretch.of_alignment(aligned),)
-
-
-def build_stretch(task: BuildTask) -> BuiltStretch:
-    """Build the place of a stretch, and compare held-out sweeps; LidarError if nothing stands."""
-    stretch = task.stretch
-    sweeps = task.read()
-    standing = standing_points(sweeps, stretch.numbers.tolist())
-    held_out, images = compared_sweeps(sweeps, task, standing)
-    place = build_place(sweeps, standing, task.voxel_m)
-    own = stretch.owns(place.surfels.centers, task.alignment.poses)
-    seen = place.observations(sweeps, standing).of_surfels(own & ~place.surfels.dark)
-    surfels = StretchSurfels.of_surfels(place.surfels, own, standing, stretch.own_numbers)
-    above = Above.of_sweeps(sweeps, standing, stretch.own_numbers, task.drawn_share)
-    return surfels, seen, held_out, images, above
-
-
-def compared_sweeps(
-    sweeps: AlignedSweeps, task: BuildTask, standing: Mapping[int, Bools]
-) -> tuple[HeldOut | None, SweepImages | None]:
-    """Compare held-out sweeps of a stretch with the place that the others make.
-
-    Parameters
-    ----------
-    sweeps
-        The sweeps, at their places.
-    task
-        The stretch. Without sweeps of its own to compare, nothing is.
-    standing
-        Which points of the sweeps stand: {number: (n,)}.
-
-    Returns
-    -------
-    tuple
-        The rays of its held-out sweeps, and images of one; None without a sweep with points.
+def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
+    """Align the sweeps of a submap.
 
     Raises
     ------
     LidarError
-        If too few points stand.
+        If the sweeps contain hardly any planes.
     """
-    stretch = task.stretch
-    compared = np.intersect1d(task.compared, stretch.own_numbers).tolist()
+    aligned = align(task.recorded, task.alignment, task.submap.numbers, set(task.mapped.tolist()))
+    return (AlignedSubmap.from_alignment(aligned),)
+
+
+def build_submap(task: BuildTask) -> BuiltSubmap:
+    """Build the surface map of a submap, and compare its held-out sweeps.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
+    """
+    submap = task.submap
+    sweeps = task.read()
+    stationary = find_stationary_points(sweeps, submap.numbers.tolist())
+    held_out, images = compare_held_out_sweeps(sweeps, task, stationary)
+    surface_map = build_surface_map(sweeps, stationary, task.voxel_m)
+    own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
+    observations = surface_map.observations(sweeps, stationary).select_surfels(
+        own & ~surface_map.surfels.dark
+    )
+    surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, stationary, submap.own_numbers)
+    top_view = TopViewPoints.from_sweeps(sweeps, stationary, submap.own_numbers, task.drawn_share)
+    return surfels, observations, held_out, images, top_view
+
+
+def compare_held_out_sweeps(
+    sweeps: AlignedSweeps, task: BuildTask, stationary: Mapping[int, Bools]
+) -> tuple[HeldOutRays | None, SweepImages | None]:
+    """Compare the held-out sweeps of a submap with a map of its other sweeps.
+
+    Parameters
+    ----------
+    sweeps
+        Aligned sweeps.
+    task
+        The submap.
+    stationary
+        Masks of the stationary points, by sweep number.
+
+    Returns
+    -------
+    tuple
+        The rays of the held-out sweeps, or None if the submap has none, and images of one of them,
+        or None if none has points.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
+    """
+    submap = task.submap
+    compared = np.intersect1d(task.compared, submap.own_numbers).tolist()
     if not compared:
         return None, None
-    mapped = np.intersect1d(stretch.numbers, task.mapped).tolist()
-    place, reflectances = rebuild(sweeps, mapped, task.voxel_m)
-    rays = hold_out(sweeps, place, reflectances, standing, compared)
+    mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
+    surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
+    rays = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
     with_points = np.unique(rays.sweep[rays.returned])
     if not len(with_points):
         return rays, None
     drawn = int(with_points[len(with_points) // 2])
-    return rays, SweepImages.of_sweep(sweeps, place, reflectances, drawn)
+    return rays, SweepImages.from_sweep(sweeps, surface_map, reflectances, drawn)
 
 
-def rebuild(
+def build_map_with_reflectances(
     sweeps: AlignedSweeps, numbers: list[int], voxel_m: float
-) -> tuple[Place, Reflectances | None]:
-    """Build the place of some sweeps alone, without what moved.
+) -> tuple[SurfaceMap, Reflectances | None]:
+    """Build a surface map of some sweeps, and estimate its reflectances.
 
-    Returns its reflectances, too, or None without intensities; LidarError if too few points stand.
+    The reflectances are None if there are no intensities.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
     """
-    standing = standing_points(sweeps, numbers)
-    place = build_place(sweeps, standing, voxel_m)
-    seen = place.observations(sweeps, standing)
+    stationary = find_stationary_points(sweeps, numbers)
+    surface_map = build_surface_map(sweeps, stationary, voxel_m)
+    observations = surface_map.observations(sweeps, stationary)
     response = fit_response(
-        [seen],
+        [observations],
         sweeps.recorded.ring_count,
         are_energies=sweeps.recorded.recording.energies,
     )
     if response is None:
-        return place, None
-    return place, response.reflectances(seen, place.surfels.centers)
+        return surface_map, None
+    return surface_map, response.reflectances(observations, surface_map.surfels.centers)

@@ -1,10 +1,11 @@
-"""Stretches of a drive: a place is rebuilt stretch by stretch, so its memory is that of a stretch.
+"""Divide a drive into submaps, so that only one submap has to fit in memory at a time.
 
-A stretch has consecutive sweeps of its own, and looks at sweeps before and after, which see the
-same surfaces. A surface belongs to the stretch whose sensor came nearest. So stretches depend on
-nothing but the drive, and any number of processes makes the same place.
+A submap consists of consecutive sweeps of its own, and of surrounding sweeps that observe the same
+surfaces. A surface belongs to the submap whose sensor positions are closest to it. The division
+depends only on the drive, so the number of processes does not affect the result.
 
-A sensor that stands sees the same again and again: of the sweeps within a meter some count.
+A stationary sensor observes the same surfaces repeatedly, so only some sweeps within each meter are
+used.
 """
 
 from __future__ import annotations
@@ -21,25 +22,27 @@ from lidarsim.numerics.even_samples import even_indices
 from .alignment import Alignment
 from .motion import MotionStep
 
-_OWN_SWEEPS = 80  # of a stretch, about
-_AROUND_SWEEPS = 40  # before and after, at most
+_OWN_SWEEPS = 80  # approximate number of sweeps of a submap
+_AROUND_SWEEPS = 40  # maximum number of surrounding sweeps on each side
 _AROUND_M = 40.0
-_METER_M = 1.0  # length of the drive of which all or no sweeps belong to a stretch
-_METER_SWEEPS = 80  # of a meter that count
+_METER_M = 1.0  # length of a section of the drive that is never split between submaps
+_METER_SWEEPS = 80  # maximum number of sweeps that are used per section
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """Sweeps of a part of a drive, and of those around.
+class Submap:
+    """Sweeps of a part of a drive, with surrounding sweeps.
 
     Attributes
     ----------
     numbers
-        int64 (k,): sweeps, with those around, ascending.
+        Numbers of the sweeps, including surrounding sweeps, in ascending order. int64 array of
+        shape (k,).
     own
-        Which of the `numbers` are of the stretch itself.
+        Slice of `numbers` that belongs to the submap itself.
     landmarks
-        int64 (p,): those of the `numbers` that are the first of their meter.
+        Those of the `numbers` that are the first of their one-meter section. int64 array of shape
+        (p,).
     """
 
     numbers: Ints
@@ -48,11 +51,14 @@ class Stretch:
 
     @property
     def own_numbers(self) -> Ints:
-        """Numbers (k,) of the sweeps of the stretch itself, ascending."""
+        """Numbers of the sweeps of the submap itself, in ascending order."""
         return self.numbers[self.own]
 
     def owns(self, points: Floats, poses: Floats) -> Bools:
-        """Return which points (n, 3) belong to the stretch, at poses (s, 4, 4) of all sweeps."""
+        """Return a mask of the points that belong to the submap.
+
+        The points have shape (n, 3). `poses` are those of all sweeps, of shape (s, 4, 4).
+        """
         from scipy.spatial import cKDTree
 
         own = self.own_numbers
@@ -61,31 +67,31 @@ class Stretch:
         return np.asarray(is_own[nearest])
 
 
-def divide(positions: Floats) -> list[Stretch]:
-    """Divide a drive with positions (s, 3) of its sweeps into stretches."""
+def split_into_submaps(positions: Floats) -> list[Submap]:
+    """Divide a drive into submaps, given the positions of its sweeps of shape (s, 3)."""
     meters = _meters(positions)
     counts = np.array([len(meter) for meter in meters])
     before = np.cumsum(counts) - counts
-    stretch_count = max(1, round(int(counts.sum()) / _OWN_SWEEPS))
-    of_meter = before * stretch_count // int(counts.sum())
+    submap_count = max(1, round(int(counts.sum()) / _OWN_SWEEPS))
+    of_meter = before * submap_count // int(counts.sum())
     starts = np.flatnonzero(np.diff(of_meter, prepend=-1)).tolist()
-    stretches = []
+    submaps = []
     for start, stop in zip(starts, [*starts[1:], len(meters)], strict=True):
         first = _reach(meters, positions, range(start - 1, -1, -1), meters[start][0])
         last = _reach(meters, positions, range(stop, len(meters)), meters[stop - 1][-1])
         lead = int(counts[start - first : start].sum())
-        stretches.append(
-            Stretch(
+        submaps.append(
+            Submap(
                 np.concatenate(meters[start - first : stop + last]),
                 slice(lead, lead + int(counts[start:stop].sum())),
                 np.array([meter[0] for meter in meters[start - first : stop + last]]),
             )
         )
-    return stretches
+    return submaps
 
 
 def _meters(positions: Floats) -> list[Ints]:
-    """Return the sweeps that count of each meter of a drive."""
+    """Return the sweeps that are used in each one-meter section of a drive."""
     starts = [0]
     for number, position in enumerate(positions):
         if np.linalg.norm(position - positions[starts[-1]]) >= _METER_M:
@@ -98,7 +104,7 @@ def _meters(positions: Floats) -> list[Ints]:
 
 
 def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -> int:
-    """Return how many meters `beyond` the end of a stretch see the same surfaces."""
+    """Return how many sections in `beyond` observe the same surfaces as the end of a submap."""
     count = 0
     sweeps = 0
     for meter in beyond:
@@ -110,8 +116,11 @@ def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -
     return count
 
 
-class AlignedStretch(NamedTuple):
-    """Alignment of the k sweeps of a stretch, with those around, as of `Alignment`."""
+class AlignedSubmap(NamedTuple):
+    """Alignment of the k sweeps of a submap, including surrounding sweeps.
+
+    The fields have the same meaning as in `Alignment`.
+    """
 
     poses: Floats  # (k, 4, 4)
     ring_offsets: Floats  # (r, 3)
@@ -119,8 +128,8 @@ class AlignedStretch(NamedTuple):
     plane_distance_m: Floats  # (k,)
 
     @classmethod
-    def of_alignment(cls, alignment: Alignment) -> AlignedStretch:
-        """Return what is known of a stretch that was aligned."""
+    def from_alignment(cls, alignment: Alignment) -> AlignedSubmap:
+        """Extract the results of aligning a submap."""
         return cls(
             alignment.poses,
             alignment.ring_offsets,
@@ -129,40 +138,40 @@ class AlignedStretch(NamedTuple):
         )
 
 
-def joined(
-    first: Alignment, stretches: Sequence[Stretch], aligned: Sequence[AlignedStretch]
+def merge_alignments(
+    first: Alignment, submaps: Sequence[Submap], aligned: Sequence[AlignedSubmap]
 ) -> Alignment:
-    """Join the alignments of stretches, each of its own sweeps and of those around.
+    """Merge the alignments of submaps.
 
-    Where stretches overlap, a pose goes over from one to the other. Sweeps that do not count move
-    with the nearest that does.
+    Where submaps overlap, poses are blended from one submap to the next. Sweeps that no submap uses
+    keep their initial pose relative to the nearest sweep that is used.
 
     Parameters
     ----------
     first
-        Of all sweeps, before they were aligned.
-    stretches
-        All stretches, in order.
+        Initial alignment of all sweeps.
+    submaps
+        All submaps in order.
     aligned
-        The same stretches, aligned.
+        The alignments of the submaps in the same order.
     """
     count = len(first.poses)
     total = np.zeros(count)
     poses = first.poses.copy()
-    twist = np.zeros((count, 6))  # weighted sums of the motions to poses of further stretches
+    twist = np.zeros((count, 6))  # weighted sums of the motions to the poses of further submaps
     distance_m = np.full(count, np.nan)
-    for stretch, one in zip(stretches, aligned, strict=True):
-        weights = _weights(len(stretch.numbers), stretch.own).tolist()
-        for number, pose, weight in zip(stretch.numbers.tolist(), one.poses, weights, strict=True):
+    for submap, one in zip(submaps, aligned, strict=True):
+        weights = _weights(len(submap.numbers), submap.own).tolist()
+        for number, pose, weight in zip(submap.numbers.tolist(), one.poses, weights, strict=True):
             if total[number]:
                 twist[number] += weight * np.concatenate(MotionStep.between(poses[number], pose))
             else:
                 poses[number] = pose
             total[number] += weight
-        distance_m[stretch.own_numbers] = one.plane_distance_m[stretch.own]
+        distance_m[submap.own_numbers] = one.plane_distance_m[submap.own]
     for number in np.flatnonzero(twist.any(axis=1)).tolist():
         mean = twist[number] / total[number]
-        poses[number] = poses[number] @ MotionStep(mean[:3], mean[3:]).part(1.0)
+        poses[number] = poses[number] @ MotionStep(mean[:3], mean[3:]).fraction(1.0)
     counting = np.flatnonzero(total)
     for number in np.flatnonzero(total == 0).tolist():
         nearest = counting[np.abs(counting - number).argmin()]
@@ -178,9 +187,9 @@ def joined(
 
 
 def _weights(count: int, own: slice) -> Floats:
-    """Return the weights (count,) of the poses of a stretch, which fall towards its ends.
+    """Return weights of the poses of a submap, which decrease toward its ends.
 
-    An end without sweeps around is an end of the drive.
+    An end without surrounding sweeps is an end of the drive, where the weights do not decrease.
     """
     index = np.arange(count)
     before = index + 1 if own.start else np.full(count, count)

@@ -1,15 +1,17 @@
-"""The place of a recording: surfels of all that stands, and what the sensor saw of each.
+"""Build a map of surfels, which represents the static surfaces of a recording.
 
-Surfels reach beyond edges, and single points of things that moved are left. The caster decides:
-rays of the recording that pass a surfel, although it should have stopped them, count against the
-surfel, and rays that end on it count for it. Lost pulses count against it, too.
+Initial surfels extend beyond edges, and single points on moving objects remain. Ray casting
+corrects both. A ray of the recording that passes through a surfel that should have blocked it
+counts against the surfel. A ray that ends on a surfel supports it. Lost pulses count against
+surfels, too.
 
-Windows and black cars return few pulses, and hide what is behind. Where pulses are lost between
-returns of the same surface, dark surfels are tried: lost pulses that meet one count for it, and
-pulses that return from there or from behind against it.
+Windows and black cars return few pulses, and hide the surfaces behind them. Where pulses are lost
+between returns of the same surface, candidates for dark surfels are created. Lost pulses that hit a
+candidate support it. Pulses that return from it or from behind it count against it.
 
-Surfels overlap, and a ray meets the nearest. So the surface that rays see is above the means of the
-points: by 5 to 10 mm on a road. Each surfel is moved until its rays end on it, in the median.
+Surfels overlap, and a ray hits the nearest one, so the visible surface lies above the mean of the
+points, by 5 to 10 mm on a road. Each surfel is therefore moved along its normal until the median of
+its rays ends on it.
 """
 
 from __future__ import annotations
@@ -29,16 +31,16 @@ from raybeam import RayCaster
 from .alignment import AlignedSweep, AlignedSweeps
 from .surfels import Surfels
 
-_ROUNDS = 3  # of casting, leaving surfels out, and moving them
-_MAX_SHIFT_M = 0.3  # difference of ranges beyond which a ray moves no surfel
-_SHIFT_PRIOR = 1.0  # rays that would leave a surfel where it is
-_VOTING_SWEEPS = 40  # of a stretch at most, evenly chosen
-_ON_SURFEL_M = 0.06  # distance to the plane of a surfel within which a point is on it
-_VIEW_CELL_M = 0.5  # edge of the cells in which ranges of points are compared
-_CELL_BITS = 21  # of a coordinate of a cell: places repeat every million meters
+_ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
+_MAX_SHIFT_M = 0.3  # Rays with a larger range difference do not move a surfel.
+_SHIFT_PRIOR = 1.0  # weight of the current position of a surfel, in rays
+_VOTING_SWEEPS = 40  # maximum number of evenly spaced sweeps per submap that vote
+_ON_SURFEL_M = 0.06  # maximum distance between a point on a surfel and its plane
+_VIEW_CELL_M = 0.5  # edge length of the cells in which ranges of points are compared
+_CELL_BITS = 21  # bits per cell coordinate, which repeats after one million meters
 _CELL_MASK = (1 << _CELL_BITS) - 1
-_MAX_VIEW_FACTOR = 1.5  # of the shortest range in a cell, beyond which points are left out
-_ON_RAY_M = 0.15  # difference of ranges within which a ray ends on a surfel
+_MAX_VIEW_FACTOR = 1.5  # Points are omitted beyond this multiple of the shortest range in a cell.
+_ON_RAY_M = 0.15  # maximum range difference of a ray that ends on a surfel
 
 
 class Observations(NamedTuple):
@@ -47,12 +49,12 @@ class Observations(NamedTuple):
     surfel: Integers  # (k,)
     ring: Integers  # (k,)
     range_m: AnyFloats  # (k,)
-    cosine: AnyFloats  # (k,): of the incidence
-    intensity: AnyFloats  # (k,): NaN where the recording has none
+    cosine: AnyFloats  # (k,), cosine of the incidence angle
+    intensity: AnyFloats  # (k,), NaN if unknown
 
     @classmethod
-    def joined(cls, parts: Sequence[Observations]) -> Observations:
-        """Join rays at different surfels, which are numbered in turn."""
+    def concatenate(cls, parts: Sequence[Observations]) -> Observations:
+        """Concatenate observations of distinct surfels, which are renumbered consecutively."""
         counts = [int(part.surfel.max(initial=-1)) + 1 for part in parts]
         starts = np.cumsum(counts) - counts
         shifted = [
@@ -61,14 +63,14 @@ class Observations(NamedTuple):
         ]
         return cls(*map(np.concatenate, zip(*shifted, strict=True)))
 
-    def of_surfels(self, chosen: Bools) -> Observations:
-        """Return the rays of chosen surfels (m,), which are numbered anew."""
+    def select_surfels(self, chosen: Bools) -> Observations:
+        """Select the rays of the chosen surfels, which are renumbered."""
         numbers = (np.cumsum(chosen) - 1).astype(np.int32)
-        rays = self.part(chosen[self.surfel])
+        rays = self.select(chosen[self.surfel])
         return rays._replace(surfel=numbers[rays.surfel])
 
-    def part(self, rays: Bools) -> Observations:
-        """Return selected rays."""
+    def select(self, rays: Bools) -> Observations:
+        """Select rays by a mask."""
         return Observations(
             self.surfel[rays],
             self.ring[rays],
@@ -78,100 +80,105 @@ class Observations(NamedTuple):
         )
 
 
-class Seen(NamedTuple):
-    """Surfels that the rays of a sweep meet, as arrays of the k rays that meet a surfel."""
+class SurfelHits(NamedTuple):
+    """Surfels that are hit by rays of a sweep, as arrays of the k rays with a hit."""
 
-    rays: Ints  # (k,): indices of the points of the sweep
+    rays: Ints  # indices of the points of the sweep
     surfel: Ints
-    distance_m: Floats  # to the surfel, along the ray
-    range_m: Floats  # as recorded
+    distance_m: Floats  # distance to the surfel along the ray
+    range_m: Floats  # recorded range
     off_plane_m: Floats  # distance of the recorded point from the plane of the surfel
-    cosine: Floats  # of the incidence
-    inward: Floats  # cosine between the ray and the normal: negative from the front
+    cosine: Floats  # cosine of the incidence angle
+    inward: Floats  # cosine between the ray and the normal, negative at the front
 
     @property
     def ends(self) -> Bools:
-        """Mask (k,) of the rays that end on their surfels."""
+        """Mask of shape (k,) of the rays that end on their surfels."""
         near = np.abs(self.distance_m - self.range_m) < _ON_RAY_M
         return np.asarray(near | (self.off_plane_m < _ON_SURFEL_M))
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Surfels, and the caster of rays at these."""
+class SurfaceMap:
+    """Surfels, with a ray caster for them."""
 
     surfels: Surfels
     caster: RayCaster
 
     @classmethod
-    def of_surfels(cls, surfels: Surfels) -> Place:
-        """Make the caster of some surfels."""
+    def from_surfels(cls, surfels: Surfels) -> SurfaceMap:
+        """Create the ray caster of surfels."""
         return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
 
-    def see(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Seen:
-        """Cast the rays of a sweep, or the rays of its points that `chosen` (n,) marks."""
+    def cast(self, sweep: AlignedSweep, chosen: Bools | None = None) -> SurfelHits:
+        """Cast the rays of a sweep, or only the rays marked by `chosen`."""
         rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
         directions = sweep.world[rows] - sweep.origins[rows]
-        hits = self.caster.cast(sweep.origins[rows], directions)
-        met = np.flatnonzero(hits.hit)
-        surfel = hits.triangle[met].astype(np.int64) // 2
+        ray_hits = self.caster.cast(sweep.origins[rows], directions)
+        met = np.flatnonzero(ray_hits.hit)
+        surfel = ray_hits.triangle[met].astype(np.int64) // 2
         range_m = np.linalg.norm(directions[met], axis=1)
         normals = self.surfels.normals[surfel]
         offsets = sweep.world[rows[met]] - self.surfels.centers[surfel]
         off_plane_m = np.abs(np.einsum("ij,ij->i", offsets, normals))
         inward = np.einsum("ij,ij->i", directions[met], normals) / range_m
-        return Seen(
-            rows[met], surfel, hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
+        return SurfelHits(
+            rows[met], surfel, ray_hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
         )
 
-    def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
-        """Return the surfels without those that more rays contradict than support.
+    def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
+        """Remove surfels that more rays contradict than support, and move the others.
 
         Each surfel that is not dark moves along its normal to the median of the rays that end on
-        it. LidarError if no surfel is left.
+        it.
+
+        Raises
+        ------
+        LidarError
+            If no surfel remains.
         """
         count = len(self.surfels)
         votes = np.zeros(count, np.int64)
-        sign = np.where(self.surfels.dark, 1, -1)  # of the votes of lost pulses
+        sign = np.where(self.surfels.dark, 1, -1)  # sign of the votes of lost pulses
         surfel = []
         offset_m = []
-        for number in _some(standing):
+        for number in _evenly_chosen(stationary):
             sweep, lost = sweeps.read_with_lost(number)
-            seen = self.see(sweep, standing[number])
-            ends = seen.ends
-            farther_m = seen.range_m - seen.distance_m
-            dark = self.surfels.dark[seen.surfel]
+            hits = self.cast(sweep, stationary[number])
+            ends = hits.ends
+            farther_m = hits.range_m - hits.distance_m
+            dark = self.surfels.dark[hits.surfel]
             passing = ~ends & (farther_m > _ON_RAY_M)
-            votes += np.bincount(seen.surfel[ends & ~dark], minlength=count)
+            votes += np.bincount(hits.surfel[ends & ~dark], minlength=count)
             votes -= np.bincount(
-                seen.surfel[np.where(dark, ends | passing, passing)], minlength=count
+                hits.surfel[np.where(dark, ends | passing, passing)], minlength=count
             )
-            votes += sign * np.bincount(self.see(lost).surfel, minlength=count)
+            votes += sign * np.bincount(self.cast(lost).surfel, minlength=count)
             moving = ~dark & (ends | (np.abs(farther_m) < _MAX_SHIFT_M))
-            surfel.append(seen.surfel[moving])
-            offset_m.append((farther_m * seen.inward)[moving])
+            surfel.append(hits.surfel[moving])
+            offset_m.append((farther_m * hits.inward)[moving])
         shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
-        supported = votes >= self.surfels.dark  # a dark surfel needs a pulse that is lost
+        supported = votes >= self.surfels.dark  # a dark surfel requires at least one lost pulse
         if not supported.any():
             raise LidarError(
                 f"The sweeps of {sweeps.name} are inconsistent with each other. Check their poses."
             )
-        return self.surfels.moved(shifts_m).part(supported)
+        return self.surfels.shift_along_normals(shifts_m).select(supported)
 
-    def observations(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Observations:
-        """Return the rays that end on surfels."""
+    def observations(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Observations:
+        """Return the rays that end on surfels, except on dark surfels."""
         parts: list[Observations] = []
-        for number in _some(standing):
+        for number in _evenly_chosen(stationary):
             sweep = sweeps.read(number)
-            seen = self.see(sweep, standing[number])
-            ends = seen.ends & ~self.surfels.dark[seen.surfel]
-            rays = seen.rays[ends]
+            hits = self.cast(sweep, stationary[number])
+            ends = hits.ends & ~self.surfels.dark[hits.surfel]
+            rays = hits.rays[ends]
             parts.append(
                 Observations(
-                    seen.surfel[ends].astype(np.int32),
+                    hits.surfel[ends].astype(np.int32),
                     sweep.ring[rays].astype(np.int32),
-                    seen.range_m[ends].astype(np.float32),
-                    seen.cosine[ends].astype(np.float32),
+                    hits.range_m[ends].astype(np.float32),
+                    hits.cosine[ends].astype(np.float32),
                     np.full(len(rays), np.nan, np.float32)
                     if sweep.intensities is None
                     else sweep.intensities[rays].astype(np.float32),
@@ -180,33 +187,43 @@ class Place:
         return Observations(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float) -> Place:
-    """Build the place of the points that stand, or raise LidarError if too few stand."""
-    points, outward, labels = _standing(sweeps, standing)
+def build_surface_map(
+    sweeps: AlignedSweeps, stationary: Mapping[int, Bools], voxel_m: float
+) -> SurfaceMap:
+    """Build a surface map of the stationary points.
+
+    Raises
+    ------
+    LidarError
+        If there are too few stationary points.
+    """
+    points, outward, labels = _stationary_points(sweeps, stationary)
     if not len(points):
         raise LidarError(
             f"{sweeps.name} contains no stationary points, so the reconstruction is empty."
         )
     name = Path(sweeps.name).name
     gap_rad = sweeps.recorded.gap_rad
-    surfels = Surfels.of_points(name, points, outward, voxel_m, gap_rad, labels)
-    dark_points, dark_outward = _dark(sweeps, standing)
+    surfels = Surfels.from_points(name, points, outward, voxel_m, gap_rad, labels)
+    dark_points, dark_outward = _lost_positions(sweeps, stationary)
     if Surfels.are_enough(dark_points, voxel_m):
-        dark = Surfels.of_points(name, dark_points, dark_outward, voxel_m, gap_rad)
+        dark = Surfels.from_points(name, dark_points, dark_outward, voxel_m, gap_rad)
         surfels = surfels.with_dark(dark)
-    for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
-        surfels = Place.of_surfels(surfels).refined(sweeps, standing)
-    return Place.of_surfels(surfels)
+    for _ in range(_ROUNDS):  # Keep only one ray caster at a time, to save memory.
+        surfels = SurfaceMap.from_surfels(surfels).refine(sweeps, stationary)
+    return SurfaceMap.from_surfels(surfels)
 
 
-def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Floats, Floats]:
-    """Return where lost pulses were lost (n, 3), if surfaces go on in their gaps.
+def _lost_positions(
+    sweeps: AlignedSweeps, stationary: Mapping[int, Bools]
+) -> tuple[Floats, Floats]:
+    """Estimate where pulses were lost, in gaps within surfaces.
 
-    The second array (n, 3) has the vectors to the sensor.
+    Return the positions and the vectors to the sensor, both of shape (n, 3).
     """
     positions = []
     outward = []
-    for number in _some(standing):
+    for number in _evenly_chosen(stationary):
         _, lost = sweeps.read_with_lost(number)
         assert lost.gap_range_m is not None
         known = np.isfinite(lost.gap_range_m)
@@ -218,7 +235,7 @@ def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Floats,
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
-    """Return the shifts (count,) of surfels: medians of the offsets (k,) of their rays."""
+    """Return the shift of each surfel, which is the damped median of the offsets of its rays."""
     shifts_m = np.zeros(count)
     order = np.lexsort((offset_m, surfel))
     surfel = surfel[order]
@@ -230,28 +247,27 @@ def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
     return shifts_m
 
 
-def _some(standing: Mapping[int, Bools]) -> list[int]:
-    """Return the numbers of some sweeps, evenly chosen."""
-    numbers = np.fromiter(standing, np.int64)
+def _evenly_chosen(stationary: Mapping[int, Bools]) -> list[int]:
+    """Return evenly spaced numbers of the sweeps."""
+    numbers = np.fromiter(stationary, np.int64)
     chosen: list[int] = numbers[even_indices(len(numbers), _VOTING_SWEEPS)].tolist()
     return chosen
 
 
-def _standing(
-    sweeps: AlignedSweeps, standing: Mapping[int, Bools]
+def _stationary_points(
+    sweeps: AlignedSweeps, stationary: Mapping[int, Bools]
 ) -> tuple[Floats, AnyFloats, Ints | None]:
-    """Return the points (n, 3) that stand in the world, with the vectors (n, 3) to the sensor.
+    """Return the stationary points in world coordinates.
 
-    The third array has the labels (n,) of the points, or is None without labels.
-
-    Points that were seen from much closer elsewhere are left out: rays that come from far away are
-    far apart, and their errors of direction are large.
+    The other arrays are the vectors to the sensor and the labels, which are None if there are none.
+    Points that were observed from a much shorter range elsewhere are omitted. Rays from a long
+    range are far apart, and their angular errors cause large position errors.
     """
-    cells, closest_m = _closest(sweeps, standing)
+    cells, closest_m = _closest_ranges(sweeps, stationary)
     positions = []
     outward = []
     labels = []
-    for number, mask in standing.items():
+    for number, mask in stationary.items():
         sweep = sweeps.read(number)
         rows = np.flatnonzero(mask)
         limit_m = (
@@ -263,16 +279,16 @@ def _standing(
         if sweep.labels is not None:
             labels.append(sweep.labels[kept])
     world = np.concatenate(positions)
-    # A sweep without points may have no columns.
+    # A sweep without points may lack columns.
     labeled = sum(map(len, labels)) == len(world)
     return world, np.concatenate(outward), np.concatenate(labels) if labels and labeled else None
 
 
-def _closest(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Ints, Floats]:
-    """Return cells (c,), ascending, and the shortest range (c,) of the points in each."""
+def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> tuple[Ints, Floats]:
+    """Return the occupied cells in ascending order, and the shortest range in each."""
     cells = []
     shortest_m = []
-    for number, mask in standing.items():
+    for number, mask in stationary.items():
         sweep = sweeps.read(number)
         found, closest_m = _shortest(_view_cells(sweep.world[mask]), sweep.range_m[mask])
         cells.append(found)
@@ -281,13 +297,13 @@ def _closest(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Ints
 
 
 def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
-    """Return the distinct cells, ascending, and the shortest of the ranges (n,) in each."""
+    """Return the distinct cells in ascending order, and the shortest range in each."""
     order = np.lexsort((range_m, cells))
     found, firsts = np.unique(cells[order], return_index=True)
     return found, range_m[order][firsts]
 
 
 def _view_cells(points: Floats) -> Ints:
-    """Return the numbers (n,) of the cells of points, in which ranges are compared."""
+    """Return the index of the cell that contains each point."""
     cells = np.floor(points / _VIEW_CELL_M).astype(np.int64) & _CELL_MASK
     return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])

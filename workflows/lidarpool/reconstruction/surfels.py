@@ -1,8 +1,8 @@
-"""Surfels of the points of many sweeps, as large as the gaps between the rays of the sensor.
+"""Create surfels from the points of many sweeps, as large as the gaps between the rays.
 
-A lidar sees a surface in lines: points of a ring are close to each other, and rings are far apart.
-The twelve nearest points of a point are often on one line, which has no plane. Then more points are
-asked, until lines of other rings and sweeps are among these.
+A lidar samples a surface in lines. Points of the same ring are close together, and rings are far
+apart. The twelve nearest neighbors of a point often lie on a single line, which does not determine
+a plane. In that case, more neighbors are used until they include lines of other rings and sweeps.
 """
 
 from __future__ import annotations
@@ -25,43 +25,43 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from ..scenario.point_files import POINT_BYTES
 from ..scenario.point_scene import PointVoxels, surfel_faces, surfel_materials
 
-_NEIGHBORS = (12, 32, 80)  # of which the first number that is no line counts
-_MIN_WIDTH = 0.1  # smaller over larger variance within a plane: less is a line
-_EXTENT = 0.85  # half of a side over the standard deviation of the neighbors
-_MAX_HALF_VOXELS = 3  # that half a side is long, beside the gaps between rays
-_MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
-_PLANE_GAPS = 0.55  # half a side, across the rings, over the gap between rays on a plane
-_MAX_RADII = 1.0  # the same over the distance of the farthest neighbor, at most
-_MAX_GAPS = 1.0  # half a side over the gap between rays elsewhere, at most
-_MIN_COSINE = 0.1  # of the incidence, by which gaps grow
-_BLOCK = 1 << 16  # surfels at a time
+_NEIGHBORS = (12, 32, 80)  # numbers of neighbors, increased until they are not on a line
+_MIN_WIDTH = 0.1  # minimum ratio of the variances within a plane, below which it is a line
+_EXTENT = 0.85  # half a side relative to the standard deviation of the neighbors
+_MAX_HALF_VOXELS = 3  # maximum half side in voxels, unless the gap between rays is larger
+_MAX_FLAT = 0.1  # maximum variance along the normal relative to the smaller variance in the plane
+_PLANE_GAPS = 0.55  # half a side across the rings relative to the gap between rays on a plane
+_MAX_RADII = 1.0  # limit of this half side, relative to the distance of the farthest neighbor
+_MAX_GAPS = 1.0  # maximum half side elsewhere, relative to the gap between rays
+_MIN_COSINE = 0.1  # limit of the incidence by which gaps grow
+_BLOCK = 1 << 16  # surfels per block
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Surfels, each two triangles in turn."""
+    """Surfels, which are represented by two consecutive triangles each."""
 
     mesh: SceneMesh
-    dark: Bools  # (m,): of surfaces that return nothing, such as windows
+    dark: Bools  # (m,), surfels that return no pulses, such as windows
 
     def __len__(self) -> int:
         return len(self.mesh.faces) // 2
 
     @cached_property
     def centers(self) -> Floats:
-        """Middles of the surfels, (m, 3), meters."""
+        """Centers of the surfels in meters, of shape (m, 3)."""
         return surfel_centers(self.mesh)
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals of the surfels, (m, 3)."""
+        """Unit normals of the surfels, of shape (m, 3)."""
         corners = self.mesh.vertices.reshape(-1, 4, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.maximum(lengths, 1e-12))
 
-    def part(self, rows: Bools) -> Surfels:
-        """Return selected surfels."""
+    def select(self, rows: Bools) -> Surfels:
+        """Select surfels by a mask."""
         mesh = self.mesh
         vertices = mesh.vertices.reshape(-1, 4, 3)[rows].reshape(-1, 3)
         faces = surfel_faces(int(rows.sum()))
@@ -69,24 +69,24 @@ class Surfels:
         materials = None if mesh.materials is None else mesh.materials.take(both)
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
-    def moved(self, shifts_m: Floats) -> Surfels:
-        """Return the surfels moved along their normals by shifts (m,), meters."""
+    def shift_along_normals(self, shifts_m: Floats) -> Surfels:
+        """Move the surfels along their normals by `shifts_m`, of shape (m,)."""
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
         return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
 
     def with_dark(self, others: Surfels) -> Surfels:
-        """Return these surfels, and others that return nothing."""
+        """Append surfels that return no pulses."""
         dark = np.append(self.dark, np.ones(len(others), bool))
-        return Surfels(joined_surfels([self.mesh, others.mesh]), dark)
+        return Surfels(merge_surfels([self.mesh, others.mesh]), dark)
 
     @staticmethod
     def are_enough(points: Floats, voxel_m: float) -> bool:
-        """Whether points (n, 3) make surfels: they are in enough voxels."""
+        """Return whether points of shape (n, 3) occupy enough voxels to create surfels."""
         cells = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)
         return len(cells) > 2 * _NEIGHBORS[-1]
 
     @classmethod
-    def of_points(
+    def from_points(
         cls,
         name: str,
         points: Floats,
@@ -95,28 +95,28 @@ class Surfels:
         gap_rad: float,
         labels: Ints | None = None,
     ) -> Surfels:
-        """Make surfels of the means of points in voxels.
+        """Create surfels at the means of the points in voxels.
 
         Parameters
         ----------
         name
-            Of the mesh, and in messages.
+            Name of the mesh, also used in messages.
         points
             Positions of shape (n, 3), in meters.
         outward
             Vectors from the points to the sensor, of shape (n, 3), in meters.
         voxel_m
-            Edge of the voxels.
+            Edge length of the voxels in meters.
         gap_rad
-            Angle between the rays of neighboring rings.
+            Angle between the rays of neighboring rings in radians.
         labels
-            Labels of the points (`labels_of`), of shape (n,), or None. The most frequent label of
-            the points of a surfel is in the name of its material.
+            Labels of the points (see `labels_of`), of shape (n,), or None. The material of a surfel
+            is named after the most frequent label of its points.
 
         Raises
         ------
         LidarError
-            If there are too few points, or too many for the memory.
+            If there are too few points, or if the surfels would exceed the memory limit.
         """
         from scipy.spatial import cKDTree
 
@@ -152,17 +152,17 @@ class Surfels:
 
 
 def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
-    """Return the mesh of surfels with corners (m, 4, 3), meters."""
+    """Create a mesh of surfels from corners of shape (m, 4, 3), in meters."""
     return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
 
 
 def surfel_centers(mesh: SceneMesh) -> Floats:
-    """Return the middles (m, 3) of the surfels of a mesh, meters."""
+    """Return the centers of the surfels of a mesh in meters, of shape (m, 3)."""
     return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
-def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
-    """Return the surfels of meshes as one mesh, with the name of the first."""
+def merge_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Merge meshes of surfels into one mesh, with the name of the first."""
     sizes = [len(mesh.faces) for mesh in meshes]
     return SceneMesh(
         meshes[0].name,
@@ -174,15 +174,15 @@ def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
 
 
 class _Planes(NamedTuple):
-    """Planes of the neighbors of m points."""
+    """Planes through the neighbors of m points."""
 
-    axes: Floats  # (m, 3, 3): unit vectors: normal, across the lines, along the lines
-    halves: Floats  # (m, 2): half the sides of surfels across and along, meters
-    radius_m: Floats  # (m,): distance of the farthest neighbor; 0 if these are in no plane
+    axes: Floats  # (m, 3, 3), unit vectors: normal, across the lines, along the lines
+    halves: Floats  # (m, 2), half sides of surfels across and along the lines, meters
+    radius_m: Floats  # (m,), distance of the farthest neighbor, or 0 if they are not in a plane
 
     @classmethod
     def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
-        """Find the planes of the neighbors of some of the means (v, 3), which are in a tree."""
+        """Find the planes at some of the means, given a k-d tree of all means."""
         count = len(centers)
         axes = np.empty((count, 3, 3))
         halves = np.empty((count, 2))
@@ -206,14 +206,14 @@ class _Planes(NamedTuple):
         return cls(axes, halves, radius_m)
 
     def corners(self, centers: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
-        """Return the corners (m, 4, 3) of surfels, counter-clockwise seen from the sensor."""
+        """Return surfel corners of shape (m, 4, 3), counterclockwise as viewed from the sensor."""
         range_m = np.linalg.norm(outward, axis=1)
         facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
         cosine = np.abs(facing) / np.maximum(range_m, 1e-9)
         gap_m = gap_rad * range_m / np.maximum(cosine, _MIN_COSINE)
         longest_m = np.maximum(_MAX_HALF_VOXELS * voxel_m, _MAX_GAPS * gap_m)
         halves = np.minimum(self.halves, longest_m[:, None])
-        # Between two rings of a sweep a plane goes on, wherever the rings of others are.
+        # A plane continues between two rings of a sweep, wherever the rings of other sweeps are.
         to_next_m = np.minimum(_PLANE_GAPS * gap_m, _MAX_RADII * self.radius_m)
         halves[:, 0] = np.maximum(halves[:, 0], to_next_m)
         across = self.axes[:, 1] * halves[:, :1]
@@ -227,13 +227,13 @@ class _Planes(NamedTuple):
 
 
 def _nearest(tree: object, centers: Floats, count: int) -> Ints:
-    """Return the indices (m, count) of the nearest points in a tree, the nearest first."""
+    """Return the indices of the nearest points in a k-d tree, in order of distance."""
     _, rows = tree.query(centers, count)  # type: ignore[attr-defined]
     return np.asarray(rows)
 
 
 def _principal(around: Floats) -> tuple[Floats, Floats]:
-    """Return the variances (m, 3), ascending, and axes (m, 3, 3) of points (m, k, 3)."""
+    """Return the ascending variances and the principal axes of point sets of shape (m, k, 3)."""
     offsets = around - around.mean(axis=1, keepdims=True)
     covariances = np.einsum("mki,mkj->mij", offsets, offsets) / around.shape[1]
     variances, axes = np.linalg.eigh(covariances)

@@ -1,4 +1,4 @@
-"""Planes of a place: means of points in voxels, and the normals of their neighborhoods."""
+"""Planes of a map, from the means of points in voxels and the normals of their neighborhoods."""
 
 from __future__ import annotations
 
@@ -13,24 +13,27 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 from ..scenario.point_scene import PointVoxels
 
 _NEIGHBORS = 12
-_MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
-_MIN_WIDTH = 0.05  # smaller over larger variance within a plane: less is a line
+_MAX_FLAT = 0.1  # maximum variance along the normal relative to the smaller variance in the plane
+_MIN_WIDTH = 0.05  # minimum ratio of the variances within a plane, below which it is a line
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelPlanes:
     """Means of the points in voxels whose neighbors lie in a plane."""
 
-    centers: Floats  # (p, 3): meters
-    normals: Floats  # (p, 3): unit vectors, of either side
+    centers: Floats  # (p, 3), meters
+    normals: Floats  # (p, 3), unit vectors with arbitrary sign
     tree: Any  # scipy.spatial.cKDTree of the centers
     thickness_m: float  # median standard deviation of the neighbors along the normals
 
     @classmethod
-    def of_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
-        """Find planes among points (n, 3) of a recording, or return None without planes.
+    def from_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
+        """Find planes in points of shape (n, 3), or return None if there are none.
 
-        LidarError if the points are too far apart to be sorted into voxels.
+        Raises
+        ------
+        LidarError
+            If the points are too far apart to be sorted into voxels.
         """
         from scipy.spatial import cKDTree
 
@@ -52,9 +55,20 @@ class VoxelPlanes:
         return cls(middles, normals, cKDTree(middles), thickness_m)
 
     def distances(self, points: Floats, max_m: float) -> tuple[Floats, Ints, Bools]:
-        """Return signed distances (k,) of points (n, 3) to their planes, the planes, and a mask.
+        """Return signed distances between points and their nearest planes.
 
-        The mask (n,) marks the points that are within `max_m` of the center of a plane.
+        Parameters
+        ----------
+        points
+            Points of shape (n, 3).
+        max_m
+            Maximum distance between a point and the center of its plane.
+
+        Returns
+        -------
+        tuple of arrays
+            Distances of shape (k,), indices of the planes of shape (k,), and a mask of shape (n,)
+            of the k points that are close enough to a plane.
         """
         distance, plane = self.tree.query(points, distance_upper_bound=max_m)
         near = np.isfinite(distance)
@@ -64,6 +78,6 @@ class VoxelPlanes:
 
 
 def _is_plane(variances: Floats) -> Bools:
-    """Mark neighborhoods that are planes by their variances (n, 3), ascending."""
+    """Return which neighborhoods are planes, given their ascending variances of shape (n, 3)."""
     smallest, middle, largest = variances.T
     return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))

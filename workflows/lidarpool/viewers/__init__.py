@@ -1,1 +1,1 @@
-"""Viewers of other makers that show sweeps while these are made: Foxglove and Rerun."""
+"""Show sweeps in third-party viewers while they are simulated: Foxglove and Rerun."""

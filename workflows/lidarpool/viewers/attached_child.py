@@ -1,7 +1,8 @@
-"""Runs a command as long as stdin is open: `python attached_child.py COMMAND …`.
+"""Run a command until stdin is closed: `python attached_child.py COMMAND …`.
 
-The process that started it holds the other end of stdin, which the system closes when that process
-ends, even if it is killed. Then the command and its children, a separate process group, end.
+The parent process holds the other end of stdin. The operating system closes it when the parent
+exits, even if the parent is killed. The command and its children, which form a process group, are
+then terminated.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ import signal
 import subprocess
 import sys
 
-_CHECK_S = 0.2  # whether the command has ended by itself
+_CHECK_S = 0.2  # interval for checking whether the command has exited
 
 
 def main(command: list[str]) -> int:
-    """Run a command until it ends, or stdin does, and return its exit status."""
+    """Run a command until it exits or stdin is closed, and return its exit status."""
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     while child.poll() is None:
         readable, _, _ = select.select([0], [], [], _CHECK_S)
         if readable and not os.read(0, 1):
-            os.killpg(os.getpgid(0), signal.SIGTERM)  # this process as well
+            os.killpg(os.getpgid(0), signal.SIGTERM)  # includes this process
     return child.returncode
 
 

@@ -1,4 +1,4 @@
-"""Sends sweeps to Foxglove, which connects to a WebSocket server of this process."""
+"""Send sweeps to Foxglove, which connects to a WebSocket server in this process."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..clouds.frame_names import WORLD
 from ..clouds.shown_sweeps import ActorBoxes, FramePose, ShownSweep, Surface, Surroundings
 from .viewer import LOOPBACK, Address, Viewer
 
-PORT = 8765  # Foxglove's own default
-# Messages that wait for a client; of more, the oldest are left out, so that a slow client takes a
-# bounded amount of memory.
+PORT = 8765  # default port of Foxglove
+# Maximum number of pending messages per client. The oldest messages are dropped first, which bounds
+# the memory that a slow client requires.
 BACKLOG = 64
 _NUMBER_TYPES = {
     "u1": messages.PackedElementFieldNumericType.Uint8,
@@ -37,7 +37,7 @@ _ACTORS = "/actors"
 _SCENE = "/scene"
 _TRAJECTORIES = "/trajectories"
 _PATH = "/path"
-_SCENE_ALPHA = 0.4  # points on a surface, and behind a wall, can be seen
+_SCENE_ALPHA = 0.4  # so that points on and behind surfaces are visible
 _GRAY = messages.Color(r=0.6, g=0.6, b=0.6, a=_SCENE_ALPHA)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
@@ -45,33 +45,35 @@ _BLUE = messages.Color(r=0.2, g=0.6, b=1.0, a=1.0)
 _GREEN = messages.Color(r=0.1, g=0.8, b=0.3, a=1.0)
 _LINE_PIXELS = 2.0
 _TEXT_PIXELS = 12.0
-_COLOR_BITS = 4  # bits of each of red, green and blue of the scene
+_COLOR_BITS = 4  # bits per color channel of the scene
 _UNIT = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer(Viewer):
-    """A WebSocket server for Foxglove, on the loopback interface only.
+    """WebSocket server for Foxglove, which only listens on the loopback interface.
 
-    The SDK's server has no token and checks no `Origin`: every program that can connect reads all
-    messages, also the scripts of any website that a browser of this machine has open.
+    The server of the SDK has no token and does not check `Origin`. Every program that can connect
+    can therefore read all messages, including scripts of any website in a browser on this machine.
 
-    Topics are `/NAME/points` of each sensor, or `/points`, `/tf`, `/actors`, `/scene`,
-    `/trajectories` and `/path`, in Foxglove's own schemas. Who subscribes late gets the last
-    message of a topic.
+    The topics are `/NAME/points` for each sensor or `/points`, `/tf`, `/actors`, `/scene`,
+    `/trajectories` and `/path`, with Foxglove schemas. Late subscribers receive the latest message
+    of a topic.
 
     Parameters
     ----------
     to
-        ADDRESS:PORT to listen on; by default 127.0.0.1:8765, or another port if it is in use.
+        Address and port to listen on, as ADDRESS:PORT. By default, the port is 8765 on 127.0.0.1,
+        or another port if it is in use.
     title
-        Name of the source of data in Foxglove.
+        Name of the data source in Foxglove.
     sends_time
-        Whether Foxglove's clock shows the times of sweeps, in order; else the computer's clock.
+        Whether the clock of Foxglove shows the times of the sweeps, which must be sent in order. By
+        default, it shows the time of the computer.
 
     Raises
     ------
     LidarError
-        If the address cannot be used, or others than this machine can reach the address.
+        If the address cannot be used, or if it can be reached from other machines.
     """
 
     def __init__(
@@ -84,21 +86,21 @@ class FoxgloveServer(Viewer):
                 f"and not on {address}. Use 127.0.0.1 and forward the port: ssh -L "
                 f"{address.port}:{LOOPBACK}:{address.port} user@machine."
             )
-        # The server logs malformed requests of clients as warnings.
+        # The server logs malformed client requests as warnings.
         logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._context = foxglove.Context()
-        self._channels: dict[str, Any] = {}  # {topic: channel}
-        self._latest: dict[str, tuple[Any, int]] = {}  # {topic: message, time in nanoseconds}
-        self._frames: dict[str, Any] = {}  # {name: last transform}
+        self._channels: dict[str, Any] = {}  # by topic
+        self._latest: dict[str, tuple[Any, int]] = {}  # message and time in nanoseconds, by topic
+        self._frames: dict[str, Any] = {}  # latest transform by frame name
         self._sends_time = sends_time
-        self._start_ns = 0  # start of the last sweep
+        self._start_ns = 0  # start of the latest sweep
         try:
             self._server = foxglove.start_server(
                 name=title,
                 host=address.host,
                 port=address.port,
                 capabilities=[Capability.Time] if sends_time else [],
-                server_listener=_Latecomers(self._send_again),
+                server_listener=_SubscriptionListener(self._send_again),
                 context=self._context,
                 message_backlog_size=BACKLOG,
             )
@@ -109,12 +111,12 @@ class FoxgloveServer(Viewer):
 
     @property
     def link(self) -> str:
-        """Address that opens Foxglove in a browser, with this server as its source of data."""
+        """Address that opens Foxglove in a browser, with this server as the data source."""
         return f"https://app.foxglove.dev/?{self._source}"
 
     @property
     def desktop_link(self) -> str:
-        """Address that opens Foxglove's desktop application with this server."""
+        """Address that opens the Foxglove desktop application with this server."""
         return f"foxglove://open?{self._source}"
 
     @property
@@ -122,10 +124,10 @@ class FoxgloveServer(Viewer):
         return f"ds=foxglove-websocket&ds.url=ws://{self.address}"
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier surroundings."""
+        """Replace the scene, trajectories and planned path."""
         self._clear()
         self._channel(_FRAMES, channels.FrameTransformsChannel)
-        for topic in surroundings.topics:  # clients subscribe before the first sweep
+        for topic in surroundings.topics:  # so that clients can subscribe before the first sweep
             self._channel(topic, channels.PointCloudChannel)
         if surroundings.has_actors:
             self._channel(_ACTORS, channels.SceneUpdateChannel)
@@ -142,11 +144,11 @@ class FoxgloveServer(Viewer):
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), meters, world coordinates."""
+        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
         self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
+        """Show the points, frames and actor boxes of a sweep without waiting for clients."""
         self._start_ns = shown.start_ns
         if self._sends_time:
             self._server.broadcast_time(shown.start_ns)
@@ -167,7 +169,7 @@ class FoxgloveServer(Viewer):
         self._server.stop()
 
     def _clear(self) -> None:
-        """Delete all entities, and forget all frames."""
+        """Delete all entities and frames."""
         everything = messages.SceneEntityDeletion(type=messages.SceneEntityDeletionType.All)
         for topic in (_SCENE, _TRAJECTORIES, _PATH, _ACTORS):
             if topic in self._latest:
@@ -186,34 +188,31 @@ class FoxgloveServer(Viewer):
         channel.log(message, log_time=time_ns)
 
     def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
-        """Return the channel of a topic.
-
-        A new channel is advertised to clients.
-        """
+        """Return the channel of a topic, which is created and advertised if necessary."""
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
 
     def _send_again(self, topic: str) -> None:
-        """Send the last message of a topic again, to all subscribers."""
+        """Send the latest message of a topic to all subscribers again."""
         if topic in self._latest:
             message, time_ns = self._latest[topic]
             self._channels[topic].log(message, log_time=time_ns)
 
 
-class _Latecomers(ServerListener):
-    """Calls a function with the topic of each new subscription."""
+class _SubscriptionListener(ServerListener):
+    """Listener that calls a function with the topic of each new subscription."""
 
     def __init__(self, subscribed: Callable[[str], None]) -> None:
         self._subscribed = subscribed
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send a new subscriber the last message."""
+        """Report the topic of a new subscription."""
         self._subscribed(channel.topic)
 
 
 def packed_points(shown: ShownSweep) -> Records:
-    """Return the points of a sweep as records: x, y and z in float32, and all columns."""
+    """Pack the points of a sweep into records of x, y and z in float32, and all columns."""
     values: dict[str, AnyArray] = dict(zip("xyz", shown.positions.T, strict=True))
     values |= shown.columns
     kinds = [(name, column.dtype.newbyteorder("<")) for name, column in values.items()]
@@ -251,10 +250,7 @@ def _transform(transform: FramePose, stamp: Any) -> Any:
 
 
 def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
-    """Return the boxes of the actors that are present.
-
-    Boxes of absent actors are deleted.
-    """
+    """Return the boxes of present actors, and deletions for absent actors."""
     entities = []
     deletions = []
     for number, name in enumerate(boxes.names):
@@ -282,7 +278,7 @@ def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
 
 
 def _triangles(surface: Surface) -> Iterable[Any]:
-    """Yield the triangles of a scene, a primitive for each color."""
+    """Yield the triangles of a scene, grouped by color."""
     pose = _pose(surface.origin)
     if surface.colors is None:
         yield _triangle_list(surface, slice(None), pose, _GRAY)
@@ -310,7 +306,7 @@ def _triangle_list(surface: Surface, face_indices: Any, pose: Any, color: Any) -
 
 
 def _line(positions: Floats, color: Any) -> Any:
-    """Return a line through positions (k, 3), meters, relative to the first position."""
+    """Return a line through positions of shape (k, 3), relative to the first position."""
     return messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
         pose=_pose(positions[0]),
@@ -322,7 +318,7 @@ def _line(positions: Floats, color: Any) -> Any:
 
 
 def _entity(name: str, **primitives: Any) -> Any:
-    """Return an entity in the world, which stays until an entity of the same name comes."""
+    """Return an entity in world coordinates, which replaces any entity with its name."""
     return messages.SceneEntity(id=name, frame_id=WORLD, frame_locked=True, **primitives)
 
 

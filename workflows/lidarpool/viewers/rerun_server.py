@@ -1,4 +1,4 @@
-"""Sends sweeps to a server of Rerun, which viewers in browsers and on desktops open."""
+"""Send sweeps to a Rerun server, to which viewers in browsers and on desktops connect."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from . import attached_child
 from .viewer import Address, Viewer
 
-PORT = 9876  # Rerun's own default
+PORT = 9876  # default port of Rerun
 _READY_S = 20.0
 
 
 class RerunServer(Viewer):
-    """A server of Rerun in a separate process, and the page of its viewer for browsers.
+    """Rerun server in a separate process, with a viewer page for browsers.
 
     Parameters
     ----------
     to
-        ADDRESS:PORT to listen on, the page of the viewer on the port after it; by default
-        127.0.0.1:9876, or another port if it is in use.
+        Address and port to listen on, as ADDRESS:PORT. The page is served on the next port. By
+        default, the port is 9876 on 127.0.0.1, or another port if it is in use.
     title
         Name of the recording in Rerun.
 
     Raises
     ------
     LidarError
-        If the address cannot be used, or the server does not start.
+        If the address cannot be used, or if the server does not start.
     """
 
     def __init__(self, to: str | None = None, title: str = "lidarpool") -> None:
@@ -44,10 +44,10 @@ class RerunServer(Viewer):
         command += ["--web-viewer-port", f"{page.port}", "--hide-welcome-screen"]
         self._process = subprocess.Popen(
             [sys.executable, attached_child.__file__, sys.executable, "-m", "rerun", *command],
-            stdin=subprocess.PIPE,  # whose end tells the server that this process is gone
+            stdin=subprocess.PIPE,  # is closed when this process exits, which stops the server
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for this process, which ends the server
+            start_new_session=True,  # Ctrl-C only interrupts this process, which stops the server
         )
         self._recording = rr.RecordingStream(APPLICATION)
         try:
@@ -64,19 +64,19 @@ class RerunServer(Viewer):
         )
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier surroundings."""
+        """Replace the scene, trajectories and planned path."""
         self._log.show_surroundings(surroundings)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), meters, world coordinates."""
+        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
         self._log.show_path(path)
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
+        """Show the points, frames and actor boxes of a sweep without waiting for viewers."""
         self._log.show_sweep(shown)
 
     def close(self) -> None:
-        """Send waiting messages, and end the server."""
+        """Send pending messages, and stop the server."""
         self._recording.disconnect()
         assert self._process.stdin is not None
         self._process.stdin.close()

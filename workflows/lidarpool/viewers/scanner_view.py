@@ -1,4 +1,4 @@
-"""Shows the sweeps of a `Scanner` in Foxglove or Rerun while a program runs."""
+"""Show the sweeps of a `Scanner` in Foxglove or Rerun while a program runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .viewer import Viewer, open_viewer
 
 
 class ScannerView(ABC):
-    """Shows the sweeps of scanners while a program scans, as a context manager."""
+    """Context manager that shows the sweeps of scanners while a program runs."""
 
     def __init__(self, scanner: Scanner) -> None:
         self._scanner = scanner
@@ -45,15 +45,15 @@ class ScannerView(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Line for users with the addresses to open."""
+        """Message for users that contains the addresses to open."""
 
     @abstractmethod
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
-        """Send a sweep that began at a time of the clock of trajectories, nanoseconds."""
+        """Send a sweep that started at `time_ns` on the clock of trajectories."""
 
     @abstractmethod
     def _end(self) -> None:
-        """Disconnect all programs."""
+        """Disconnect all clients."""
 
     def show(
         self,
@@ -63,20 +63,20 @@ class ScannerView(ABC):
         start_s: float = 0.0,
         scanner: Scanner | None = None,
     ) -> None:
-        """Show a sweep with its frames and the boxes of the actors, and return at once.
+        """Show a sweep with its frames and the boxes of the actors.
 
-        Its time is the time of the call.
+        The method does not wait for clients. The time of the sweep is the time of the call.
 
         Parameters
         ----------
         cloud
-            From `Scanner.sweep`.
+            Sweep that was returned by `Scanner.sweep`.
         pose
-            The pose or trajectory that `Scanner.sweep` was given.
+            Pose or trajectory that was passed to `Scanner.sweep`.
         start_s
-            Start of the sweep by the clock of trajectories, seconds.
+            Start of the sweep in seconds on the clock of trajectories.
         scanner
-            The scanner of the sweep, if there are several, with names; by default the first.
+            Scanner of the sweep if there are several named scanners. By default, the first scanner.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class ScannerView(ABC):
         self._send(scanner or self._scanner, cloud, pose, start_s * 1e9)
 
     def close(self) -> None:
-        """Disconnect all programs."""
+        """Disconnect all clients."""
         if not self._is_closed:
             self._is_closed = True
             self._end()
@@ -100,8 +100,8 @@ class ScannerView(ABC):
         self.close()
 
 
-class _InViewer(ScannerView):
-    """Shows the sweeps of scanners in a viewer of another program."""
+class _ExternalScannerView(ScannerView):
+    """View of a scanner in a third-party viewer."""
 
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         super().__init__(scanner)
@@ -118,17 +118,17 @@ class _InViewer(ScannerView):
 
     @property
     def description(self) -> str:
-        """Line for users with the addresses to open."""
+        """Message for users that contains the addresses to open."""
         return self._viewer.description
 
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
-        self._viewer.show_sweep(_shown(scanner, cloud, pose, time_ns))
+        self._viewer.show_sweep(_sweep_for_viewers(scanner, cloud, pose, time_ns))
 
     def _end(self) -> None:
         self._viewer.close()
 
 
-class Foxglove(_InViewer):
+class Foxglove(_ExternalScannerView):
     """Show the sweeps of a scanner in Foxglove, in real time.
 
     The object is a context manager. It prints the link that opens Foxglove.
@@ -153,7 +153,7 @@ class Foxglove(_InViewer):
         super().__init__(open_viewer("foxglove", to), scanner)
 
 
-class Rerun(_InViewer):
+class Rerun(_ExternalScannerView):
     """Show the sweeps of a scanner in Rerun, in real time.
 
     The object is used like `Foxglove`. It prints the link of the viewer in the browser. By default,
@@ -166,18 +166,18 @@ class Rerun(_InViewer):
         super().__init__(open_viewer("rerun", to), scanner)
 
 
-def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
-    """Return a sweep that a scanner has scanned from a pose or along a trajectory."""
+def _sweep_for_viewers(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
+    """Return a sweep of a scanner, with frames and boxes, for viewers."""
     scene = scanner.scene
     (mounted,) = scanner.survey.carried
-    carrier = pose_at(pose, time_ns)
-    sensor = carrier.compose(mounted.mount)
+    vehicle = pose_at(pose, time_ns)
+    sensor = vehicle.compose(mounted.mount)
     positions = cloud.positions.astype(np.float64)
     if scanner.survey.coordinates == "world":
         positions = (positions - (scene.origin + sensor.position)) @ sensor.rotation_matrix
     frame, *actor_frames = frame_names([mounted.name], [actor.name for actor in scene.actors])
     transforms = [
-        FramePose(WORLD, VEHICLE, *_position_and_quaternion(carrier, scene.origin)),
+        FramePose(WORLD, VEHICLE, *_position_and_quaternion(vehicle, scene.origin)),
         FramePose(VEHICLE, frame, *_position_and_quaternion(mounted.mount, np.zeros(3))),
     ]
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
@@ -198,7 +198,7 @@ def _shown(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSw
 
 
 def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) -> ActorBoxes:
-    """Return the boxes of the actors of a scanner's scene at their poses, as of `Boxes`."""
+    """Return the boxes of the actors in a scanner's scene at their poses."""
     scene = scanner.scene
     actors = scene.actors
     bounds = np.array([actor.bounds for actor in actors])
@@ -220,17 +220,17 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
 
 
 def is_present(actor: Actor, time_ns: float) -> bool:
-    """Return True if an actor is in the scene at a time, nanoseconds."""
+    """Return whether an actor is in the scene at a time in nanoseconds."""
     appears_ns, leaves_ns = presence_ns(actor.trajectory)
     return appears_ns <= time_ns <= leaves_ns
 
 
 def pose_at(pose: Any, time_ns: float) -> Pose:
-    """Return a pose unchanged, or the pose of a trajectory at a time."""
+    """Return the pose of a trajectory at a time, or a pose unchanged."""
     is_trajectory = hasattr(pose, "poses")
     return pose.pose(0, time_ns) if is_trajectory else pose_of("pose", pose)
 
 
 def _position_and_quaternion(pose: Pose, origin: Floats) -> tuple[Floats, Floats]:
-    """Return the position, from local coordinates to the world's, and the quaternion of a pose."""
+    """Return the world position and the quaternion of a pose in local coordinates."""
     return np.array(pose.position) + origin, quaternions_of(pose.rotation_matrix[None])[0]

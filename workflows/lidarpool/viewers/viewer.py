@@ -1,4 +1,4 @@
-"""Interface of viewers, and their addresses."""
+"""Interface of viewers and the addresses on which they listen."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ from .viewer_table import VIEWERS
 
 LOOPBACK = "127.0.0.1"
 _PORTS_TRIED = 20
-_SHOWN_LETTERS = 60  # letters of an address that is refused
+_SHOWN_LETTERS = 60  # maximum length of an invalid address in messages
 
 
 class Viewer(ABC):
-    """Sends sweeps to connected programs that show sweeps.
+    """Context manager that sends sweeps to connected clients.
 
-    A context manager. Programs that connect late get the surroundings, too.
+    Clients that connect late also receive the surroundings.
     """
 
-    description: str  # one line for users: what to open
+    description: str  # message for users that contains the addresses to open
 
     @abstractmethod
     def show_surroundings(self, surroundings: Surroundings) -> None:
-        """Show scene, trajectories and path in place of earlier surroundings."""
+        """Replace the scene, trajectories and planned path."""
 
     @abstractmethod
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), meters, world coordinates."""
+        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
 
     @abstractmethod
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
+        """Show the points, frames and actor boxes of a sweep without waiting for clients."""
 
     @abstractmethod
     def close(self) -> None:
-        """Disconnect all programs."""
+        """Disconnect all clients."""
 
     def __enter__(self) -> Self:
         return self
@@ -67,12 +67,24 @@ class Viewer(ABC):
 def open_viewer(
     name: str, to: str | None = None, title: str = "lidarpool", **options: Any
 ) -> Viewer:
-    """Start the viewer of a name at an address, by default the viewer's usual port on loopback.
+    """Start a viewer by name.
+
+    Parameters
+    ----------
+    name
+        Name of the viewer in `VIEWERS`.
+    to
+        Address and port to listen on. By default, the standard port of the viewer on the loopback
+        interface.
+    title
+        Title of the data.
+    **options
+        Further options of the viewer class.
 
     Raises
     ------
     LidarError
-        If the package of the viewer is missing, or the address cannot be used.
+        If the package of the viewer is not installed, or if the address cannot be used.
     """
     check_installed(name)
     module, _, kind = VIEWERS[name].target.partition(":")
@@ -81,7 +93,7 @@ def open_viewer(
 
 
 def check_installed(name: str) -> None:
-    """Raise LidarError if the package of a viewer is missing in this environment."""
+    """Raise LidarError if the package of a viewer is not installed."""
     row = VIEWERS[name]
     if find_spec(row.package) is None:
         command = install_command(f"lidarpool[{row.extra}]")
@@ -89,7 +101,7 @@ def check_installed(name: str) -> None:
 
 
 class Address(NamedTuple):
-    """Where a viewer listens."""
+    """Address and port on which a viewer listens."""
 
     host: str
     port: int
@@ -99,14 +111,24 @@ class Address(NamedTuple):
 
     @classmethod
     def choose(cls, text: str | None, port: int, count: int = 1) -> Address:
-        """Return the address of ADDRESS:PORT, ADDRESS or :PORT.
+        """Parse ADDRESS:PORT, ADDRESS or :PORT, or choose a free port.
 
-        The rest is loopback and `port`.
+        Missing values default to loopback and `port`. If `text` is empty, another free port is
+        chosen if `port` is in use.
 
-        Without a text it is another free port if `port` is in use. All `count` ports from the port
-        on must be free.
+        Parameters
+        ----------
+        text
+            Address to parse.
+        port
+            Default port.
+        count
+            Number of consecutive ports that must be free.
 
-        LidarError for other text, or if a server cannot listen there.
+        Raises
+        ------
+        LidarError
+            If the text is not a valid address, or if a server cannot listen there.
         """
         check_type("to", text, str, NoneType)
         if text:
@@ -156,9 +178,12 @@ class Address(NamedTuple):
                 ) from error
 
     def wait_until_open(self, timeout_s: float, is_alive: Callable[[], bool]) -> None:
-        """Wait for a server to listen here.
+        """Wait until a server listens on the address.
 
-        Raises LidarError if the server has ended, or after a time.
+        Raises
+        ------
+        LidarError
+            If the server has exited, or after a timeout.
         """
         give_up_at = time.monotonic() + timeout_s
         while is_alive() and time.monotonic() < give_up_at:

@@ -1,4 +1,4 @@
-"""The table of viewers, quick to import for the help of commands."""
+"""Table of viewers, which can be imported quickly for command-line help."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 
 class ViewerRow(NamedTuple):
-    """A kind of viewers: its class and its packages."""
+    """Class and packages of a viewer."""
 
-    target: str  # module and class, which is called with an address and a title
-    package: str  # import package
+    target: str  # MODULE:CLASS, which is called with an address and a title
+    package: str  # name of the import package
     distribution: str
     extra: str  # extra of lidarpool that installs the distribution
 
 
-PAGE = "page"  # the run's own page, in place of a viewer
+PAGE = "page"  # the live page of the run instead of a viewer
 VIEWERS = {
     "foxglove": ViewerRow(
         "lidarpool.viewers.foxglove_server:FoxgloveServer",
