@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all durations slow lock compat chaos mutants soak lint docs format bench clean dev
+.PHONY: help demo test test-all durations slow dist release lock compat chaos mutants soak lint docs format bench clean dev
 
 # Where Python may not write what it has compiled, as in containers, each of the many processes of a
 # run or of the tests would compile all modules again.
@@ -43,6 +43,13 @@ durations: dev  ## seconds of each file of tests, into tests/durations.json; on 
 slow: dev  ## the tests that take seconds to minutes each
 	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
+
+dist: dev  ## source distributions and wheels of all four distributions, checked, in dist/
+	@.ci/dist $(BIN)/python
+
+release: dev  ## check that this commit can be released: versions, changelog, tag, placeholders, links, wheels
+	@$(BIN)/python .ci/release.py
+	$(MAKE) lint dist
 
 lock:  ## newest versions of all dependencies, with hashes, into requirements/; OPTIONS="--upgrade-package numpy" for one
 	@.ci/lock $(OPTIONS)

@@ -4,4 +4,4 @@
 packages is also a distribution of its own.
 """
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.3.0"
