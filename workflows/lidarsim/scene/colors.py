@@ -57,8 +57,8 @@ class Colors:
         Texture coordinates of the corners as in `Cutout`, or None if there are only plain colors.
         Shape (f, 3, 2), float32.
     corners
-        Vertex colors of each face, by which the colors of the images are multiplied in linear light,
-        or None for white. Shape (f, 3, 3), uint8.
+        Vertex colors of each face, or None for white. The colors of the images are multiplied by
+        these colors in linear light. Shape (f, 3, 3), uint8.
     """
 
     images: tuple[Bytes, ...]

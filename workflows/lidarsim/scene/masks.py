@@ -225,8 +225,8 @@ class Texture:
         Raises
         ------
         MaskError
-            If texture coordinates are missing, infinite, too large, or too far outside an image that
-            does not repeat.
+            If texture coordinates are missing, infinite, too large, or too far outside an image
+            that does not repeat.
         """
         if not len(coordinates) or not 0 <= corners.min() <= corners.max() < len(coordinates):
             raise MaskError("texture coordinates are missing")
@@ -298,7 +298,7 @@ class MaskNotes:
         return _noted(self.mask_errors, material)
 
     def without_color(self, material: str) -> AbstractContextManager[None]:
-        """Catch errors of the body, record them for a material, and leave its triangles uncolored."""
+        """Catch errors of the body, record them for a material, and ignore its colors."""
         return _noted(self.color_errors, material)
 
     def lines(self) -> list[str]:

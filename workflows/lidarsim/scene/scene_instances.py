@@ -204,9 +204,9 @@ class Instances:
     def rows_of(self, owners: Integers) -> tuple[Indices, Indices]:
         """Return the indices of all instances of the given objects.
 
-        `owners` contains unique object indices and has shape (k,). The instances are in the order of
-        `owners`. The second array contains the index into `owners` for each instance. Both arrays
-        have shape (m,).
+        `owners` contains unique object indices and has shape (k,). The instances are in the order
+        of `owners`. The second array contains the index into `owners` for each instance. Both
+        arrays have shape (m,).
         """
         order, sorted_owners = self._by_owner
         starts = np.searchsorted(sorted_owners, owners, "left")
