@@ -26,12 +26,15 @@ class Limits(NamedTuple):
     high: float
 
     def is_plain(self) -> bool:
-        """Return whether the limits are those of a typical scale, such as 0 to 1, 100, 255 or 4096."""
+        """Return whether the limits are those of a typical scale, such as 0 to 1, 100 or 255."""
         steps = {self.high, self.high + 1}
         return self.low == 0 and not steps.isdisjoint(_PLAIN_STEPS)
 
     def apply(self, intensities: AnyArray) -> AnyArray:
-        """Normalize intensities so that the limits become 0 and 1, and clip negative results to 0."""
+        """Normalize intensities so that the limits become 0 and 1.
+
+        Negative results are clipped to 0.
+        """
         return np.maximum((intensities - self.low) / (self.high - self.low), 0.0)
 
 
