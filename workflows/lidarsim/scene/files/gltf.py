@@ -110,7 +110,7 @@ class _NodeReader:
         self._worlds: dict[int, Floats] = {}  # {node: transform to the scene} in this frame
 
     def animated_content(self, name: str) -> Content:
-        """Read the scene and bake an animation into its meshes, from the first to the last keyframe."""
+        """Read the scene and bake an animation into its meshes, from the first to the last key."""
         animation = find_animation(self._file.header.get("animations", []), name)
         first, last = keys_of(animation, self._file.accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
@@ -230,7 +230,7 @@ class _NodeReader:
         return _matrices(*(rows.get(name) for name in names))
 
     def motion_notes(self) -> list[str]:
-        """Return notes about animations that are not played, or about masks in an animated scene."""
+        """Return notes on animations that are not played, or on masks in an animated scene."""
         posed_count = self._posed.cache_info().currsize
         animation_count = len(self._file.header.get("animations", ()))
         meshes = (f" with {plural(posed_count, 'deformed mesh', 'deformed meshes')}") * bool(
@@ -249,7 +249,7 @@ class _NodeReader:
         return [f"has {plural(animation_count, 'animation')}{meshes}. {advice}"]
 
     def _weights(self, index: int, node: dict[str, Any]) -> tuple[float, ...]:
-        """Return the weights of the morph targets of a node's mesh in the current animation frame."""
+        """Return the morph target weights of a node's mesh in the current animation frame."""
         mesh = self._file.part("meshes", node["mesh"])
         if not any("targets" in primitive for primitive in mesh["primitives"]):
             return ()

@@ -1,4 +1,4 @@
-"""Animations of glTF 2.0 files, with samplers as in section 3.11 and appendix C of the specification."""
+"""Animations of glTF 2.0 files, with samplers as in section 3.11 and appendix C."""
 
 from __future__ import annotations
 

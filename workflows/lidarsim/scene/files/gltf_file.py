@@ -174,7 +174,10 @@ class GltfFile:
         return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
     def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
-        """Return values of shape (count, width) in a buffer view, starting at `part['byteOffset']`."""
+        """Return values in a buffer view, starting at `part['byteOffset']`.
+
+        The shape is (count, width).
+        """
         row = kind.itemsize * width
         stride = self.part("bufferViews", part["bufferView"]).get("byteStride", row)
         view = self.view(part["bufferView"])[part.get("byteOffset", 0) :]

@@ -110,7 +110,10 @@ class MeshFormat:
         return options
 
     def _named(self, name: str, kind: Any) -> Any:
-        """Import an object by its name, "module:object", and check its type if it comes from a plug-in."""
+        """Import an object by its name, "module:object".
+
+        If the format belongs to a plug-in, the type of the object is checked.
+        """
         if self.plugin is not None:
             return replace(self.plugin, value=name).load(kind)
         module, _, attribute = name.partition(":")
@@ -271,7 +274,7 @@ def plugin_endings() -> tuple[str, ...]:
 
 
 def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
-    """Validate the options for reading a file, and split them into shared and format-specific options.
+    """Validate and split options into shared and format-specific options.
 
     Parameters
     ----------

@@ -323,7 +323,7 @@ def _tell_axes(
 
 
 def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
-    """Return why a file that was rotated from Y-up may already have been Z-up, or an empty string."""
+    """Return why a file that was rotated from Y-up may have been Z-up, or an empty string."""
     if "trimesh" in content.generator:
         return ", but was written by trimesh, which does not convert axes"
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
@@ -464,7 +464,10 @@ def _placed_object(
 
 
 def _keeps_places(transform: Transform) -> bool:
-    """Return whether a transform is the identity, which makes files with many objects faster to read."""
+    """Return whether a transform is the identity.
+
+    Skipping identity transforms makes files with many objects faster to read.
+    """
     return np.array_equal(transform.linear, np.eye(3)) and not transform.offset.any()
 
 
