@@ -302,7 +302,7 @@ class MaskNotes:
         return _noted(self.color_errors, material)
 
     def lines(self) -> list[str]:
-        """Return the notes as predicates whose subject is the name of the file."""
+        """Return the notes as clauses that follow the name of the file."""
         notes = []
         if self.missing_files:
             files = _listed(self.missing_files)

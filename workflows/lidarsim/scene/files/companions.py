@@ -65,7 +65,10 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
 
 
 def outside(name: str) -> str:
-    """Return the error message for a file outside the allowed folders, as a predicate."""
+    """Return the error message for a file outside the allowed folders.
+
+    The message is a clause that follows the name of the mesh file.
+    """
     return (
         f"takes data from {name[-80:]!r}, but only files in its own folder are read. Set assets "
         "to the folder that contains that file"

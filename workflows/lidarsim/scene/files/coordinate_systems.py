@@ -207,7 +207,7 @@ def horizontal_part(crs: Any) -> tuple[Any, float | None]:
 
 
 def is_local(crs: Any) -> bool:
-    """Return whether a system has no georeference but has axes in length units, such as a site grid.
+    """Return whether a system has length units but no georeference, such as a site grid.
 
     Such systems have the type LOCAL_CS in WKT 1 and ENGCRS in WKT 2. `crs` must not be compound.
     """
@@ -366,10 +366,10 @@ def _is_in_zone(epsg: int, x: float, y: float) -> bool:
 
 
 def zone_in_area(epsg: int, x: float, y: float) -> int | None:
-    """Return the EPSG code of the only UTM zone in which a location is in the area of use of a system.
+    """Return the UTM zone that moves a location into the area of use of a system.
 
     This identifies coordinates in a UTM zone that were mistaken for coordinates in the system. The
-    result is None if no zone or several zones fit, and without rasterio.
+    zone is an EPSG code. The result is None if no zone or several zones fit, and without rasterio.
     """
     crs = crs_of_code(epsg) if has_registry() else None
     area = None if crs is None else area_of_use(horizontal_part(crs)[0])

@@ -110,7 +110,10 @@ METRE = CoordinateUnit("metre", 1.0)
 
 
 def unit_by_name(name: str) -> float | None:
-    """Return the length of a unit in meters by its case-insensitive name, or None if it is unknown."""
+    """Return the length of a unit in meters by its name, or None if the unit is unknown.
+
+    The case of the name is ignored.
+    """
     words = re.sub(r"[\s_-]+", " ", name.replace(".", "")).strip().lower()
     return _UNIT_NAMES.get(words)
 
@@ -389,7 +392,10 @@ def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
 
 
 def method_of_keys(keys: Mapping[int, float]) -> str:
-    """Return the name of the projection method in GeoTIFF keys, or an empty string if it is unknown."""
+    """Return the name of the projection method in GeoTIFF keys.
+
+    The name is an empty string if the method is unknown.
+    """
     return _METHODS.get(int(keys.get(_PROJECTION, 0)), "")
 
 

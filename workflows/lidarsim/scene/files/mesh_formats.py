@@ -312,9 +312,10 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
 
 
 def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
-    """Return an error message about unsupported options as a predicate, or an empty string.
+    """Return an error message about unsupported options, or an empty string.
 
-    The message lists the formats that support these options.
+    The message is a clause that follows the name of the file. It lists the formats that support the
+    options.
     """
     names = option_names(row)
     lacks = [name for name in options if name not in names]

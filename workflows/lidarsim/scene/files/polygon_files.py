@@ -109,12 +109,13 @@ class _ObjContent:
 
 
 def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a Wavefront file with an object for each 'o' statement, or each 'g' statement if none.
+    """Read a Wavefront (.obj) file.
 
-    If a name is repeated after 'o', it starts another object. After 'g', it continues the group, as
-    the format defines. Objects are in the order of their statements and are not split by materials.
-    If `options.masks` is not set, all triangles are opaque. Material files and images are only read
-    if required by the options.
+    There is an object for each 'o' statement, or for each 'g' statement if there are no 'o'
+    statements. If a name is repeated after 'o', it starts another object. After 'g', it continues
+    the group, as the format defines. Objects are in the order of these statements and are not split
+    by materials. If `options.masks` is not set, all triangles are opaque. Material files and images
+    are only read if required by the options.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
@@ -268,7 +269,10 @@ def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
 
 
 def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the lines of a file with their line numbers, joining lines that end with a backslash."""
+    """Yield the lines of a file with their line numbers.
+
+    Lines that end with a backslash are joined with the next line.
+    """
     joined = b""
     first = 0
     for number, line in enumerate(re.split(rb"\r\n|\r|\n", data), 1):
@@ -726,7 +730,7 @@ class _PlyElementReader:
         return columns, offset
 
     def _row(self, start: int) -> tuple[list[tuple[int, int]], int]:
-        """Return the offset and number of values of each property in a row, and the end of the row."""
+        """Return the offset and length of each property in a row, and the offset after the row."""
         element = self._element
         body = self._body
         spans = []

@@ -52,7 +52,7 @@ class ObjectClass(NamedTuple):
 
 
 class MeshFileError(Exception):
-    """An error in a mesh file, whose message is a predicate with the file name as its subject."""
+    """An error in a mesh file, whose message is a clause that follows the name of the file."""
 
 
 class ReadOptions(NamedTuple):
@@ -106,7 +106,7 @@ class Content:
     turned: str = ""  # note on why a Y-up file is rotated, or empty
     unit_note: str = ""  # note on the unit if the file does not state it, or empty
     skipped: list[str] = field(default_factory=list)  # names of objects with zero area
-    notes: list[str] = field(default_factory=list)  # predicates whose subject is the file name
+    notes: list[str] = field(default_factory=list)  # clauses that follow the name of the file
     raster: Raster | None = None
     epsg: int | None = None  # code of the coordinate system in meters, if the file states it
     is_landscape: bool = False  # whether the file represents terrain rather than an object

@@ -97,9 +97,10 @@ class StatedSystem:
 
     @classmethod
     def of_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
-        """Create a system from the LASF_Projection records of a LAS file, or return None if none.
+        """Create a system from the LASF_Projection records of a LAS file.
 
-        `prefer_wkt` specifies whether WKT has precedence if a file also has GeoTIFF keys.
+        The result is None if the records do not state a system. `prefer_wkt` specifies whether WKT
+        has precedence if a file also has GeoTIFF keys.
 
         Raises
         ------
@@ -114,7 +115,10 @@ class StatedSystem:
 
     @classmethod
     def of_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
-        """Create a system from the first comment that states only a system, such as "crs: EPSG:3857"."""
+        """Create a system from the first comment that only states a system, or return None.
+
+        For example, "crs: EPSG:3857" is such a comment.
+        """
         matches = (_COMMENT.fullmatch(comment.strip()) for comment in comments)
         texts = (match["wkt"] or f"EPSG:{match['code']}" for match in matches if match)
         return next((cls(text) for text in texts), None)
@@ -136,7 +140,7 @@ class StatedSystem:
         if self.text:
             try:
                 return wkt_code(self.text)
-            except ValueError:  # no WKT, which counts as meters where the user gives the unit
+            except ValueError:  # text that is not WKT is ignored if the user specifies the unit
                 return None
         code = int(self._keys.get(PROJECTED_CRS, 0))
         return None if code in (0, USER_DEFINED) else code
@@ -172,7 +176,10 @@ class StatedSystem:
 
     @cached_property
     def crs(self) -> Any:
-        """The `rasterio.crs.CRS`, or None without rasterio, or if PROJ knows no such system on Earth."""
+        """The `rasterio.crs.CRS`, or None if it is unknown.
+
+        It is unknown without rasterio, and if PROJ knows no such system on Earth.
+        """
         if not has_registry():
             return None
         crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
@@ -199,7 +206,7 @@ class StatedSystem:
 
     @property
     def angles(self) -> str:
-        """Error message about angular or geocentric coordinates as a predicate, or an empty string."""
+        """Note about angular or geocentric coordinates that follows the file name, or an empty string."""
         if self.crs is None or self.crs.is_projected:
             return ""
         if is_geocentric(self.crs):
@@ -208,7 +215,10 @@ class StatedSystem:
 
     @property
     def is_true_by_name(self) -> bool | None:
-        """Whether the projection preserves lengths according to its code or name, or None if unknown."""
+        """Whether the projection preserves lengths, or None if this is unknown.
+
+        This is inferred from the code of the system or the name of the projection.
+        """
         if self._code in WORLD_EPSG:
             return False
         if self._code is not None and is_utm(self._code):
@@ -221,7 +231,7 @@ class StatedSystem:
         else:
             try:
                 method = wkt_method(self.text)
-            except ValueError:  # no WKT, which counts as meters where the user gives the unit
+            except ValueError:  # text that is not WKT is ignored if the user specifies the unit
                 return None
             has_projection = bool(method)
         return projection_kind(method) if has_projection else True  # local systems are true
@@ -274,7 +284,7 @@ class StatedSystem:
 class _Scale:
     """The scale of a system at the location of the positions, as far as it is known."""
 
-    problem: str = ""  # why lengths are not true to scale, as a predicate for the file name
+    problem: str = ""  # why lengths are not true to scale, as a clause after the file name
     epsg: int | None = None  # code of a suggested system that is true to scale
     note: str = ""  # note on lengths at the edges, or on an unknown scale
 
@@ -282,9 +292,7 @@ class _Scale:
 def stated_meters(
     system: StatedSystem | None, positions: Floats, unit: str | None
 ) -> tuple[Meters, list[str]]:
-    """Return the units of x, y and z in meters, and notes.
-
-    Notes are predicates whose subject is the name of the file.
+    """Return the units of x, y and z in meters, and notes that follow the name of the file.
 
     Parameters
     ----------
@@ -424,7 +432,7 @@ class Reprojection:
     Attributes
     ----------
     notes
-        Predicates whose subject is the name of the file.
+        Clauses that follow the name of the file.
 
     Raises
     ------
@@ -474,7 +482,7 @@ class Reprojection:
     def apply(self, positions: Floats) -> Floats:
         """Transform positions to the target system in meters.
 
-        Positions that are not finite become NaN in x and y. The shape is (n, 3).
+        Positions that are not finite become NaN. The shape is (n, 3).
 
         Raises
         ------

@@ -207,7 +207,7 @@ def _is_number(cell: str, separator: str | None) -> bool:
 
 
 def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> list[str]:
-    """Return the names of all cells, or raise ValueError if the header has a different number of cells."""
+    """Return the names of all cells, or raise ValueError if they do not match the header."""
     names = head.names or []
     count = len(first_cells)
     if count < len("xyz"):
