@@ -243,7 +243,7 @@ def check_spray(actors: Iterable[Actor]) -> None:
 def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
     """Return the number of poses to draw for each actor.
 
-    The number is `max_samples`, or fewer if there are many actors.
+    The number is `max_samples`, or fewer if there are many actors, but at least 20.
     """
     return max(20, min(max_samples, MAX_SAMPLES // max(len(actors), 1)))
 

@@ -134,7 +134,7 @@ class PlacedNode(NamedTuple):
     mesh: SceneMesh
     matrix: Floats  # (4, 4), from mesh coordinates to file coordinates
     name: str
-    path: tuple[str, ...] = ()  # names of the closest ancestor nodes, with the closest one last
+    path: tuple[str, ...] = ()  # names of the closest ancestors and of the node, which is last
 
 
 def placed_nodes(
@@ -142,8 +142,9 @@ def placed_nodes(
 ) -> list[PlacedNode]:
     """Return all placed meshes of a scene graph, in which a node can have several parents.
 
-    A placed mesh is named after the closest ancestor node with a name. Without such a node, it is
-    named after the mesh, or `stem` if the mesh has no name either.
+    A placed mesh is named after its node. If the node has no name, the mesh is named after the
+    closest ancestor with a name. Without such an ancestor, the mesh keeps its own name, or is named
+    `stem` if it has none.
 
     Parameters
     ----------

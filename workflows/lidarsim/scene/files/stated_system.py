@@ -206,7 +206,7 @@ class StatedSystem:
 
     @property
     def angles(self) -> str:
-        """Note about angular or geocentric coordinates that follows the file name, or an empty string."""
+        """Clause about angular or geocentric coordinates that follows the file name, or empty."""
         if self.crs is None or self.crs.is_projected:
             return ""
         if is_geocentric(self.crs):
