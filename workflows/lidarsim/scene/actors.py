@@ -28,8 +28,8 @@ from ..schema.checks import check_fields, check_fits
 from ..schema.value_texts import one_line
 from . import face_materials
 from .colors import join_colors
-from .scene_instances import SceneInstance, parts_of
-from .scene_mesh import SceneMesh, stacked
+from .scene_instances import SceneInstance, split_by_masks
+from .scene_mesh import SceneMesh, stack_meshes
 
 MAX_SAMPLES = 200_000  # drawn poses of all actors
 # Number of poses and maximum duration for measuring the length of user-defined trajectories.
@@ -101,7 +101,7 @@ class Actor:
         with prefixed(f"Actor {self.name!r}"):
             check_rotations(np.asarray(rotations, np.float64))
 
-    def following(self, trajectory: Trajectory) -> Actor:
+    def with_trajectory(self, trajectory: Trajectory) -> Actor:
         """Return a copy of the actor with another trajectory.
 
         Raises
@@ -137,7 +137,7 @@ class Actor:
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
-            vertices = animation.vertices_at(self.played(np.array([time_ns]))[0])[0][0]
+            vertices = animation.vertices_at(self.frames_at(np.array([time_ns]))[0])[0][0]
         vertices = rotate(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
@@ -146,7 +146,7 @@ class Actor:
             self.name, vertices + positions[0], self.mesh.faces, colors=self.mesh.colors
         )
 
-    def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
+    def frames_at(self, times_ns: Floats) -> tuple[Floats, Floats]:
         """Return the animation frames and frame rates at several times.
 
         Times have shape (k,) and are in nanoseconds since the start of the survey. Frame
@@ -289,9 +289,9 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
         return replace(flat[0], name=name)
     if any(mesh.animation for mesh in flat):
         return _join_animated(name, flat)
-    parts = [part for mesh in flat for part in parts_of(mesh)]
+    parts = [part for mesh in flat for part in split_by_masks(mesh)]
     parts.sort(key=lambda part: part.mask is not None)  # parts with masks last
-    vertices, faces = stacked((part.vertices, part.faces) for part in parts)
+    vertices, faces = stack_meshes((part.vertices, part.faces) for part in parts)
     cutouts = [cutout for mesh in flat for cutout in mesh.cutouts]
     sizes = [len(part.faces) for part in parts]
     colors = join_colors([part.colors for part in parts], sizes)
@@ -311,7 +311,7 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     sizes = [len(mesh.faces) for mesh in meshes]
     colors = join_colors([mesh.colors for mesh in meshes], sizes)
     materials = face_materials.join_materials([mesh.materials for mesh in meshes], sizes)
-    parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
+    parts = stack_meshes((mesh.vertices, mesh.faces) for mesh in meshes)
     return SceneMesh(name, *parts, colors=colors, animation=animation, materials=materials)
 
 

@@ -23,7 +23,7 @@ class Animation:
     """Evenly spaced keyframes of a mesh, between which its vertices move linearly.
 
     Actors with the same mesh share the animation, but each actor plays it at its own rate
-    (`Actor.played`).
+    (`Actor.frames_at`).
 
     Parameters
     ----------

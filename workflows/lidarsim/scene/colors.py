@@ -78,7 +78,7 @@ class Colors:
         return cls((color,), np.zeros(faces, np.int32))
 
     @classmethod
-    def of_corners(cls, corners: Bytes) -> Colors:
+    def from_vertex_colors(cls, corners: Bytes) -> Colors:
         """Create vertex colors for each face.
 
         `corners` has shape (f, 3, 3).
@@ -86,12 +86,12 @@ class Colors:
         return cls((WHITE,), np.zeros(len(corners), np.int32), corners=corners)
 
     @classmethod
-    def of_faces(cls, colors: Bytes) -> Colors:
+    def from_face_colors(cls, colors: Bytes) -> Colors:
         """Create a plain color for each face.
 
         `colors` has shape (f, 3).
         """
-        return cls.of_corners(colors[:, None].repeat(3, axis=1))
+        return cls.from_vertex_colors(colors[:, None].repeat(3, axis=1))
 
     def take(self, face_selection: Integers | slice) -> Colors:
         """Return the colors of selected faces."""
@@ -99,7 +99,7 @@ class Colors:
         corners = None if self.corners is None else self.corners[face_selection]
         return Colors(self.images, self.image[face_selection], uv, corners)
 
-    def divided(self, face_indices: Integers, weights: Floats) -> Colors:
+    def subdivide(self, face_indices: Integers, weights: Floats) -> Colors:
         """Return the colors of pieces of faces.
 
         Parameters
@@ -114,7 +114,7 @@ class Colors:
         corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
         return replace(faces, uv=uv, corners=corners)
 
-    def mirrored(self) -> Colors:
+    def reverse_corners(self) -> Colors:
         """Return the colors with the corners of each face in reverse order."""
         uv = None if self.uv is None else self.uv[:, ::-1]
         corners = None if self.corners is None else self.corners[:, ::-1]
@@ -134,13 +134,13 @@ class Colors:
             valid &= image.dtype == np.uint8 and image.shape[2:] == (3,)
             valid &= image.size == 3 or (image.size > 3 and self.uv is not None)
         valid &= self.uv is None or bool(np.isfinite(self.uv).all())
-        if not valid or not are_indices(self.image, len(self.images)):
+        if not valid or not are_valid_indices(self.image, len(self.images)):
             raise LidarError(
                 f"The colors of {name!r} do not match its {faces} faces. Expected uint8 images (h, "
                 "w, 3), image (f,), finite uv (f, 3, 2) and corners (f, 3, 3)."
             )
 
-    def means(self) -> Bytes:
+    def mean_colors(self) -> Bytes:
         """Return the mean color of each face, computed in linear light.
 
         The mean is taken over 4 points of each face, or over 100 points if the mesh has at most
@@ -161,7 +161,7 @@ class Colors:
             light = np.zeros((len(block), 3))
             for u, v in points.tolist():
                 colors = lookup.colors_at(rows, np.tile([u, v, 0.0], (len(block), 1)))
-                light += LINEAR[unpacked(colors)]
+                light += LINEAR[unpack_colors(colors)]
             mean_colors[start : start + BLOCK_FACES] = as_srgb(light / len(points))
         return mean_colors
 
@@ -170,7 +170,7 @@ MAX_DENSE_FACES = 20_000  # up to this size, colors are averaged over 100 points
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
-def are_indices(indices: Ints32, count: int) -> bool:
+def are_valid_indices(indices: Ints32, count: int) -> bool:
     """Return whether all numbers are valid indices for a sequence of length `count`."""
     return not indices.size or bool(0 <= indices.min() <= indices.max() < count)
 
@@ -190,7 +190,7 @@ class Lookup:
         images = colors.images
         tints = colors.corners
         self._image = colors.image
-        self._texels = np.concatenate([packed(image.reshape(-1, 3)) for image in images])
+        self._texels = np.concatenate([pack_colors(image.reshape(-1, 3)) for image in images])
         sizes = np.array([image.shape[:2] for image in images], np.int64)
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
@@ -205,10 +205,10 @@ class Lookup:
             rows = slice(start, start + len(block))
             if colors.uv is not None:
                 uv = colors.uv[rows][textured[rows]]
-                textures.append(_planes(block[textured[rows]], uv.astype(np.float64)))
+                textures.append(_fit_planes(block[textured[rows]], uv.astype(np.float64)))
             if tints is not None:
                 light = LINEAR[tints[rows][tinted[rows]]]
-                lights.append(_planes(block[tinted[rows]], light))
+                lights.append(_fit_planes(block[tinted[rows]], light))
             start += len(block)
         self._texture = _Planes.joined(textured, textures)
         self._light = _Planes.joined(tinted, lights)
@@ -226,13 +226,13 @@ class Lookup:
             selected, (u, v) = self._texture.values_at(face_indices, positions)
             image = image[selected]
             width = self._width.take(image)
-            row = _element(v, self._height.take(image))
-            texel[selected] += row * width + _element(u, width)
+            row = _texel_index(v, self._height.take(image))
+            texel[selected] += row * width + _texel_index(u, width)
         colors = self._texels.take(texel)
         if self._light is not None:
             selected, light = self._light.values_at(face_indices, positions)
-            tinted = LINEAR[unpacked(colors[selected])] * np.clip(light.T, 0, 1)
-            colors[selected] = packed(as_srgb(tinted))
+            tinted = LINEAR[unpack_colors(colors[selected])] * np.clip(light.T, 0, 1)
+            colors[selected] = pack_colors(as_srgb(tinted))
         return colors
 
 
@@ -277,7 +277,7 @@ class _Planes(NamedTuple):
         return selected, values
 
 
-def _planes(corners: Floats, values: Floats) -> Floats:
+def _fit_planes(corners: Floats, values: Floats) -> Floats:
     """Return the slopes of `_Planes` for values at the corners of faces.
 
     Degenerate triangles, which rays never hit, have the value of their first corner. Corners have
@@ -297,14 +297,14 @@ def _planes(corners: Floats, values: Floats) -> Floats:
     return planes.reshape(len(corners), 4 * values.shape[2])
 
 
-def _element(coordinate: Floats, size: Ints) -> Ints:
+def _texel_index(coordinate: Floats, size: Ints) -> Ints:
     """Return the row or column of a repeating image that contains a texture coordinate."""
     position = coordinate - np.floor(coordinate)
     position *= size
     return np.minimum(position.astype(np.int64), size - 1)
 
 
-def packed(colors: Bytes) -> UInts32:
+def pack_colors(colors: Bytes) -> UInts32:
     """Pack colors into integers, with red in the lowest byte.
 
     Colors have shape (n, 3), and the result has shape (n,).
@@ -314,7 +314,7 @@ def packed(colors: Bytes) -> UInts32:
     return channels.view("<u4")[:, 0]
 
 
-def unpacked(colors: UInts32) -> Bytes:
+def unpack_colors(colors: UInts32) -> Bytes:
     """Unpack colors from integers.
 
     Packed colors have shape (n,), and the result has shape (n, 3).
@@ -322,17 +322,17 @@ def unpacked(colors: UInts32) -> Bytes:
     return np.ascontiguousarray(colors, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
-def as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
+def pack_as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
     """Encode colors as in the `rgb` field of PCL and ROS.
 
     The bits 0x00RRGGBB of each color are interpreted as a float. All arrays have shape (n,).
     """
-    return packed(np.column_stack([blue, green, red])).view("<f4")
+    return pack_colors(np.column_stack([blue, green, red])).view("<f4")
 
 
 def luminance(colors: UInts32) -> Floats:
     """Return the luminance of packed colors in linear light, from 0 to 1."""
-    red, green, blue = map(np.take, _SHARES, unpacked(colors).T)
+    red, green, blue = map(np.take, _SHARES, unpack_colors(colors).T)
     return np.asarray(red + green + blue)
 
 

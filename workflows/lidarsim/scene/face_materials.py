@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import LidarError
 from ..numerics.arrays import Integers, Ints32
-from .colors import are_indices
+from .colors import are_valid_indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class FaceMaterials:
     index: Ints32 | None = None
 
     @classmethod
-    def named(cls, name: str) -> FaceMaterials | None:
+    def from_name(cls, name: str) -> FaceMaterials | None:
         """Assign the same material to all faces, or return None if the name is empty."""
         return cls((name,)) if name else None
 
@@ -49,7 +49,7 @@ class FaceMaterials:
         fits = len(self.names) > 0 and len(set(self.names)) == len(self.names)
         if index is not None:
             fits = fits and index.shape == (faces,) and index.dtype == np.int32
-            fits = fits and are_indices(index, len(self.names))
+            fits = fits and are_valid_indices(index, len(self.names))
         if not fits:
             raise LidarError(
                 f"The materials of {name!r} do not match its {faces} faces. Names must be unique, "
@@ -104,7 +104,7 @@ class ObjectMaterials:
         ]
         return cls(names, np.concatenate(rows))
 
-    def of_object(self, owner: int, faces: Integers) -> FaceMaterials | None:
+    def for_object(self, owner: int, faces: Integers) -> FaceMaterials | None:
         """Return the materials of selected faces, which must all belong to the object `owner`."""
         if not self.names[owner]:
             return None

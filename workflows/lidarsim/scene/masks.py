@@ -53,7 +53,7 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = Fals
     MaskError
         If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         if not (gray or opened.has_transparency_data):
             return None
         pixels = opened.width * opened.height
@@ -65,7 +65,7 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = Fals
             alpha = np.asarray(rgba.getchannel("A"))
             if alpha.min() < 255:
                 return alpha
-        return np.asarray(_of_bytes(opened).convert("L")) if gray else None
+        return np.asarray(_as_8_bit(opened).convert("L")) if gray else None
 
 
 def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
@@ -79,10 +79,10 @@ def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> 
     MaskError
         If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         if not allowance.fits(PIXEL_BYTES * opened.width * opened.height):
             raise _TooLargeError
-        rgb = _of_bytes(opened).convert("RGB")
+        rgb = _as_8_bit(opened).convert("RGB")
         if max(rgb.size) > MAX_SIDE_PIXELS:
             notes.reduced_sizes.append(f"{rgb.width:,} x {rgb.height:,}")
             rgb.thumbnail((MAX_SIDE_PIXELS, MAX_SIDE_PIXELS), Image.Resampling.BOX)
@@ -102,7 +102,7 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
     MaskError
         If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         pixels = opened.width * opened.height
         if not allowance.fits((PIXEL_BYTES + bytes_per_pixel) * pixels):
             raise _TooLargeError
@@ -115,7 +115,7 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
 
 
 @contextmanager
-def _opened(image: Path | bytes) -> Iterator[Image.Image]:
+def _open_image(image: Path | bytes) -> Iterator[Image.Image]:
     """Open an image, and convert all errors, including those in the body, to MaskError."""
     name = image.name if isinstance(image, Path) else "its image"
     try:
@@ -146,7 +146,7 @@ class _TooLargeError(Exception):
     pass
 
 
-def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
+def cache_with_errors(read: Callable[[K], V]) -> Callable[[K], V]:
     """Cache the results of a function and its MaskErrors."""
 
     @cache
@@ -165,7 +165,7 @@ def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
     return read_once
 
 
-def _of_bytes(image: Image.Image) -> Image.Image:
+def _as_8_bit(image: Image.Image) -> Image.Image:
     """Convert an image with 16 bits per channel to 8 bits, where Pillow would clip the values."""
     if not image.mode.startswith("I;16"):
         return image
@@ -188,10 +188,10 @@ class Texture:
     ) -> None:
         self._wraps = wraps
         self._allowance = allowance
-        _take(allowance, image.size)
+        _deduct(allowance, image.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
             if wrap == "mirror":  # the image and its mirror image repeat alternately
-                _take(allowance, 2 * image.size)
+                _deduct(allowance, 2 * image.size)
                 image = np.concatenate([image, np.flip(image, axis)], axis)
         self._image = image
 
@@ -240,10 +240,10 @@ class Texture:
             if wrap == "mirror":
                 uv[..., column] /= 2
             elif wrap != "repeat":
-                image = self._continued(image, uv[..., column], 1 - column, wrap == "black")
+                image = self._extend(image, uv[..., column], 1 - column, wrap == "black")
         return image, uv.astype(np.float32)
 
-    def _continued(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
+    def _extend(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
         """Extend an image until it covers all texture coordinates, with its edges or with black.
 
         The coordinates are modified in place to match the extended image. Their shape is (k, 3).
@@ -268,7 +268,7 @@ class Texture:
         if not texels_before and not texels_after:
             return image
         continued_size = size + texels_before + texels_after
-        _take(self._allowance, image.size // size * continued_size)
+        _deduct(self._allowance, image.size // size * continued_size)
         widths = [(0, 0)] * image.ndim
         widths[axis] = texels_before, texels_after
         coordinates *= size / continued_size
@@ -276,7 +276,7 @@ class Texture:
         return np.pad(image, widths, mode="constant" if black else "edge")
 
 
-def _take(allowance: Allowance, count: int) -> None:
+def _deduct(allowance: Allowance, count: int) -> None:
     """Deduct bytes from the allowance, or raise MaskError if there are not enough left."""
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
@@ -293,13 +293,13 @@ class MaskNotes:
         self.reduced_sizes: list[str] = []  # original sizes of downscaled color images
         self.missing_files: list[str] = []  # material files that cannot be read
 
-    def without_mask(self, material: str) -> AbstractContextManager[None]:
+    def record_mask_error(self, material: str) -> AbstractContextManager[None]:
         """Catch errors of the body, record them for a material, and make its triangles opaque."""
-        return _noted(self.mask_errors, material)
+        return _record_error(self.mask_errors, material)
 
-    def without_color(self, material: str) -> AbstractContextManager[None]:
+    def record_color_error(self, material: str) -> AbstractContextManager[None]:
         """Catch errors of the body, record them for a material, and ignore its colors."""
-        return _noted(self.color_errors, material)
+        return _record_error(self.color_errors, material)
 
     def lines(self) -> list[str]:
         """Return the notes as clauses that follow the name of the file."""
@@ -335,7 +335,7 @@ class MaskNotes:
 
 
 @contextmanager
-def _noted(reasons: dict[str, str], material: str) -> Iterator[None]:
+def _record_error(reasons: dict[str, str], material: str) -> Iterator[None]:
     """Record errors of the body, unless an error is already recorded for the material."""
     try:
         yield

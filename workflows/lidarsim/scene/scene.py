@@ -24,12 +24,12 @@ from ..schema.checks import as_array, check_fields, check_list
 from ..schema.value_texts import shown
 from ..words import listed, plural
 from .actors import Actor
-from .colors import GRAY, Colors, are_indices, join_colors
+from .colors import GRAY, Colors, are_valid_indices, join_colors
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, load_objects, warn
 from .object_names import SameNames, resolve_same_names, unique_names
-from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
-from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
+from .scene_instances import Instances, MeshPart, SceneInstance, split_by_masks
+from .scene_mesh import Cutout, SceneMesh, drop_unused_vertices, points_array, stack_meshes
 from .shapes import seed_objects
 from .transform import Transform
 
@@ -130,9 +130,9 @@ class Scene:
             raise LidarError(
                 f"The faces of a scene must have the shape (f, 3), but have {faces.shape}."
             )
-        if not are_indices(faces, len(vertices)):
+        if not are_valid_indices(faces, len(vertices)):
             raise LidarError(f"Faces must refer to the {len(vertices)} vertices, counted from 0.")
-        if owners.shape != faces.shape[:1] or not are_indices(owners, len(self.names)):
+        if owners.shape != faces.shape[:1] or not are_valid_indices(owners, len(self.names)):
             raise LidarError(
                 f"face_object must have the index of one of the {len(self.names)} objects, counted "
                 f"from 0, for each of the {len(faces)} faces."
@@ -276,7 +276,7 @@ class Scene:
         vertices = np.zeros((0, 3))
         faces = np.zeros((0, 3), np.int64)
         if split.meshes:
-            vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in split.meshes)
+            vertices, faces = stack_meshes((mesh.vertices, mesh.faces) for mesh in split.meshes)
         instances = split.instances()
         corners = [vertices]
         if instances is not None:
@@ -532,7 +532,7 @@ class Scene:
         )
         sizes = [len(self.faces), *(len(faces) for _, faces in moving)]
         return Scene(
-            *stacked([(self.vertices, self.faces), *moving]),
+            *stack_meshes([(self.vertices, self.faces), *moving]),
             np.append(self.face_object, owners),
             self.object_names,
             self.origin,
@@ -565,7 +565,7 @@ class Scene:
         return tuple(item for items in by_object for item in items)
 
     def _mesh_of_faces(self, owner: int, face_indices: Indices) -> SceneMesh:
-        points, faces = compacted(self.vertices, self.faces[face_indices])
+        points, faces = drop_unused_vertices(self.vertices, self.faces[face_indices])
         return SceneMesh(
             self.names[owner],
             points + self.origin,
@@ -573,7 +573,7 @@ class Scene:
             colors=self.colors and self.colors.take(face_indices),
             materials=None
             if self.materials is None
-            else self.materials.of_object(owner, face_indices),
+            else self.materials.for_object(owner, face_indices),
         )
 
     def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:
@@ -745,7 +745,7 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
             matrix = item.matrix
         if mesh not in part_indices:
             first = len(split.mesh_parts)
-            split.mesh_parts += parts_of(mesh)
+            split.mesh_parts += split_by_masks(mesh)
             part_indices[mesh] = range(first, len(split.mesh_parts))
         for index in part_indices[mesh]:
             part = split.mesh_parts[index]

@@ -20,7 +20,7 @@ from ..schema.checks import check_fields
 from ..schema.value_texts import one_line
 from .colors import Colors
 from .face_materials import FaceMaterials
-from .scene_mesh import Cutout, SceneMesh, Voxels, compacted
+from .scene_mesh import Cutout, SceneMesh, Voxels, drop_unused_vertices
 from .transform import Transform, affine
 
 # No point on Earth is farther from the origin of its map. `sections.Coordinate` has the same limit.
@@ -137,14 +137,14 @@ class MeshPart(NamedTuple):
     materials: FaceMaterials | None = None  # with the names of all materials in the mesh
 
 
-def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
+def split_by_masks(mesh: SceneMesh) -> Iterator[MeshPart]:
     """Divide a mesh by its masks, and yield the parts in the order of the triangles."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
 
     def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:
         rows = slice(first, stop)
         return MeshPart(
-            *_compacted(mesh.vertices, mesh.faces[rows]),
+            *_drop_unused_vertices(mesh.vertices, mesh.faces[rows]),
             mask=None if cut is None else cut.mask,
             uv=None if cut is None else cut.uv,
             colors=mesh.colors and mesh.colors.take(rows),
@@ -159,9 +159,9 @@ def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
         start += len(cut.uv)
 
 
-def _compacted(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
+def _drop_unused_vertices(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
     """Remove unused vertices and return the renumbered faces as int32."""
-    points, corners = compacted(vertices, faces)
+    points, corners = drop_unused_vertices(vertices, faces)
     return points, corners.astype(np.int32)
 
 
@@ -310,7 +310,7 @@ class Instances:
         scales, is_known = self._scales
         unknown = instance_indices[~is_known[instance_indices]]
         if len(unknown):
-            scales[unknown] = scales_of(self.transforms[unknown, :, :3])
+            scales[unknown] = polar_scales(self.transforms[unknown, :, :3])
             is_known[unknown] = True
         return np.asarray(scales[instance_indices])
 
@@ -363,7 +363,7 @@ class _Scales(NamedTuple):
     is_known: Bools  # (n,)
 
 
-def scales_of(matrices: Floats) -> Floats:
+def polar_scales(matrices: Floats) -> Floats:
     """Return the scaling, including mirroring, of each matrix by polar decomposition.
 
     Matrices and scales have shape (m, 3, 3). The rotation is computed by Newton's method (Higham

@@ -172,7 +172,7 @@ class SceneMesh:
         if determinant(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
-            colors = colors and colors.mirrored()
+            colors = colors and colors.reverse_corners()
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
         vertices = rotate(self.vertices, linear) + offset
@@ -217,7 +217,7 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         raise LidarError(f"{name!r} has {faces} faces, but its cutouts have {cutout_faces}.")
 
 
-def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+def stack_meshes(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
     """Concatenate pairs of vertices and faces, and renumber the faces accordingly.
 
     Vertices have shape (v, 3), and faces have shape (f, 3).
@@ -232,7 +232,7 @@ def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyA
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
+def drop_unused_vertices(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
     """Remove unused vertices and renumber the faces accordingly.
 
     The order of the remaining vertices does not change.

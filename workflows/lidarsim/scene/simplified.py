@@ -16,7 +16,7 @@ from .colors import Colors, join_colors
 from .face_materials import ObjectMaterials
 from .scene import Scene
 from .scene_instances import Instances, MeshPart
-from .scene_mesh import stacked, triangle_areas
+from .scene_mesh import stack_meshes, triangle_areas
 
 DRAWN_TRIANGLES = 2_000_000  # total limit for instances, which are simplified if they exceed it
 MIN_PART_TRIANGLES = 32  # minimum for a simplified part
@@ -61,7 +61,7 @@ class SimplifiedScene:
         shares = _triangle_shares(shared, max_triangles, near_positions)
         copies = _CopiedInstances(scene)
         for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = _drawn_part(shared.mesh_parts[index], share)
+            part = _simplify_for_drawing(shared.mesh_parts[index], share)
             for row in np.flatnonzero((shared.part == index) & (shares == share)):
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
@@ -115,7 +115,7 @@ class _CopiedInstances:
 
     def scene(self) -> Scene:
         """Return a scene with all triangles and actors, but without instances."""
-        vertices, faces = stacked(self._meshes)
+        vertices, faces = stack_meshes(self._meshes)
         return Scene(
             vertices,
             faces,
@@ -137,15 +137,15 @@ class _CopiedInstances:
         return ObjectMaterials(self._scene.materials.names, np.concatenate(rows))
 
 
-def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
+def _simplify_for_drawing(part: MeshPart, share: float) -> _DrawnPart:
     """Return a part with the given share of its triangles, each of which has its mean color."""
     vertices = part.vertices
     faces = part.faces
     rows = np.arange(len(part.faces))
     count = max(MIN_PART_TRIANGLES, int(len(faces) * share))
     if count < len(faces):
-        vertices, faces, rows = _simplified_part(part, count)
-    colors = part.colors and Colors.of_faces(part.colors.take(rows).means())
+        vertices, faces, rows = _simplify_part(part, count)
+    colors = part.colors and Colors.from_face_colors(part.colors.take(rows).mean_colors())
     materials = part.materials and part.materials.take(rows)
     return _DrawnPart(vertices, faces, colors, None if materials is None else materials.index)
 
@@ -187,7 +187,7 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
     opaque[0, 0] |= not opaque.any()  # a part must not be empty
     face, piece = np.nonzero(opaque)
     vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
-    colors = part.colors and part.colors.divided(face, corners[piece])
+    colors = part.colors and part.colors.subdivide(face, corners[piece])
     return MeshPart(
         vertices,
         np.arange(len(vertices), dtype=np.int32).reshape(-1, 3),
@@ -246,7 +246,7 @@ class _SimplifiedPart(NamedTuple):
     face_indices: Indices  # (k,), index of the original face
 
 
-def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
+def _simplify_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
     """Reduce a part to at most `max_triangles` while preserving its appearance.
 
     Merging vertices would remove most of a part that consists of many small pieces, such as the
@@ -278,7 +278,7 @@ def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
     return _SimplifiedPart(enlarged.reshape(-1, 3), faces, rows)
 
 
-def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
+def simplify_scene(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
     """Reduce a scene to at most `max_triangles`, and map the original triangles to the new ones.
 
     Returns
@@ -312,11 +312,11 @@ def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _Mer
     area = float(triangle_areas(points[corners]).sum())
     cell = (2 * area / max_triangles) ** 0.5
     while True:
-        merged, counts = _cells(points, cell)
+        merged, counts = _grid_cells(points, cell)
         faces = merged[corners].astype(np.int32)
         collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
         full = np.flatnonzero(~collapsed)
-        keys = _row_numbers(np.sort(faces[full], axis=1))
+        keys = _sort_keys(np.sort(faces[full], axis=1))
         _, distinct, group = np.unique(keys, return_index=True, return_inverse=True)
         if len(distinct) <= max_triangles:
             break
@@ -337,17 +337,17 @@ def _face_at_vertex(faces: Ints32, vertex_count: int) -> Ints:
     return face_at_vertex
 
 
-def _cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
+def _grid_cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
     """Return the grid cell of each point, and the number of points in each cell.
 
     Only cells that contain points are numbered.
     """
     columns = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, merged, counts = np.unique(_row_numbers(columns), return_inverse=True, return_counts=True)
+    _, merged, counts = np.unique(_sort_keys(columns), return_inverse=True, return_counts=True)
     return merged, counts
 
 
-def _row_numbers(rows: AnyArray) -> Ints:
+def _sort_keys(rows: AnyArray) -> Ints:
     """Return numbers that sort in the same order as rows of nonnegative integers.
 
     Sorting the numbers is faster than sorting the rows. Rows have shape (n, 3), and the result has

@@ -37,7 +37,7 @@ def affine(linear: Floats, offset: Floats) -> Floats:
     return matrices
 
 
-def inverted(matrix: Floats) -> Floats:
+def inverse_pose(matrix: Floats) -> Floats:
     """Return the inverse of a pose matrix.
 
     Both matrices have shape (4, 4). The upper left block must be a rotation.

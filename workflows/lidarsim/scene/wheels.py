@@ -23,7 +23,7 @@ _MAX_REVOLUTIONS = 10
 _ROUNDNESS = 0.05  # maximum difference between length and height, relative to the height
 
 
-def rolling(
+def animate_wheels(
     objects: Sequence[SceneMesh | SceneInstance], wheels: Sequence[str], tell: Callable[[str], None]
 ) -> list[SceneMesh]:
     """Animate wheels that roll along x and rotate about y around their centers.

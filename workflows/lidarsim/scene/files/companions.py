@@ -10,7 +10,7 @@ from ..masks import MaskError
 from .scene_graph import MeshFileError, ReadOptions
 
 
-def named_file(
+def find_named_file(
     mesh: Path, name: str, options: ReadOptions, *, allow_moved: bool = True
 ) -> Path | None:
     """Return the path of a file that a mesh file refers to, or None if the file does not exist.
@@ -42,7 +42,7 @@ def named_file(
         except (OSError, ValueError, RuntimeError):
             continue  # no file can have this name
     if refused:
-        raise MeshFileError(outside(name))
+        raise MeshFileError(outside_message(name))
     return None
 
 
@@ -55,7 +55,7 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
         If the image does not exist, or only exists in folders that are not allowed.
     """
     try:
-        file = named_file(mesh, name, options)
+        file = find_named_file(mesh, name, options)
     except MeshFileError as error:
         raise MaskError(str(error)) from error
     if file is None:
@@ -64,7 +64,7 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
     return file
 
 
-def outside(name: str) -> str:
+def outside_message(name: str) -> str:
     """Return the error message for a file outside the allowed folders.
 
     The message is a clause that follows the name of the mesh file.

@@ -138,7 +138,7 @@ def has_registry() -> bool:
     return find_spec("rasterio") is not None
 
 
-def need_registry(purpose: str) -> None:
+def require_registry(purpose: str) -> None:
     """Raise an error if rasterio is not installed.
 
     `purpose` is the subject of the error message.
@@ -155,7 +155,7 @@ def need_registry(purpose: str) -> None:
         )
 
 
-def crs_of_text(text: str) -> Any:
+def crs_from_text(text: str) -> Any:
     """Return the `rasterio.crs.CRS` for WKT, a code such as EPSG:3857, or a PROJ string.
 
     The result is None if PROJ does not understand the text.
@@ -170,14 +170,14 @@ def crs_of_text(text: str) -> Any:
 
 
 @lru_cache(maxsize=32)
-def _crs_of_json(text: str) -> Any:
+def _crs_from_json(text: str) -> Any:
     """Return the `rasterio.crs.CRS` for PROJJSON, cached because parsing takes 20 ms."""
-    return crs_of_text(text)
+    return crs_from_text(text)
 
 
-def crs_of_code(epsg: int) -> Any:
+def crs_from_code(epsg: int) -> Any:
     """Return the `rasterio.crs.CRS` for an EPSG code, or None if the code is unknown."""
-    return crs_of_text(f"EPSG:{epsg}")
+    return crs_from_text(f"EPSG:{epsg}")
 
 
 def projjson(crs: Any) -> dict[str, Any]:
@@ -200,7 +200,7 @@ def horizontal_part(crs: Any) -> tuple[Any, float | None]:
     parts = [_unbound(part) for part in described.get("components", [described])]
     axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
-    horizontal = _crs_of_json(json.dumps(parts[0])) if len(parts) > 1 else crs
+    horizontal = _crs_from_json(json.dumps(parts[0])) if len(parts) > 1 else crs
     if not units:
         return horizontal, None
     return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
@@ -255,13 +255,13 @@ def crs_name(crs: Any) -> str:
     return f"EPSG:{code}" if name in UNNAMED else f"EPSG:{code} ({name})"
 
 
-def named_system(epsg: int) -> str:
+def describe_system(epsg: int) -> str:
     """Return an EPSG code, with the name of the system if rasterio is installed and knows it."""
-    crs = crs_of_code(epsg) if has_registry() else None
+    crs = crs_from_code(epsg) if has_registry() else None
     return f"EPSG:{epsg}" if crs is None else crs_name(crs)
 
 
-def transformed(source: Any, target: Any, points: Floats) -> Floats:
+def transform_coordinates(source: Any, target: Any, points: Floats) -> Floats:
     """Transform points to another coordinate system.
 
     The shape of the points is (n, 2) or (n, 3). Points with coordinates that are not finite become
@@ -281,14 +281,14 @@ def longitude_latitude(crs: Any, x: float, y: float) -> tuple[float, float] | No
 
     The result is None if the location is outside the domain of the system.
     """
-    places = _transformed_places(crs, crs_of_code(4326), np.array([[x, y]]))
+    places = _transform_locations(crs, crs_from_code(4326), np.array([[x, y]]))
     return None if places is None else (float(places[0, 0]), float(places[0, 1]))
 
 
-def _transformed_places(source: Any, target: Any, places: Floats) -> Floats | None:
+def _transform_locations(source: Any, target: Any, places: Floats) -> Floats | None:
     """Transform locations, or return None if any of them cannot be transformed."""
     try:
-        moved = transformed(source, target, places)
+        moved = transform_coordinates(source, target, places)
     except Exception:  # rasterio does not export the classes of GDAL errors
         return None
     return moved if np.isfinite(moved).all() else None
@@ -300,7 +300,7 @@ def area_of_use(crs: Any) -> AreaOfUse | None:
     `crs` must not be compound.
     """
     code = crs.to_epsg(confidence_threshold=90)
-    described = projjson(crs_of_code(code) if code else crs)
+    described = projjson(crs_from_code(code) if code else crs)
     stated = [part for part in (described, *described.get("usages", ())) if part.get("bbox")]
     if not stated:
         return None
@@ -343,7 +343,7 @@ def outside_system(epsg: int, x: float, y: float) -> str:
     """
     if _is_in_zone(epsg, x, y) or not has_registry():
         return ""
-    crs = crs_of_code(epsg)
+    crs = crs_from_code(epsg)
     horizontal = None if crs is None else horizontal_part(crs)[0]
     if horizontal is None or not horizontal.is_projected:
         return ""
@@ -371,14 +371,14 @@ def zone_in_area(epsg: int, x: float, y: float) -> int | None:
     This identifies coordinates in a UTM zone that were mistaken for coordinates in the system. The
     zone is an EPSG code. The result is None if no zone or several zones fit, and without rasterio.
     """
-    crs = crs_of_code(epsg) if has_registry() else None
+    crs = crs_from_code(epsg) if has_registry() else None
     area = None if crs is None else area_of_use(horizontal_part(crs)[0])
     if area is None:
         return None
     longitudes = np.arange(area.west, area.west + area.width, 1.0).tolist()
     latitude = (area.south + area.north) / 2
-    codes = {zone_in_meters((at + 180) % 360 - 180, latitude) for at in longitudes}
-    places = {code: longitude_latitude(crs_of_code(code), x, y) for code in codes - {epsg}}
+    codes = {utm_code((at + 180) % 360 - 180, latitude) for at in longitudes}
+    places = {code: longitude_latitude(crs_from_code(code), x, y) for code in codes - {epsg}}
     fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
     return fitting[0] if len(fitting) == 1 else None
 
@@ -400,21 +400,21 @@ def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
     if not crs.is_projected:
         return None
     base = projjson(crs).get("base_crs")
-    geographic = _crs_of_json(json.dumps(base)) if base else None
+    geographic = _crs_from_json(json.dumps(base)) if base else None
     step = _GROUND_STEP_M / crs.linear_units_factor[1]
     places = np.array([x, y]) + step / 2 * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
-    degrees = _transformed_places(crs, geographic or crs_of_code(4326), places)
+    degrees = _transform_locations(crs, geographic or crs_from_code(4326), places)
     if degrees is None:
         return None
     degrees = degrees * _degrees_per_unit(base or {})
-    east_m, north_m = _ground_meters_of_degrees(base or {}, degrees[:, 1].mean())
+    east_m, north_m = _degree_lengths_m(base or {}, degrees[:, 1].mean())
     longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps can cross 180 degrees
     latitude = np.diff(degrees[:, 1])[::2]
     steps = np.stack([longitude * east_m, latitude * north_m]) / _GROUND_STEP_M
-    return _ellipse(steps)
+    return _tissot_axes(steps)
 
 
-def _ellipse(steps: Floats) -> GroundScale:
+def _tissot_axes(steps: Floats) -> GroundScale:
     """Return the semi-axes of Tissot's indicatrix, which are the singular values of the steps.
 
     The shape of the steps is (2, 2).
@@ -439,7 +439,7 @@ def _degrees_per_unit(base: dict[str, Any]) -> float:
     return 1.0 if isinstance(unit, str) else float(np.degrees(unit["conversion_factor"]))
 
 
-def _ground_meters_of_degrees(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
+def _degree_lengths_m(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
     """Return the ellipsoidal lengths of a degree of longitude and of latitude in meters."""
     datum = base.get("datum") or base.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
@@ -459,7 +459,7 @@ def _ground_meters_of_degrees(base: dict[str, Any], latitude_deg: float) -> tupl
     )
 
 
-def zone_in_meters(longitude: float, latitude: float) -> int:
+def utm_code(longitude: float, latitude: float) -> int:
     """Return the EPSG code of the WGS 84 UTM zone that contains a location.
 
     At latitudes of 84 degrees and more, return the code of the universal polar stereographic
@@ -481,7 +481,7 @@ def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
     if missed_area(horizontal, x, y) is not None:
         return None
     place = longitude_latitude(horizontal, x, y)
-    return None if place is None else zone_in_meters(*place)
+    return None if place is None else utm_code(*place)
 
 
 def projection_kind(name: str) -> bool | None:
@@ -496,19 +496,19 @@ def projection_kind(name: str) -> bool | None:
     return False if "mercator" in letters else None
 
 
-def middle_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
+def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
     """Return the center of the bounding rectangle of the centers of objects.
 
     The result contains x and y, which are zero if there are no objects.
     """
     if not objects:
         return np.zeros(2)
-    middles = np.array([_middle(item)[:2] for item in objects])
+    middles = np.array([_center(item)[:2] for item in objects])
     middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
     return middle
 
 
-def _middle(item: SceneMesh | SceneInstance) -> Floats:
+def _center(item: SceneMesh | SceneInstance) -> Floats:
     """Return the center of the bounding box of an object in world coordinates."""
     if isinstance(item, SceneMesh):
         return np.asarray(item.bounds.mean(axis=0))
@@ -537,7 +537,7 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
     if not has_registry():
         is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
         return "whose meters are not true to scale" if is_known else ""
-    crs = crs_of_text(system)
+    crs = crs_from_text(system)
     horizontal = None if crs is None else horizontal_part(crs)[0]
     scale = None if crs is None else ground_scale(horizontal, x, y)
     if scale is None or scale.is_true:
@@ -574,7 +574,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return ""  # avoids loading the registry, which takes half a second
     if not has_registry():
         return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
-    crs = crs_of_code(epsg)
+    crs = crs_from_code(epsg)
     if crs is None:
         return f"EPSG:{epsg}, which is unknown to rasterio"
     name = f"EPSG:{epsg} ({projjson(crs)['name']})"
@@ -590,7 +590,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return ""
     advice = "Use a system for this location"
     if place := longitude_latitude(horizontal, x, y):
-        advice = f"Use EPSG:{zone_in_meters(*place)}, which is true to scale there"
+        advice = f"Use EPSG:{utm_code(*place)}, which is true to scale there"
     return f"{name}, whose meter is {scale} long at x {x:.9g}, y {y:.9g}{why_there}. {advice}"
 
 

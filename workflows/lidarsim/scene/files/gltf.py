@@ -24,21 +24,21 @@ from ...numerics.vectors import matmul, matvec, norm
 from ...words import listed, plural, printable
 from ..animation import RATE_HZ
 from ..scene_mesh import SceneMesh
-from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keys_of, sample_channels
-from .gltf_draco import DRACO, unpacked
+from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keyframe_range, sample_channels
+from .gltf_draco import DRACO, decompress_draco
 from .gltf_file import (
     INSTANCING,
     VISIBILITY,
     GltfFile,
     check_readable,
-    chunks,
     extension,
     extension_notes,
     natural,
     root_nodes,
+    split_chunks,
 )
 from .gltf_materials import GltfMaterials
-from .polygons import fanned, unrolled
+from .polygons import fan_triangles, unroll_strip
 from .scene_graph import (
     GENERATOR,
     MAX_NODES,
@@ -62,7 +62,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     If `options.masks` is not set, all triangles are opaque. If `options.colors` is not set either,
     no images are read.
     """
-    header, body = chunks(data)
+    header, body = split_chunks(data)
     check_readable(header)
     allowance = Allowance(len(data), SMALLER if options.animation is None else SHORTER)
     file = GltfFile(header, body, path, options, allowance)
@@ -74,7 +74,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
         content = reader.animated_content(options.animation)
     content.unit_m = 1.0
     content.up_axis = "y"
-    content.turned = "as glTF requires"
+    content.rotation_note = "as glTF requires"
     notes = [*reader.visibility_notes(), *extension_notes(header)]
     if notes and not content.meshes:
         raise MeshFileError(f"contains no readable triangles, because it {'; it '.join(notes)}")
@@ -112,7 +112,7 @@ class _NodeReader:
     def animated_content(self, name: str) -> Content:
         """Read the scene and bake an animation into its meshes, from the first to the last key."""
         animation = find_animation(self._file.header.get("animations", []), name)
-        first, last = keys_of(animation, self._file.accessor)
+        first, last = keyframe_range(animation, self._file.accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
@@ -306,7 +306,7 @@ class _NodeReader:
                 if weight and "POSITION" in target:
                     vertices += weight * self._file.accessor(target["POSITION"])
             if joints is not None:
-                vertices = self._skinned(vertices, primitive["attributes"], joints)
+                vertices = self._apply_skin(vertices, primitive["attributes"], joints)
             return unposed._replace(vertices=vertices)
 
         return join_pieces(name, map(piece, surfaces), self._allowance)
@@ -325,7 +325,7 @@ class _NodeReader:
             worlds = matmul(worlds, columns.reshape(len(worlds), 4, 4).transpose(0, 2, 1))
         return worlds
 
-    def _skinned(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
+    def _apply_skin(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
         """Return vertices transformed by the weighted joints of each vertex."""
         blend = np.zeros((len(vertices), 4, 4))
         total = np.zeros(len(vertices))
@@ -360,7 +360,7 @@ class _NodeReader:
         if position is None:
             return Piece(np.empty((0, 3)), np.empty((0, 3), np.int64))
         if packed and "bufferView" not in self._file.part("accessors", position):
-            mesh = unpacked(bytes(self._file.view(packed["bufferView"])), self._allowance)
+            mesh = decompress_draco(bytes(self._file.view(packed["bufferView"])), self._allowance)
             vertices = np.asarray(mesh.points).reshape(-1, 3)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
             return self._materials.with_material(Piece(vertices, faces), primitive, mesh)
@@ -375,7 +375,7 @@ class _NodeReader:
         if mode == 4:
             faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
         else:
-            faces = unrolled(corners) if mode == 5 else fanned(corners)
+            faces = unroll_strip(corners) if mode == 5 else fan_triangles(corners)
         return self._materials.with_material(Piece(vertices, faces), primitive)
 
 

@@ -42,7 +42,9 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
     return animations[names.index(name) if name else 0]
 
 
-def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tuple[float, float]:
+def keyframe_range(
+    animation: Mapping[str, Any], read: Callable[[Any], AnyArray]
+) -> tuple[float, float]:
     """Return the times of the first and the last keyframe of an animation.
 
     `read` returns the values of an accessor.
@@ -86,11 +88,13 @@ def sample_channels(
                 f"keyframes of a {path} must have {WIDTHS[path]} numbers, but have "
                 f"{values.shape[2]}"
             )
-        channels[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
+        channels[target["node"], path] = _interpolate(keys, values, at_s, kind, path == "rotation")
     return channels
 
 
-def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool) -> Floats:
+def _interpolate(
+    keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool
+) -> Floats:
     """Interpolate keyframe values at given times.
 
     Times have shape (t,), keyframe times have shape (k,), and the result has shape (t, w). Keyframe

@@ -12,7 +12,7 @@ from .scene_graph import MeshFileError
 DRACO = "KHR_draco_mesh_compression"
 
 
-def unpacked(data: bytes, allowance: Allowance) -> Any:
+def decompress_draco(data: bytes, allowance: Allowance) -> Any:
     """Decompress a Draco mesh."""
     try:
         import DracoPy

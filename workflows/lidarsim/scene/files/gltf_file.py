@@ -18,7 +18,7 @@ from ...io.allowance import Allowance
 from ...io.input_files import read_input
 from ...numerics.arrays import AnyArray
 from ...words import listed, printable
-from .companions import image_file, named_file
+from .companions import find_named_file, image_file
 from .gltf_draco import DRACO
 from .scene_graph import MeshFileError, ReadOptions
 
@@ -41,7 +41,7 @@ _OLD = "is glTF 1.0, which is not supported. Convert it to glTF 2.0"
 V = TypeVar("V")
 
 
-def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+def split_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Return the JSON object of a file, and the binary buffer of a .glb file."""
     body = b""
     if data[:4] == b"glTF" and len(data) >= 20:
@@ -207,7 +207,7 @@ class GltfFile:
                 )
             content = self._body
         elif uri.startswith("data:"):
-            content = _inline(uri)
+            content = _decode_data_uri(uri)
         else:
             content = self._buffer_file(uri)
         if len(content) < buffer["byteLength"]:
@@ -218,7 +218,7 @@ class GltfFile:
         return content
 
     def _read_buffer_file(self, uri: str) -> bytes:
-        target = named_file(self.path, uri, self._options, allow_moved=False)
+        target = find_named_file(self.path, uri, self._options, allow_moved=False)
         if target is None:
             raise MeshFileError(
                 f"takes data from {uri[:80]!r}, which does not exist. Copy this file to the "
@@ -234,11 +234,11 @@ class GltfFile:
             return read(bytes(self.view(image["bufferView"])), self.allowance)
         uri = image["uri"]
         if uri.startswith("data:"):
-            return read(_inline(uri), self.allowance)
+            return read(_decode_data_uri(uri), self.allowance)
         return read(image_file(self.path, uri, self._options, self.allowance), self.allowance)
 
 
-def _inline(uri: str) -> bytes:
+def _decode_data_uri(uri: str) -> bytes:
     """Decode a data URI."""
     kind, _, text = uri.partition(",")
     content = unquote_to_bytes(text)

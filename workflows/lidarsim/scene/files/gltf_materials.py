@@ -19,9 +19,9 @@ from ..masks import (
     MaskNotes,
     Texture,
     Wrap,
+    cache_with_errors,
     read_colors,
     read_opacity,
-    remembered,
 )
 from .gltf_draco import DRACO
 from .gltf_file import GltfFile, extension, natural
@@ -43,10 +43,10 @@ class GltfMaterials:
         self.options = options
         self.notes = MaskNotes()
         self._texture = cache(self._read_texture)
-        self._opacity = remembered(self._read_opacity)
-        self._mask = remembered(self._read_mask)
-        self._base = remembered(self._read_base)
-        self._tinted = remembered(self._read_tinted)
+        self._opacity = cache_with_errors(self._read_opacity)
+        self._mask = cache_with_errors(self._read_mask)
+        self._base = cache_with_errors(self._read_base)
+        self._tinted = cache_with_errors(self._read_tinted)
 
     @property
     def have_masks(self) -> bool:
@@ -61,7 +61,7 @@ class GltfMaterials:
         if self.options.materials and (number := primitive.get("material")) is not None:
             piece = piece._replace(material=self._material_name(number))
         if self.options.colors and len(piece.faces):
-            with self.notes.without_color(self._material_name(primitive.get("material"))):
+            with self.notes.record_color_error(self._material_name(primitive.get("material"))):
                 piece = piece._replace(colors=self._face_colors(primitive, piece.faces, mesh))
         return self._with_mask(piece, primitive, mesh)
 
@@ -77,7 +77,7 @@ class GltfMaterials:
             if light.shape[1] < 3:
                 raise MaskError("its COLOR_0 is not red, green and blue")
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
-            colors = Colors.of_corners(corners)
+            colors = Colors.from_vertex_colors(corners)
         if number is not None:
             base, info = self._base(natural(number))
             if isinstance(base, Texture):
@@ -122,7 +122,7 @@ class GltfMaterials:
     def _with_mask(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
         number = primitive.get("material")
         if number is not None and self.options.masks and len(piece.faces):
-            with self.notes.without_mask(self._material_name(number)):
+            with self.notes.record_mask_error(self._material_name(number)):
                 if mask := self._texture(number):
                     texture, info = mask
                     uv = self._coordinates(info, primitive, mesh)

@@ -38,7 +38,7 @@ class Limits(NamedTuple):
         return np.maximum((intensities - self.low) / (self.high - self.low), 0.0)
 
 
-def scales_of(limits: Sequence[Limits]) -> Sequence[Limits] | None:
+def common_limits(limits: Sequence[Limits]) -> Sequence[Limits] | None:
     """Return the limits that bring the intensities of all scans to the same scale.
 
     Many programs write the lowest and highest measured intensity of each scan as its limits,

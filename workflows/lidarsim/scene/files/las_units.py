@@ -16,7 +16,7 @@ from typing import NamedTuple
 from ...environment.extras import install_command
 from ...errors import CutShortError, LidarError
 from ...schema.vocabulary import UNITS_M
-from .coordinate_systems import UTM_EPSG, crs_of_code, has_registry
+from .coordinate_systems import UTM_EPSG, crs_from_code, has_registry
 
 # Record numbers of LASF_Projection in ASPRS LAS 1.4, which are also TIFF tags
 GEO_KEYS = 34735
@@ -87,7 +87,7 @@ _OVERRIDE = (
 )
 
 
-def advice_to_project(epsg: int | None) -> str:
+def reprojection_advice(epsg: int | None) -> str:
     """Return a sentence that explains how to transform a cloud to a system in meters.
 
     `epsg` is the code of the suggested system, or None.
@@ -200,7 +200,7 @@ def wkt_units(text: str) -> CoordinateUnits:
     ValueError
         If the text is not valid WKT.
     """
-    node, parts = _systems(text)
+    node, parts = _parse_systems(text)
     horizontal = next((part for part in parts if part.keyword in _HORIZONTAL), None)
     vertical = next((part for part in parts if part.keyword in _VERTICAL), None)
     name = node.values[0] if node.values else node.keyword
@@ -208,7 +208,7 @@ def wkt_units(text: str) -> CoordinateUnits:
         if angular := next((part for part in parts if part.keyword in _ANGULAR), None):
             kind = "geocentric" if _is_geocentric(angular) else "angles"
             raise LidarError(
-                f"its coordinates are {kind} ({name[:80]}). {advice_to_project(None)}."
+                f"its coordinates are {kind} ({name[:80]}). {reprojection_advice(None)}."
             )
         raise ValueError(
             f"its coordinate system begins with {node.keyword[:20]!r}, but the WKT of a projected "
@@ -225,7 +225,7 @@ def wkt_units(text: str) -> CoordinateUnits:
 
 def wkt_method(text: str) -> str:
     """Return the name of the projection method in WKT, or an empty string if there is none."""
-    _, parts = _systems(text)
+    _, parts = _parse_systems(text)
     for part in parts:
         if part.keyword in _HORIZONTAL:
             conversion = part.child({"CONVERSION"}) or part
@@ -236,7 +236,7 @@ def wkt_method(text: str) -> str:
 
 def wkt_code(text: str) -> int | None:
     """Return the EPSG code of the projected system in WKT, or None."""
-    _, parts = _systems(text)
+    _, parts = _parse_systems(text)
     for part in parts:
         code = part.child({"AUTHORITY", "ID"}) if part.keyword in _HORIZONTAL else None
         if code and len(code.values) > 1 and code.values[0].upper() == "EPSG":
@@ -244,12 +244,12 @@ def wkt_code(text: str) -> int | None:
     return None
 
 
-def _systems(text: str) -> tuple[_Node, list[_Node]]:
+def _parse_systems(text: str) -> tuple[_Node, list[_Node]]:
     """Return the coordinate system in WKT, and its components.
 
     A system that is not compound is its only component.
     """
-    node = _without_transformation(_parsed(text))
+    node = _without_transformation(_parse_wkt(text))
     if node.keyword not in _COMPOUND:
         return node, [node]
     return node, [_without_transformation(part) for part in node.nodes]
@@ -268,7 +268,7 @@ def _is_geocentric(system: _Node) -> bool:
     )
 
 
-def _parsed(text: str) -> _Node:
+def _parse_wkt(text: str) -> _Node:
     """Parse WKT and return the root node."""
     root = _Node("")
     open_nodes = [root]
@@ -300,7 +300,7 @@ def _length_unit(system: _Node) -> CoordinateUnit | None:
         if node is system or node.keyword == "AXIS":
             unit = node.child({*_LENGTH_UNITS})
             if unit is not None:
-                return _unit_of(unit)
+                return _parse_unit(unit)
     return None
 
 
@@ -310,10 +310,10 @@ def _third_unit(system: _Node) -> CoordinateUnit | None:
     if len(axes) < 3:
         return None
     unit = axes[2].child({*_LENGTH_UNITS})
-    return _length_unit(system) if unit is None else _unit_of(unit)
+    return _length_unit(system) if unit is None else _parse_unit(unit)
 
 
-def _unit_of(node: _Node) -> CoordinateUnit:
+def _parse_unit(node: _Node) -> CoordinateUnit:
     name, *factors = node.values
     meters = float(factors[0]) if factors else 0.0
     if not 1e-6 <= meters <= 1e6:
@@ -364,7 +364,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
         kind = "geocentric" if model == _GEOCENTRIC else "angles"
-        raise LidarError(f"its coordinates are {kind} (EPSG:{code}). {advice_to_project(None)}.")
+        raise LidarError(f"its coordinates are {kind} (EPSG:{code}). {reprojection_advice(None)}.")
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
     if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
@@ -418,7 +418,7 @@ def units_of_epsg(code: int) -> CoordinateUnits:
 def _vertical_unit_of_epsg(code: int) -> CoordinateUnit | None:
     if code in _DATUMS:
         return None
-    node = _parsed(_wkt_of_epsg(code))
+    node = _parse_wkt(_wkt_of_epsg(code))
     return _length_unit(node) if node.keyword in _VERTICAL else None
 
 
@@ -428,7 +428,7 @@ def _wkt_of_epsg(code: int) -> str:
             f"its coordinate system EPSG:{code} has an unknown unit. {_OVERRIDE}. To look up the "
             f"unit instead, run {install_command('lidarpool[geo]')}."
         )
-    crs = crs_of_code(code)
+    crs = crs_from_code(code)
     if crs is None:
         raise LidarError(f"its coordinate system EPSG:{code} is unknown. {_OVERRIDE}.")
     return str(crs.to_wkt(version="WKT2_2019"))

@@ -87,7 +87,7 @@ class MeshFormat:
         assert self.read is not None, "of a format that is read"
         if not isinstance(self.read, str):
             return self.read
-        reader: MeshReader = self._named(self.read, Callable)
+        reader: MeshReader = self._import_object(self.read, Callable)
         return reader
 
     @property
@@ -101,15 +101,15 @@ class MeshFormat:
         """
         options = self.options
         if isinstance(options, str):
-            options = self._named(options, type)
-        if options is not None and self.plugin is not None and (flaw := _flaw(options)):
+            options = self._import_object(options, type)
+        if options is not None and self.plugin is not None and (flaw := _options_problem(options)):
             raise LidarError(
                 f"{self.plugin} has options that {flaw}. Install a different version of "
                 f"{self.plugin.distribution}."
             )
         return options
 
-    def _named(self, name: str, kind: Any) -> Any:
+    def _import_object(self, name: str, kind: Any) -> Any:
         """Import an object by its name, "module:object".
 
         If the format belongs to a plug-in, the type of the object is checked.
@@ -120,7 +120,7 @@ class MeshFormat:
         return getattr(import_module(module), attribute)
 
 
-def _flaw(options: type) -> str:
+def _options_problem(options: type) -> str:
     """Return why a class cannot define format-specific options, or an empty string if it can."""
     if not is_dataclass(options):
         return "are not a dataclass"
@@ -224,21 +224,21 @@ def format_of(path: str | Path) -> MeshFormat | None:
         If several plug-ins provide the extension, or if the plug-in cannot be used.
     """
     ending = Path(path).suffix.lower()
-    row = _row(ending, _formats_read())
+    row = _first_with_ending(ending, _formats_read())
     if row is not None:
         return row
     plugin = _plugin_of_ending(ending)
-    return _row(ending, iter(_NOT_READ)) if plugin is None else _row_of_plugin(plugin)
+    return _first_with_ending(ending, iter(_NOT_READ)) if plugin is None else _row_of_plugin(plugin)
 
 
-def _row(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
+def _first_with_ending(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
     return next((row for row in rows if ending in row.endings), None)
 
 
 def plugin_of(path: str | Path) -> Plugin | None:
     """Return the plug-in that reads files with the extension of a path, or None."""
     ending = Path(path).suffix.lower()
-    return None if _row(ending, _formats_read()) else _plugin_of_ending(ending)
+    return None if _first_with_ending(ending, _formats_read()) else _plugin_of_ending(ending)
 
 
 def _plugin_of_ending(ending: str) -> Plugin | None:
@@ -273,7 +273,7 @@ def plugin_endings() -> tuple[str, ...]:
     return tuple(plugins_of(GROUP))
 
 
-def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
+def split_options(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
     """Validate and split options into shared and format-specific options.
 
     Parameters
@@ -297,7 +297,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
         If the format does not support an option, or if a value is invalid.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    if problem := lacking(row, values):
+    if problem := unsupported_options(row, values):
         raise LidarError(f"{path} {problem}")
     own_values = {name: value for name, value in values.items() if name not in _SHARED}
     shared_values = {name: value for name, value in values.items() if name in _SHARED}
@@ -311,7 +311,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
     return shared, own
 
 
-def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
+def unsupported_options(row: MeshFormat | None, options: Iterable[str]) -> str:
     """Return an error message about unsupported options, or an empty string.
 
     The message is a clause that follows the name of the file. It lists the formats that support the

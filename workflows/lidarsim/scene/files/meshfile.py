@@ -39,8 +39,8 @@ from .mesh_formats import (
     endings_for,
     format_of,
     missing_packages,
-    options_of,
     plugin_endings,
+    split_options,
 )
 from .scene_graph import (
     GENERATOR,
@@ -137,7 +137,7 @@ def load_objects(
     path = Path(path)
     row = _format_to_read(path)
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
-    shared, own = options_of(row, path, options)
+    shared, own = split_options(row, path, options)
     wanted = ReadOptions(
         masks=shared.opacity == "mask" and shared.animation is None,
         colors=shared.colors,
@@ -156,8 +156,8 @@ def load_objects(
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         axis = shared.up_axis or content.up_axis or "z"
         upright = Transform(UP_AXES[axis] * unit_m, np.zeros(3))
-        objects = _in_world(path, content, upright, shared.transform)
-    _tell_notes(path, content, tell, unit_given=unit is not None)
+        objects = _place_in_world(path, content, upright, shared.transform)
+    _report_notes(path, content, tell, unit_given=unit is not None)
     meshes = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
         raise LidarError(f"{path} contains only triangles without an area.")
@@ -166,7 +166,7 @@ def load_objects(
         and content.generator != GENERATOR
         and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
     ):
-        _tell_axes(path, content, meshes, axes)
+        _report_axes(path, content, meshes, axes)
     epsg = content.epsg or _stated_epsg(data[:_HEAD_BYTES])
     if content.raster is not None:
         epsg = content.raster.epsg
@@ -182,7 +182,7 @@ def load_objects(
     return objects._replace(summary=_summary(meshes, unit_m, axis, wanted))
 
 
-def _in_world(
+def _place_in_world(
     path: Path, content: Content, upright: Transform, transform: Transform | None
 ) -> Objects:
     """Transform the objects of a file to world coordinates.
@@ -198,7 +198,7 @@ def _in_world(
     reaches_m: dict[str, float] = {}  # {name of a remote object: meters from the origin}
     with prefixed(path):
         for mesh in content.meshes:
-            item, reach_m = _placed_object(mesh, path.stem, transforms)
+            item, reach_m = _place_object(mesh, path.stem, transforms)
             if item is None:
                 reaches_m[printable(mesh.name) or printable(path.stem)] = reach_m
             else:
@@ -224,7 +224,7 @@ def _in_world(
     return Objects(tuple(static), tuple(actors))
 
 
-def _tell_notes(
+def _report_notes(
     path: Path, content: Content, tell: Callable[[str], None], *, unit_given: bool
 ) -> None:
     """Call `tell` with messages about skipped objects and with the notes of the reader."""
@@ -293,17 +293,17 @@ def _stated_epsg(head: bytes) -> int | None:
     return int(match[1]) if match else None
 
 
-def _tell_axes(
+def _report_axes(
     path: Path,
     content: Content,
     meshes: Sequence[SceneMesh | SceneInstance],
     axes: Callable[[str], None] | None,
 ) -> None:
     """Call `axes` with a message if a file does not state its axes or was rotated."""
-    if content.turned and content.up_axis == "y":
-        doubt = _seems_to_lie(content, meshes)
+    if content.rotation_note and content.up_axis == "y":
+        doubt = _doubt_about_rotation(content, meshes)
         other_axis = "z"
-        statement = f"was rotated from Y-up to Z-up, {content.turned}{doubt}"
+        statement = f"was rotated from Y-up to Z-up, {content.rotation_note}{doubt}"
     elif path.suffix.lower() == ".obj":  # the format does not define axes, and Y-up is common
         statement = "does not state its axes and is assumed to be Z-up"
         doubt = ""
@@ -322,7 +322,7 @@ def _tell_axes(
         _log.info(as_python(note))
 
 
-def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
+def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
     """Return why a file that was rotated from Y-up may have been Z-up, or an empty string."""
     if "trimesh" in content.generator:
         return ", but was written by trimesh, which does not convert axes"
@@ -349,13 +349,13 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
             raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
         # Readers raise errors of many classes, such as ValueError, IndexError, KeyError,
         # BadZipFile, ParseError and struct.error.
-        failure = _end_missing(error, data) or error
+        failure = _truncation_error(error, data) or error
         raise LidarError(
             f"{unreadable(path, failure, _advice(failure))}{_other_format(path, data)}"
         ) from error
 
 
-def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
+def _truncation_error(error: Exception, data: bytes) -> CutShortError | None:
     """Return a CutShortError if the error of a library means that the file is truncated."""
     if isinstance(error, json.JSONDecodeError):
         if error.msg.startswith("Unterminated") or error.pos >= len(error.doc.rstrip()):
@@ -447,7 +447,7 @@ def _other_format(path: Path, data: bytes) -> str:
     return ""
 
 
-def _placed_object(
+def _place_object(
     item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
 ) -> tuple[SceneMesh | SceneInstance | None, float]:
     """Return an object in world coordinates, and its maximum coordinate in meters.
@@ -457,13 +457,13 @@ def _placed_object(
     """
     name = printable(item.name) or printable(stem)
     for transform in transforms:
-        if name != item.name or not _keeps_places(transform):
+        if name != item.name or not _is_identity(transform):
             item = item.moved(name, transform.linear, transform.offset)
     reach_m = float(np.abs(_corners(item)).max())
     return (item if reach_m <= MAX_COORDINATE_M else None), reach_m
 
 
-def _keeps_places(transform: Transform) -> bool:
+def _is_identity(transform: Transform) -> bool:
     """Return whether a transform is the identity.
 
     Skipping identity transforms makes files with many objects faster to read.

@@ -16,9 +16,17 @@ from ...io.input_files import InputFileError, read_input
 from ...numerics.arrays import Bytes, Floats, Ints
 from ...words import as_text
 from ..colors import Colors, as_bytes
-from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colors, read_opacity, remembered
+from ..masks import (
+    HALF_OPACITY,
+    MaskNotes,
+    Texture,
+    Wrap,
+    cache_with_errors,
+    read_colors,
+    read_opacity,
+)
 from ..scene_mesh import Cutout
-from .companions import image_file, named_file
+from .companions import find_named_file, image_file
 from .scene_graph import SMALLER, MeshFileError, ReadOptions
 
 # Image options and their arguments. The options -o, -s and -t have one to three numbers.
@@ -96,9 +104,9 @@ class MtlMaterials:
         self._mesh = mesh
         self._options = options
         self._allowance = Allowance(size, SMALLER)
-        self._opacity = remembered(self._read_opacity)
-        self._mask = remembered(self._read_mask)
-        self._image = remembered(self._read_image)
+        self._opacity = cache_with_errors(self._read_opacity)
+        self._mask = cache_with_errors(self._read_mask)
+        self._image = cache_with_errors(self._read_image)
         self._entries: dict[bytes, _Entry] = {}
         for data in self._files(libraries):
             self._entries |= _read_mtl(data)
@@ -120,7 +128,7 @@ class MtlMaterials:
         """
         if not self._options.masks or name not in self._entries:
             return None
-        with self.notes.without_mask(as_text(name)):
+        with self.notes.record_mask_error(as_text(name)):
             images = self._entries[name].images
             if texture := self._texture(as_text(name), images):
                 image = images.get(b"map_d") or images[b"map_kd"]
@@ -149,11 +157,11 @@ class MtlMaterials:
             return None
         colors = None
         if (image := entry.images.get(b"map_kd")) is not None:
-            with self.notes.without_color(as_text(name)):
+            with self.notes.record_color_error(as_text(name)):
                 texture = self._image((image.name, image.wrap))
                 colors = texture.colors(image.coordinates(vt), corners)
         elif tints is not None:
-            colors = Colors.of_corners(tints)
+            colors = Colors.from_vertex_colors(tints)
         elif entry.color is not None:
             colors = Colors.plain(entry.color, len(corners))
         return colors
@@ -167,7 +175,7 @@ class MtlMaterials:
         for names in map(as_text, libraries):
             for name in [names] if self._file(names) else names.split():
                 try:
-                    path = named_file(self._mesh, name, self._options)
+                    path = find_named_file(self._mesh, name, self._options)
                 except MeshFileError:
                     reason = "outside the folder of the mesh; set assets to the folder of this file"
                     self.notes.missing_files.append(f"{name} ({reason})")
@@ -189,7 +197,7 @@ class MtlMaterials:
 
     def _file(self, name: str) -> Path | None:
         with suppress(MeshFileError):
-            return named_file(self._mesh, name, self._options)
+            return find_named_file(self._mesh, name, self._options)
         return None
 
     def _texture(self, name: str, images: dict[bytes, _Image]) -> Texture | None:

@@ -117,7 +117,7 @@ def read_pcd(path: Path) -> list[Sweep]:
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
-    return [Sweep(positions, unpacked_colors(columns), pose=pose, scanner=scanner)]
+    return [Sweep(positions, split_rgb(columns), pose=pose, scanner=scanner)]
 
 
 def pcd_bytes(
@@ -348,7 +348,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
             "are present"
         )
     Allowance(file_size, _SMALLER).take(size)
-    content = _unpacked(body[8 : 8 + packed_size], size)
+    content = _decompress(body[8 : 8 + packed_size], size)
     arrays = []
     start = 0
     for field in stored:
@@ -365,7 +365,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
     ]
 
 
-def _unpacked(packed: memoryview, size: int) -> Bytes:
+def _decompress(packed: memoryview, size: int) -> Bytes:
     """Decompress LZF data, or raise ValueError if it is corrupt."""
     from .lzf_loops import unpack_lzf  # importing numba is slow
 
@@ -399,7 +399,7 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
         numbers: AnyArray = values[:, start : start + field.count]
         if field.name != _PADDING and field.kind[1] != "f":
             exact = _exact_integers(field, body, range(start, start + field.count))
-            numbers = _as_type(numbers, field) if exact is None else exact
+            numbers = _as_integers(numbers, field) if exact is None else exact
         arrays.append(numbers)
         start += field.count
     return arrays
@@ -418,7 +418,7 @@ def _exact_integers(field: _Field, body: memoryview, cells: Sequence[int]) -> An
         return None
 
 
-def _as_type(values: Floats, field: _Field) -> AnyArray:
+def _as_integers(values: Floats, field: _Field) -> AnyArray:
     """Convert floating-point numbers to the integer type of a field.
 
     NaN becomes 0, as in PCL. Raise ValueError if other numbers are not representable.
@@ -459,7 +459,7 @@ def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict
     }
 
 
-def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
+def split_rgb(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
     """Replace the packed column `rgb` or `rgba` by red, green and blue.
 
     A column `alpha` is added unless alpha is constant.
@@ -467,7 +467,7 @@ def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
     for name in ("rgb", "rgba"):
         if name not in columns or not columns.keys().isdisjoint(COLORS):
             continue
-        bits = _bits(columns.pop(name))
+        bits = _packed_colors(columns.pop(name))
         for shift, color in zip((16, 8, 0), COLORS, strict=True):
             columns[color] = (bits >> shift & 255).astype(np.uint8)
         alpha = (bits >> 24).astype(np.uint8)
@@ -476,7 +476,7 @@ def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
     return columns
 
 
-def _bits(values: AnyArray) -> AnyArray:
+def _packed_colors(values: AnyArray) -> AnyArray:
     """Return packed colors as integers 0xAARRGGBB.
 
     Colors are stored as integers, or as the bits of floating-point numbers. The first versions of

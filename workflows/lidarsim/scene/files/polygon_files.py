@@ -26,7 +26,7 @@ from ...words import as_text
 from ..colors import Colors, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
-from .polygons import check_corners, triangulated
+from .polygons import check_corners, triangulate
 from .scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 
 
@@ -73,9 +73,9 @@ class _ObjPolygons:
         sizes = _ints(self.sizes)
         check_corners(corners, len(vertices))
         if not self.materials:  # polygons were read without materials
-            faces = triangulated(vertices, corners, sizes)
+            faces = triangulate(vertices, corners, sizes)
             return _ObjTriangles(faces, faces, np.zeros(len(faces), np.int64))
-        faces = triangulated(vertices[corners], np.arange(len(corners)), sizes)
+        faces = triangulate(vertices[corners], np.arange(len(corners)), sizes)
         materials = np.repeat(_ints(self.materials), sizes)
         return _ObjTriangles(corners[faces], _ints(self.coordinates)[faces], materials[faces[:, 0]])
 
@@ -321,7 +321,7 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
     is_colored = options.colors and keyword is not None and keyword[0].upper() == b"COFF"
     vertices, tints = _off_vertices(vertex_lines, is_colored=is_colored)
     corners, sizes = _off_faces(face_lines, len(vertices))
-    faces = triangulated(vertices, corners, sizes)
+    faces = triangulate(vertices, corners, sizes)
     colors = None
     if is_colored and len(tints) == len(vertices):
         colors = _vertex_colors(_color_shares(tints), faces)
@@ -410,7 +410,7 @@ def _color_shares(colors: Floats) -> Floats:
 
 def _vertex_colors(shares: Floats, faces: Ints) -> Colors:
     """Return face colors from vertex colors that range from 0 to 1."""
-    return Colors.of_corners(as_bytes(shares)[faces])
+    return Colors.from_vertex_colors(as_bytes(shares)[faces])
 
 
 # -- .stl ----------------------------------------------------------------------------------------
@@ -556,7 +556,7 @@ def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("the vertex indices of faces must be integers")
-    return triangulated(vertices, corners, sizes)
+    return triangulate(vertices, corners, sizes)
 
 
 def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:

@@ -16,7 +16,7 @@ _WARPED = 1e-5  # maximum deviation of a planar polygon from its plane, relative
 _FLAT = 1e-12  # a corner is reflex if the sine of its turning angle is below minus this
 
 
-def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
+def triangulate(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Triangulate polygons without changing their corners and orientation.
 
     Convex polygons and quadrilaterals become fans, where all polygons with the same number of
@@ -57,20 +57,20 @@ def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
         if size == 4:
             polygon_corners = _from_reflex_corner(vertices, polygon_corners)
         triangle_rows = stops[polygons, None] - (size - 2) + np.arange(size - 2)
-        triangles[triangle_rows] = fanned(polygon_corners)
+        triangles[triangle_rows] = fan_triangles(polygon_corners)
         if size > 4:
             has_reflex = _reflex_corners(vertices[polygon_corners]).any(axis=1)
             for i in np.flatnonzero(has_reflex).tolist():
-                clipped = _clipped_polygon(vertices, polygon_corners[i])
+                clipped = _triangulate_nonconvex(vertices, polygon_corners[i])
                 if len(clipped):  # otherwise, neither the polygon nor the fan has an area
                     triangles[triangle_rows[i]] = -1
                     triangles[triangle_rows[i, : len(clipped)]] = clipped
     return triangles[triangles[:, 0] >= 0]
 
 
-def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
+def _triangulate_nonconvex(vertices: Floats, corners: Ints) -> Ints:
     """Triangulate a polygon with reflex corners, and return no triangles if it has no area."""
-    clipped = with_holes(vertices, [corners])
+    clipped = triangulate_with_holes(vertices, [corners])
     if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
         return np.asarray(corners[_all_triangles(vertices[corners])])
     return clipped
@@ -87,7 +87,7 @@ def _from_reflex_corner(vertices: Floats, quadrangles: Ints) -> Ints:
     return np.take_along_axis(quadrangles, (start[:, None] + np.arange(4)) % 4, axis=1)
 
 
-def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
+def triangulate_with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     """Triangulate a polygon with holes.
 
     The first ring is the outline, and the other rings are holes. The triangles have the orientation
@@ -111,10 +111,10 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     up = (drop + 2) % 3
     if normal[drop] < 0:  # mapbox_earcut always returns counterclockwise triangles
         across, up = up, across
-    return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]
+    return corners[_clip_ears(points[:, [across, up]], [len(ring) for ring in rings])]
 
 
-def _clipped(flat: Floats, sizes: list[int]) -> Ints:
+def _clip_ears(flat: Floats, sizes: list[int]) -> Ints:
     """Triangulate planar rings, which are an outline and holes with the given sizes.
 
     Points have shape (k, 2), and triangles have shape (t, 3).
@@ -124,7 +124,7 @@ def _clipped(flat: Floats, sizes: list[int]) -> Ints:
     return np.asarray(triangles, np.int64).reshape(-1, 3)
 
 
-def unrolled(strip: Ints) -> Ints:
+def unroll_strip(strip: Ints) -> Ints:
     """Return the triangles of a triangle strip, all with the same orientation.
 
     `strip` has shape (t + 2,), and the result has shape (t, 3).
@@ -134,7 +134,7 @@ def unrolled(strip: Ints) -> Ints:
     return faces
 
 
-def fanned(corners: Ints) -> Ints:
+def fan_triangles(corners: Ints) -> Ints:
     """Return the triangles of triangle fans.
 
     `corners` has shape (…, t + 2), and the result has shape (…, t, 3).
@@ -171,7 +171,7 @@ def _all_triangles(points: Floats) -> Ints:
     normal = _newell(points)
     normal = normal / norm(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    clipped = _clipped(rotate(points, np.stack([across, np.cross(normal, across)])), [count])
+    clipped = _clip_ears(rotate(points, np.stack([across, np.cross(normal, across)])), [count])
     if len(clipped) == count - 2:
         return clipped
 
@@ -180,7 +180,7 @@ def _all_triangles(points: Floats) -> Ints:
         return float(norm(np.cross(rotated[1:-1], rotated[2:])).sum())
 
     best = min(range(count), key=area)
-    return fanned((best + np.arange(count)) % count)
+    return fan_triangles((best + np.arange(count)) % count)
 
 
 def _newell(points: Floats) -> Floats:

@@ -84,7 +84,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     first = next_line(lines)
     if first is None:
         raise CutShortError(f"line {number} declares {count:,} points, but none follow")
-    names = names_of_cells(first, _NAMES)
+    names = cell_names(first, _NAMES)
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
@@ -92,7 +92,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     return Sweep(values[:, :3], point_columns(values, names))
 
 
-def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
+def cell_names(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
     """Return the cell names of a line according to the number of cells.
 
     Raises

@@ -21,7 +21,7 @@ from ...numerics.arrays import Floats
 from ...numerics.vectors import matmul
 from ...words import plural, printable
 from ..transform import affine
-from .pts import COLORS, names_of_cells, next_line, point_columns
+from .pts import COLORS, cell_names, next_line, point_columns
 from .text_rows import RowReader
 
 _NAMES = {  # {number of cells in a line: names}
@@ -100,13 +100,13 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
     if not count:
         return Sweep(np.zeros((0, 3)), {}, pose=pose, scanner=scanner)
     first = next_line(lines)
-    names = ("x", "y", "z", "intensity") if first is None else names_of_cells(first, _NAMES)
+    names = ("x", "y", "z", "intensity") if first is None else cell_names(first, _NAMES)
     values = np.zeros((0, len(names)))
     # A line has at least a digit and a separator for each of four numbers.
     if first is not None and 8 * count <= size:
         texts = (line for _, line in lines)
         values = RowReader(names, range(len(names))).read(
-            _begun(first[1], islice(texts, count - 1)), first[0]
+            _with_first(first[1], islice(texts, count - 1)), first[0]
         )
     if len(values) < count:
         following_points = f"{len(values):,} follow" if len(values) else "there are fewer"
@@ -118,7 +118,7 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
     return Sweep(values[:, :3], point_columns(values, names), pose=pose, scanner=scanner)
 
 
-def _begun(first: str, lines: Iterator[str]) -> Iterator[str]:
+def _with_first(first: str, lines: Iterator[str]) -> Iterator[str]:
     yield first
     yield from lines
 

@@ -21,7 +21,7 @@ from ..animation import Animation
 from ..colors import Colors
 from ..face_materials import FaceMaterials
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
-from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
+from ..scene_mesh import Cutout, SceneMesh, drop_unused_vertices, stack_meshes
 from .polygons import check_corners
 
 # Advice for files whose content is too large, without and with an animation.
@@ -103,7 +103,7 @@ class Content:
     unit_m: float | None = None  # length unit of the file in meters, or None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z', or None if neither file nor format specifies it
     generator: str = ""  # program that wrote the file, if known
-    turned: str = ""  # note on why a Y-up file is rotated, or empty
+    rotation_note: str = ""  # note on why a Y-up file is rotated, or empty
     unit_note: str = ""  # note on the unit if the file does not state it, or empty
     skipped: list[str] = field(default_factory=list)  # names of objects with zero area
     notes: list[str] = field(default_factory=list)  # clauses that follow the name of the file
@@ -312,7 +312,7 @@ def join_pieces(
     masked: dict[int, list[Piece]] = {}  # {id of a mask: its pieces}
     for piece in pieces:
         if len(piece.faces):
-            compact = _compacted_piece(piece, allowance)
+            compact = _compact_piece(piece, allowance)
             cut = compact.cutout
             group = solid if cut is None else masked.setdefault(id(cut.mask), [])
             group.append(compact)
@@ -324,7 +324,7 @@ def join_pieces(
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
     ordered = [*chain(solid, *masked.values())]
     sizes = [len(piece.faces) for piece in ordered]
-    vertices, faces = stacked((piece.vertices, piece.faces) for piece in ordered)
+    vertices, faces = stack_meshes((piece.vertices, piece.faces) for piece in ordered)
     return [
         SceneMesh(
             name,
@@ -333,13 +333,13 @@ def join_pieces(
             tuple(cutouts),
             colors.join_colors([piece.colors for piece in ordered], sizes),
             materials=face_materials.join_materials(
-                [FaceMaterials.named(piece.material) for piece in ordered], sizes
+                [FaceMaterials.from_name(piece.material) for piece in ordered], sizes
             ),
         )
     ]
 
 
-def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
+def _compact_piece(piece: Piece, allowance: Allowance | None) -> Piece:
     """Remove unused vertices from a piece, which can share its vertices with other pieces."""
     vertices, faces, cutout, face_colors, material = piece
     check_corners(faces, len(vertices))
@@ -347,7 +347,7 @@ def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
         extra = 0 if cutout is None else cutout.uv.nbytes
         extra += 0 if face_colors is None else 40 * len(faces)
         allowance.take(faces.nbytes + extra)
-    vertices, faces = compacted(vertices, faces)
+    vertices, faces = drop_unused_vertices(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # double precision
     return Piece(vertices, faces, cutout, face_colors, material)

@@ -23,10 +23,10 @@ from ...words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
     UNNAMED,
+    crs_from_code,
+    crs_from_text,
     crs_key,
     crs_name,
-    crs_of_code,
-    crs_of_text,
     ground_scale,
     has_registry,
     horizontal_part,
@@ -34,13 +34,13 @@ from .coordinate_systems import (
     is_true_in_utm,
     is_utm,
     missed_area,
-    need_registry,
     outside_system,
     projection_kind,
     projjson,
+    require_registry,
     suggested_epsg,
     target_problem,
-    transformed,
+    transform_coordinates,
 )
 from .las_units import (
     GEO_DOUBLES,
@@ -50,10 +50,10 @@ from .las_units import (
     USER_DEFINED,
     WKT_KEYWORDS,
     CoordinateUnits,
-    advice_to_project,
     geo_keys,
     height_unit_of_keys,
     method_of_keys,
+    reprojection_advice,
     units_of_epsg,
     units_of_keys,
     wkt_code,
@@ -96,7 +96,7 @@ class StatedSystem:
     records: Mapping[int, bytes] = field(default_factory=dict)
 
     @classmethod
-    def of_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
+    def from_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
         """Create a system from the LASF_Projection records of a LAS file.
 
         The result is None if the records do not state a system. `prefer_wkt` specifies whether WKT
@@ -114,7 +114,7 @@ class StatedSystem:
         return cls(records=records) if keys else None
 
     @classmethod
-    def of_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
+    def from_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
         """Create a system from the first comment that only states a system, or return None.
 
         For example, "crs: EPSG:3857" is such a comment.
@@ -182,10 +182,10 @@ class StatedSystem:
         """
         if not has_registry():
             return None
-        crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
+        crs = crs_from_text(self.text) if self.text else _crs_from_keys(self.records)
         on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
         if not on_earth and self._code:  # GeoTIFF keys contain Esri codes as well as EPSG codes
-            return crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
+            return crs_from_code(self._code) or crs_from_text(f"ESRI:{self._code}")
         return crs if on_earth else None
 
     @property
@@ -316,7 +316,7 @@ def stated_meters(
         return (meter, meter, meter), [note] if problem else []
     scale = _scale_of(system, positions)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {reprojection_advice(scale.epsg)}.")
     units = system.units()
     if units is None:
         return (1.0, 1.0, 1.0), []
@@ -337,7 +337,7 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
         return []
     if system.crs is not None and is_geocentric(system.crs):
         raise LidarError(
-            f"its coordinates are geocentric ({system.name}). {advice_to_project(None)}."
+            f"its coordinates are geocentric ({system.name}). {reprojection_advice(None)}."
         )
     meter = system.horizontal_m
     if meter is None:
@@ -346,7 +346,7 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
         ]
     scale = _scale_of(system, positions / meter)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {reprojection_advice(scale.epsg)}.")
     notes = [scale.note] if scale.note else []
     if meter != 1.0:
         notes.append(
@@ -363,7 +363,7 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     """
     middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
     if system.is_in_utm_zone(positions):  # the registry takes half a second to load
-        return _Scale(note=_place_note(system, middle) if len(positions) else "")
+        return _Scale(note=_location_note(system, middle) if len(positions) else "")
     horizontal = None
     if system.crs is not None and not is_geocentric(system.crs):
         horizontal, _ = horizontal_part(system.crs)
@@ -385,13 +385,13 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     scales = [ground_scale(horizontal, x, y) for x in corners[:, 0] for y in corners[:, 1]]
     error = max((scale.error for scale in scales if scale is not None), default=0.0)
     if error <= MAX_SCALE_ERROR:
-        return _Scale(note=_place_note(system, middle))
+        return _Scale(note=_location_note(system, middle))
     return _Scale(
         note=f"is so large that lengths in {system.name} are wrong by {error:.1%} at its edges"
     )
 
 
-def _place_note(system: StatedSystem, middle: Floats) -> str:
+def _location_note(system: StatedSystem, middle: Floats) -> str:
     """Return a note if coordinates are far outside the area of use, or an empty string.
 
     `middle` contains x and y in the unit of the system.
@@ -442,7 +442,7 @@ class Reprojection:
     """
 
     def __init__(self, system: StatedSystem | None, epsg: int) -> None:
-        need_registry("Transforming a cloud to another coordinate system")
+        require_registry("Transforming a cloud to another coordinate system")
         if system is None:
             raise LidarError(
                 f"it states no coordinate system, so it cannot be transformed to EPSG:{epsg}. "
@@ -452,7 +452,7 @@ class Reprojection:
         source = system.crs
         if source is None:
             raise LidarError(f"its coordinate system {system.name!r} is unknown to PROJ.")
-        target = crs_of_code(epsg)
+        target = crs_from_code(epsg)
         if target is None:
             raise LidarError(f"EPSG:{epsg} is unknown to PROJ. Use the code of a different system.")
         self._epsg = epsg
@@ -493,22 +493,24 @@ class Reprojection:
         moved = np.where(finite[:, None], positions, np.nan).astype(np.float64)
         axes = slice(3) if self._is_geocentric else slice(2)
         try:
-            moved[finite, axes] = transformed(self._source, self._target, moved[finite, axes])
+            moved[finite, axes] = transform_coordinates(
+                self._source, self._target, moved[finite, axes]
+            )
         except Exception as error:  # rasterio does not export the classes of GDAL errors
-            raise self._no_place() from error
+            raise self._location_error() from error
         if not np.isfinite(moved[finite]).all():
-            raise self._no_place()
+            raise self._location_error()
         moved[:, 2] *= self._height_m
         return moved
 
-    def _no_place(self) -> LidarError:
+    def _location_error(self) -> LidarError:
         return LidarError(
             f"it contains points that cannot be transformed to EPSG:{self._epsg}. Use the code of "
             "a different system."
         )
 
 
-def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
+def _crs_from_keys(records: Mapping[int, bytes]) -> Any:
     """Return the `rasterio.crs.CRS` for GeoTIFF keys, or None.
 
     GDAL reads the keys from a TIFF with a single pixel, so that user-defined projections are

@@ -24,7 +24,7 @@ from ...io.tables import column_name
 from ...numerics.arrays import AnyArray, Floats
 from ...schema.vocabulary import UNITS_M
 from ...words import distinct, plural, printable
-from .text_rows import REMARKS, RowReader, cells_of
+from .text_rows import COMMENT_PREFIXES, RowReader, cells_of
 
 _SEPARATORS = (";", "\t", ",", None)
 _HEAD_BYTES = 1 << 12
@@ -142,8 +142,8 @@ def _read_head(lines: Iterator[str]) -> _Head:
         if names is None and (header := _header_names(text.lstrip("#/% "))) is not None:
             names = header
             names_line = number
-            is_remark = text.startswith(REMARKS)
-        elif not text or text.startswith(REMARKS):
+            is_remark = text.startswith(COMMENT_PREFIXES)
+        elif not text or text.startswith(COMMENT_PREFIXES):
             if number > _MAX_HEAD_LINES:
                 raise ValueError(f"its first {_MAX_HEAD_LINES:,} lines contain no points")
         elif text.isdecimal() and announced is None:

@@ -19,7 +19,7 @@ import numpy as np
 from ...numerics.arrays import Floats
 from ...words import plural, printable
 
-REMARKS = ("#", "//", "%")  # prefixes of comment lines
+COMMENT_PREFIXES = ("#", "//", "%")  # prefixes of comment lines
 _BLOCK = 1 << 16  # lines that are read at once
 _SHOWN = 40  # maximum number of characters of a cell in an error message
 
@@ -105,7 +105,7 @@ class RowReader:
         used = range(width) if self.used is None else self.used
         for line_number, line in enumerate(lines, number):
             text = line.strip()
-            if not text or text.startswith(REMARKS):
+            if not text or text.startswith(COMMENT_PREFIXES):
                 continue
             cells = cells_of(text, self.separator)
             if len(cells) == len(self.names) + 1 and not cells[-1]:
