@@ -16,7 +16,7 @@ from ..numerics.elementary import power
 from ..numerics.vectors import matmul
 from ..words import plural
 
-# Faces without a color are gray with half of the linear light, like the default reflectance.
+# Faces without a color have a linear gray value of 0.5, which is also the default reflectance.
 GRAY = np.full((1, 1, 3), 188, np.uint8)
 WHITE = np.full((1, 1, 3), 255, np.uint8)
 WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709

@@ -34,7 +34,7 @@ V = TypeVar("V")
 
 
 class MaskError(Exception):
-    """An error that states as a clause why a mask or an image cannot be read."""
+    """An error whose message is a clause that states why an image cannot be read."""
 
 
 def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = False) -> Bytes | None:

@@ -366,7 +366,7 @@ def _is_in_zone(epsg: int, x: float, y: float) -> bool:
 
 
 def zone_in_area(epsg: int, x: float, y: float) -> int | None:
-    """Return the UTM zone that moves a location into the area of use of a system.
+    """Return the UTM zone in which a location would be in the area of use of a system.
 
     This identifies coordinates in a UTM zone that were mistaken for coordinates in the system. The
     zone is an EPSG code. The result is None if no zone or several zones fit, and without rasterio.

@@ -366,7 +366,7 @@ class _NodeReader:
             return self._materials.with_material(Piece(vertices, faces), primitive, mesh)
         vertices = self._file.accessor(position)
         mode = primitive.get("mode", 4)
-        # This is for the corners and the triangles of strips and fans before they are checked.
+        # Reserve memory for the corners and for the triangles of strips and fans.
         count = len(vertices if index is None else self._file.accessor(index))
         self._allowance.take((8 if mode == 4 else 24) * count)
         corners = np.arange(count)
