@@ -17,8 +17,8 @@ from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
 
 _POSES_PER_REVOLUTION = 64  # linear interpolation between poses shrinks a wheel by up to 0.12 %
-# Maximum revolutions of a wheel per revolution of the largest wheel. All wheels have the same number
-# of poses, so fast wheels increase the number of poses of the other wheels.
+# Maximum revolutions of a wheel per revolution of the largest wheel. All wheels have the same
+# number of poses, so fast wheels increase the number of poses of the other wheels.
 _MAX_REVOLUTIONS = 10
 _ROUNDNESS = 0.05  # maximum difference between length and height, relative to the height
 
