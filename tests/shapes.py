@@ -15,7 +15,7 @@ from raybeam import available_backends
 
 CPU = [name for name in ("numpy", "tiles") if not available_backends()[name]]
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
-COLORS = Colors.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+COLORS = Colors.from_face_colors(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
 PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
 BALL_AROUND = Scene.from_meshes(
     [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colors=COLORS), PLATE]

@@ -59,7 +59,7 @@ def reds(scene):
     """Return the mean red of the surfels, and their x."""
     centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
     (mesh,) = scene.meshes()
-    return mesh.colors.means()[:, 0].astype(int), centers[:, 0]
+    return mesh.colors.mean_colors()[:, 0].astype(int), centers[:, 0]
 
 
 @pytest.fixture

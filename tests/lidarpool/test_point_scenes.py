@@ -208,7 +208,7 @@ def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
         write_scene(tmp_path / "b.glb", scene)
         again = Scene.load(tmp_path / "b.glb", colors=True, materials=True)
         assert again.triangles == 2 * len(GRID)
-        (means,) = np.unique(again.colors.means(), axis=0)
+        (means,) = np.unique(again.colors.mean_colors(), axis=0)
         # Half of a white surface's light, and the mean of 0, 50 and 100 in linear light.
         expected = [100, 0, 64] if color == "rgb" else 3 * [188]
         assert np.abs(means.astype(int) - expected).max() <= 1
@@ -350,7 +350,7 @@ def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
 def reds(scene):
     """Return the red of surfels, and their x."""
     centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
-    return scene.meshes()[0].colors.means()[:, 0].astype(int), centers[:, 0]
+    return scene.meshes()[0].colors.mean_colors()[:, 0].astype(int), centers[:, 0]
 
 
 def ptx_scan(x, cells):
@@ -433,7 +433,7 @@ def test_packed_colors_are_read_in_all_formats(tmp_path):
     rows["rgb"] = 200 << 16 | 100 << 8 | 50
     np.save(tmp_path / "a.npy", rows)
     scene = scene_of_points(tmp_path / "a.npy", voxel_m=1e-3)
-    assert np.unique(scene.meshes()[0].colors.means(), axis=0).tolist() == [[200, 100, 50]]
+    assert np.unique(scene.meshes()[0].colors.mean_colors(), axis=0).tolist() == [[200, 100, 50]]
 
 
 def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):

@@ -247,7 +247,7 @@ def test_surfaces_are_as_bright_as_they_were(place):
     scene = place.scene
     middles = scene.vertices[scene.faces].mean(axis=1)
     (colors,) = scene.colored
-    light = LINEAR[colors.means()].mean(axis=1)
+    light = LINEAR[colors.mean_colors()].mean(axis=1)
     floor = np.median(light[middles[:, 2] < 0.05])
     walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
     np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.15)

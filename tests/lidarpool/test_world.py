@@ -62,7 +62,7 @@ def test_a_local_plan_is_written_in_its_system(tmp_path, origin, added):
     np.testing.assert_array_equal(read_cloud(tmp_path / "cloud.ply").positions, expected)
     head = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0].decode()
     comments = [line.removeprefix("comment ") for line in head.splitlines()]
-    assert StatedSystem.of_comments(comments) == StatedSystem("EPSG:25832")
+    assert StatedSystem.from_comments(comments) == StatedSystem("EPSG:25832")
     part = pq.read_table(tmp_path / "cloud.parquet" / "part-00000.parquet")
     np.testing.assert_array_equal(np.stack([part[axis] for axis in "xyz"], axis=1), expected)
     assert part.schema.metadata[b"crs"] == b"EPSG:25832"

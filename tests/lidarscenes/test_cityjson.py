@@ -154,7 +154,7 @@ def test_surfaces_that_are_not_there_and_colors(tmp_path):
     (tube,) = load(tmp_path, city({"a": one}, appearance=appearance), notes, colors=True)
     assert area(tube) == pytest.approx(5)
     assert "1 texture, 1 ClosureSurface" in notes[-1]
-    shown = tube.colors.means()
+    shown = tube.colors.mean_colors()
     assert (shown == [255, 0, 0]).all(axis=1).sum() == 8, "four sides"
     assert (shown == 188).all(axis=1).sum() == 2, "one without a material"
 

@@ -392,7 +392,7 @@ def test_colors_materials_and_retro_are_those_of_visuals(tmp_path):
         model("glass", link(inside=shape(SHAPE, more="<transparency>1</transparency>"))),
     )
     objects, _, notes = load(tmp_path, text, colors=True, materials=True)
-    colors = {name: item.colors.means()[0].tolist() for name, item in objects.items()}
+    colors = {name: item.colors.mean_colors()[0].tolist() for name, item in objects.items()}
     assert colors["red/link"] == [255, 128, 0] and colors["blue/link"] == [0, 0, 255]
     assert colors["retro/link"] == [188] * 3 and colors["bright/link"] == [255] * 3
     assert objects["blue/link"].materials.names == ("Gazebo/Blue",)
@@ -412,7 +412,7 @@ def test_images_of_meshes_are_in_the_folder_of_textures(tmp_path):
     Image.new("RGB", (4, 4), (200, 100, 50)).save(textures / "wood.png")
     objects, _, notes = load(tmp_path, world(include("model://chair")), colors=True)
     assert not notes
-    assert objects["chair/link"].colors.means().tolist() == [[200, 100, 50]]
+    assert objects["chair/link"].colors.mean_colors().tolist() == [[200, 100, 50]]
 
 
 def test_actors_follow_their_waypoints(tmp_path):

@@ -167,7 +167,7 @@ def test_shapes_and_their_colors(tmp_path):
     for name, (_, (x, y, z)) in shapes.items():
         mesh = robot.meshes[name]
         assert np.allclose(np.ptp(mesh.bounds, axis=0), (y, x, z), rtol=2e-3), name
-        assert mesh.colors.means()[0].tolist() == [255, 128, 0]
+        assert mesh.colors.mean_colors()[0].tolist() == [255, 128, 0]
     assert robot_of(tmp_path, *links, *joints, color).meshes["box"].colors is None
     # Mirrored by a negative scale: faces still look the same way.
     corners = robot.meshes["mesh"].vertices[robot.meshes["mesh"].faces]

@@ -77,11 +77,11 @@ def test_colors_come_back_from_a_glb_file(tmp_path):
         found = {}
         for part in read[name]:
             own = part.colors
-            shades = np.full((len(part.faces), 3), 188) if own is None else own.means()
+            shades = np.full((len(part.faces), 3), 188) if own is None else own.mean_colors()
             for triangle, shade in zip(part.vertices[part.faces], shades, strict=True):
                 key = tuple(triangle.mean(axis=0).round(3) + 0.0)
                 found[key] = shade.astype(int)
-        expected = np.full((12, 3), 188) if mesh.colors is None else mesh.colors.means()
+        expected = np.full((12, 3), 188) if mesh.colors is None else mesh.colors.mean_colors()
         for triangle, shade in zip(mesh.vertices[mesh.faces] + shift, expected, strict=True):
             key = tuple(triangle.mean(axis=0).round(3) + 0.0)
             assert np.abs(found[key] - shade.astype(int)).max() <= 1, name

@@ -20,7 +20,7 @@ from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import distinct_meshes, join_meshes
 from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation
 from lidarsim.scene.files.meshfile import load_objects
-from lidarsim.scene.wheels import rolling
+from lidarsim.scene.wheels import animate_wheels
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
@@ -390,13 +390,13 @@ def test_the_rate_follows_the_way_and_who_stands_keeps_the_pose(walker):
     seconds, rates = actor.seconds(times)
     np.testing.assert_allclose(seconds, [0.1, 0.1, 0.35, 0.6, 0.6, 0.6, 0.35, 0.1])
     np.testing.assert_allclose(rates, [0, 0.5, 0.5, 0, 0, -0.5, -0.5, 0])
-    frames, passing = actor.played(times)
+    frames, passing = actor.frames_at(times)
     duration = walker.animation.duration_s
     step = walker.animation.step_s
     np.testing.assert_allclose(frames * step, np.mod(seconds, duration))
     np.testing.assert_allclose(passing * step, rates)
     by_time = replace(walker, animation=replace(walker.animation, speed_m_s=None, repeat=False))
-    frames, passing = Actor(by_time, way).played(np.array([-1, 0.5, 2]) * 1e9)
+    frames, passing = Actor(by_time, way).frames_at(np.array([-1, 0.5, 2]) * 1e9)
     np.testing.assert_allclose(frames * step, [0, 0.5, duration])
     np.testing.assert_allclose(passing * step, [0, 1, 0])
 
@@ -590,10 +590,10 @@ def test_wheels_turn_by_speed_over_radius():
     parts = [box("Body", (4, 1.6, 1)), ring("wheel_front", 0.3, [1.2, 0.8, 0.3]),
              ring("wheel_rear", 0.6, [-1.2, 0.8, 0.6])]  # fmt: skip
     notes = []
-    mesh = join_meshes("Car", rolling(parts, ["wheel*"], notes.append))
+    mesh = join_meshes("Car", animate_wheels(parts, ["wheel*"], notes.append))
     assert not notes and mesh.animation.duration_s == pytest.approx(2 * np.pi * 0.6)
     actor = Actor(mesh, Track([0, 10], [[0, 0, 0], [50, 0, 0]]))
-    frames, rates = actor.played(np.array([0.1, 0.37]) * 1e9)
+    frames, rates = actor.frames_at(np.array([0.1, 0.37]) * 1e9)
     places, moves = mesh.animation.vertices_at(frames)
     velocity = moves * rates[:, None, None] + [5, 0, 0]
     assert np.array_equal(velocity[:, :8], np.full((2, 8, 3), [5.0, 0, 0]))
@@ -603,20 +603,20 @@ def test_wheels_turn_by_speed_over_radius():
         expected = 5 / radius * np.stack([from_axle[..., 2], -from_axle[..., 0]], axis=-1)
         np.testing.assert_allclose(velocity[:, wheel][..., [0, 2]] - [5, 0], expected, atol=0.3)
     flat = replace(parts[1], name="wheel_flat", vertices=parts[1].vertices * [1, 1, 0.5])
-    rolling([*parts, flat], ["wheel*"], notes.append)
+    animate_wheels([*parts, flat], ["wheel*"], notes.append)
     assert notes == [
         "wheel_flat is not round about its y axis (0.6 m long, 0.3 m high) and does not rotate"
     ]
     oval = replace(parts[1], name="wheel_oval", vertices=parts[1].vertices * [1, 1, 0.97])
-    rolling([*parts, oval], ["wheel*"], notes.append)
+    animate_wheels([*parts, oval], ["wheel*"], notes.append)
     assert len(notes) == 1, "3 % off round still rotates"
     nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
-    rolling([*parts, nut], ["wheel*"], notes.append)
+    animate_wheels([*parts, nut], ["wheel*"], notes.append)
     assert notes[1:] == ["wheel_nut is 60 times smaller than the largest wheel and does not rotate"]
     with pytest.raises(
         LidarError, match=r"'axle', but no object has that name\. Available names: Bo"
     ):
-        rolling(parts, ["wheel*", "axle"], notes.append)
+        animate_wheels(parts, ["wheel*", "axle"], notes.append)
     with pytest.raises(
         LidarError,
         match=(
@@ -624,7 +624,7 @@ def test_wheels_turn_by_speed_over_radius():
             r"rotate\.$"
         ),
     ):
-        rolling([*parts, flat], ["wheel_flat"], notes.append)
+        animate_wheels([*parts, flat], ["wheel_flat"], notes.append)
 
 
 def scenario(folder, *actors, **sections):

@@ -48,8 +48,8 @@ from lidarsim.scene.colors import (
     as_srgb,
     colors_summary,
     luminance,
-    packed,
-    unpacked,
+    pack_colors,
+    unpack_colors,
 )
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -166,7 +166,7 @@ def test_colors_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
         path = tmp_path / "m.ply"
         text = PLY.format(names) + "".join(rows) + "3 0 1 2\n"
     write(path, text)
-    assert Scene.load(path, colors=True).colors.means().tolist() == [[255, 128, 0]]
+    assert Scene.load(path, colors=True).colors.mean_colors().tolist() == [[255, 128, 0]]
 
 
 EFFECTS = """
@@ -410,8 +410,8 @@ def test_colors_that_do_not_fit_are_refused():
 def test_light_and_bytes_are_one_another(rows):
     colors = np.array(rows, np.uint8)
     np.testing.assert_array_equal(as_srgb(LINEAR[colors]), colors)
-    np.testing.assert_array_equal(unpacked(packed(colors)), colors)
-    np.testing.assert_allclose(luminance(packed(colors)), LINEAR[colors] @ WEIGHTS)
+    np.testing.assert_array_equal(unpack_colors(pack_colors(colors)), colors)
+    np.testing.assert_allclose(luminance(pack_colors(colors)), LINEAR[colors] @ WEIGHTS)
 
 
 def test_a_material_has_the_reflectance_of_the_nearer_wavelength():

@@ -12,16 +12,16 @@ from lidarsim import LidarError, Survey
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.coordinate_systems import (
     area_of_use,
-    crs_of_code,
-    crs_of_text,
+    crs_from_code,
+    crs_from_text,
     ground_scale,
     outside_system,
     scale_problem,
     suggested_epsg,
     target_problem,
-    transformed,
+    transform_coordinates,
+    utm_code,
     zone_in_area,
-    zone_in_meters,
 )
 
 needs_registry = pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
@@ -30,7 +30,9 @@ ECCENTRICITY_2 = 0.0066943799901413165  # of WGS 84, squared
 
 
 def place(epsg, longitude, latitude):
-    return transformed(crs_of_code(4326), crs_of_code(epsg), np.array([[longitude, latitude]]))[0]
+    return transform_coordinates(
+        crs_from_code(4326), crs_from_code(epsg), np.array([[longitude, latitude]])
+    )[0]
 
 
 def radii_m(latitude):
@@ -51,7 +53,7 @@ def test_scales_of_mercator_projections_are_their_closed_forms(longitude, latitu
         3395: [across_m * cosine / AXIS_M] * 2,
     }
     for epsg, expected in true_m.items():
-        scale = ground_scale(crs_of_code(epsg), *place(epsg, longitude, latitude))
+        scale = ground_scale(crs_from_code(epsg), *place(epsg, longitude, latitude))
         np.testing.assert_allclose((scale.shortest, scale.longest), expected, rtol=2e-5)
 
 
@@ -61,7 +63,7 @@ def test_the_scale_of_a_utm_zone_is_its_series(latitude, longitude):
     east_m = place(32632, longitude, latitude)[0] - 500_000
     across_m, along_m = radii_m(latitude)
     scale_factor = 0.9996 * (1 + east_m**2 / (2 * 0.9996**2 * across_m * along_m))
-    scale = ground_scale(crs_of_code(32632), *place(32632, longitude, latitude))
+    scale = ground_scale(crs_from_code(32632), *place(32632, longitude, latitude))
     assert scale.is_true and scale.is_even
     assert 1 / scale.shortest == pytest.approx(scale_factor, rel=1e-5)
 
@@ -84,24 +86,24 @@ def test_the_scale_of_a_utm_zone_is_its_series(latitude, longitude):
 )
 def test_national_grids_are_true_where_they_are_meant_to_be(epsg, longitude, latitude, is_true):
     x, y = place(epsg, longitude, latitude)
-    scale = ground_scale(crs_of_code(epsg), x, y)
+    scale = ground_scale(crs_from_code(epsg), x, y)
     assert scale.is_true == is_true
-    code = suggested_epsg(crs_of_code(epsg), x, y)
-    assert code == zone_in_meters(longitude, latitude)
-    assert ground_scale(crs_of_code(code), *place(code, longitude, latitude)).is_true
+    code = suggested_epsg(crs_from_code(epsg), x, y)
+    assert code == utm_code(longitude, latitude)
+    assert ground_scale(crs_from_code(code), *place(code, longitude, latitude)).is_true
 
 
 @needs_registry
 def test_zones_cover_the_earth_with_true_meters():
     for latitude in (-89.9, -84, -83.9, -45, 0, 60, 83.9, 84, 89.9):
         for longitude in (-180, -177.1, -0.1, 0, 5.9, 179.9):
-            code = zone_in_meters(longitude, latitude)
-            assert ground_scale(crs_of_code(code), *place(code, longitude, latitude)).is_true
+            code = utm_code(longitude, latitude)
+            assert ground_scale(crs_from_code(code), *place(code, longitude, latitude)).is_true
 
 
 @needs_registry
 def test_scales_are_those_of_the_system_s_own_body():
-    moon = crs_of_text("+proj=merc +R=1737400 +units=m")
+    moon = crs_from_text("+proj=merc +R=1737400 +units=m")
     scale = ground_scale(moon, 0, 2_288_082.65)  # 60 degrees north
     assert scale.shortest == pytest.approx(0.5, rel=1e-5)
     assert scale.longest == pytest.approx(0.5, rel=1e-5)
@@ -176,7 +178,7 @@ def test_zones_of_coordinates_that_are_taken_for_another_system():
     assert zone_in_area(28992, 650_000, 5.77e6) == 32631
     assert zone_in_area(27700, 5e5, 5.7e6) is None  # three zones fit
     assert zone_in_area(31467, 5e5, 0) is None
-    assert suggested_epsg(crs_of_code(31467), 5e5, 5.4e6) is None  # not a zone in the Atlantic
+    assert suggested_epsg(crs_from_code(31467), 5e5, 5.4e6) is None  # not a zone in the Atlantic
     problem = scale_problem("EPSG:31467", 5e5, 5.4e6)
     assert problem.startswith("whose area of use (Germany") and "scale" not in problem
 
@@ -185,17 +187,17 @@ def test_zones_of_coordinates_that_are_taken_for_another_system():
 @pytest.mark.parametrize("epsg", [3035, 6933, 3577])
 @pytest.mark.parametrize("turns", [(0.1, 0.9), (0.5, 0.2), (0.8, 0.8)])
 def test_equal_area_projections_keep_areas_where_they_distort_shapes(epsg, turns):
-    area = area_of_use(crs_of_code(epsg))
+    area = area_of_use(crs_from_code(epsg))
     longitude = area.west + turns[0] * area.width
     latitude = area.south + turns[1] * (area.north - area.south)
-    scale = ground_scale(crs_of_code(epsg), *place(epsg, longitude, latitude)[:2])
+    scale = ground_scale(crs_from_code(epsg), *place(epsg, longitude, latitude)[:2])
     assert scale.longest > 1.002 > 0.998 > scale.shortest
     assert scale.shortest * scale.longest == pytest.approx(1, abs=1e-5)
 
 
 @needs_registry
 def test_areas_may_cross_the_date_line():
-    area = area_of_use(crs_of_code(3460))  # Fiji
+    area = area_of_use(crs_from_code(3460))  # Fiji
     assert area.west > 170 and area.east < -170
     assert area.width == pytest.approx(area.east + 360 - area.west)
     middle = (area.south + area.north) / 2
@@ -212,6 +214,6 @@ def test_areas_may_cross_the_date_line():
         assert area.reaches(longitude, middle, 0.2) is (inside or longitude != 0.0)
     assert not area.reaches(180.0, area.north + 0.1)
     # A degree of arc is two degrees of longitude at a latitude of 60.
-    north = area_of_use(crs_of_code(25833))
+    north = area_of_use(crs_from_code(25833))
     assert north.reaches(north.west - 1.9, 60.0, 1.0)
     assert not north.reaches(north.west - 2.1, 60.0, 1.0)

@@ -92,7 +92,7 @@ def scenes():
     objects = []
     for k, mesh in enumerate(seed_objects(rings=8, segments=12)):
         colors = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
-        objects.append(replace(mesh, colors=Colors.of_faces(colors)))
+        objects.append(replace(mesh, colors=Colors.from_face_colors(colors)))
     copies = []
     for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
         matrix = np.diag([stretch, 1, 1, 1.0])

@@ -118,7 +118,7 @@ def test_light_is_mirrored_twice_and_not_three_times():
 def test_ghosts_of_textures_take_what_the_colors_leave():
     """A black wall absorbs what it does not mirror, and a white one has nothing to mirror."""
     for bright, share in ((0, 1 - 1e-3), (255, 0.0)):
-        colors = Colors.of_faces(np.full((2, 3), bright, np.uint8))
+        colors = Colors.from_face_colors(np.full((2, 3), bright, np.uint8))
         slanted = replace(SLANTED, colors=colors)
         paint = Material("Slanted", "texture", specular_reflectance=0.2)
         found = cast([slanted, CEILING], materials=[paint, Material("*", 1.0)], **ALL)

@@ -15,7 +15,7 @@ from tests.meshes import PLY, write
 
 from lidarsim import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.files.polygons import MAX_CORNERS, triangulated, with_holes
+from lidarsim.scene.files.polygons import MAX_CORNERS, triangulate, triangulate_with_holes
 
 CORNERS = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 3]], dtype=float)
 ROOF = [[0, 3, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]  # a square under four triangles
@@ -192,7 +192,7 @@ def placed(shape, turn=0, shift=(0.0, 0.0, 0.0)):
 
 def cut(vertices, *sizes):
     sizes = sizes or (len(vertices),)
-    return triangulated(vertices, np.arange(sum(sizes)), np.array(sizes))
+    return triangulate(vertices, np.arange(sum(sizes)), np.array(sizes))
 
 
 def area_vectors(vertices, faces):
@@ -275,7 +275,7 @@ def test_warped_polygons_lose_no_triangle(count):
         np.testing.assert_allclose(parts.sum(axis=0), area_vector(vertices), atol=1e-9)
         far = vertices + np.array([5e5, 5e6, 100.0])
         np.testing.assert_array_equal(cut(far), faces, "the same far from the origin")
-        lost += len(with_holes(vertices, [np.arange(count)])) < count - 2
+        lost += len(triangulate_with_holes(vertices, [np.arange(count)])) < count - 2
     assert lost > 20, "the clipper alone fills them"
 
 
@@ -288,7 +288,7 @@ def test_a_plane_polygon_is_clipped_though_its_numbers_are_rounded():
 
 def test_corners_that_are_not_there():
     with pytest.raises(ValueError, match="vertices 0 to 3, counted from 0, but"):
-        triangulated(np.zeros((3, 3)), np.array([0, 1, 3]), np.array([3]))
+        triangulate(np.zeros((3, 3)), np.array([0, 1, 3]), np.array([3]))
 
 
 def test_an_outline_without_end_is_refused_unless_it_is_convex():

@@ -18,7 +18,7 @@ from lidarsim.columns.table import Z
 from lidarsim.environment.notebook import PICTURE_SIZE
 from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
+from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplify_scene
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.words import plural
@@ -63,7 +63,7 @@ def draw_scene(scene: Scene) -> bytes:
     """Draw a scene at time 0, with one color per object."""
     drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
     if len(drawn.faces) > MAX_TRIANGLES:
-        drawn, _ = simplified(drawn, MAX_TRIANGLES)
+        drawn, _ = simplify_scene(drawn, MAX_TRIANGLES)
     sides = " × ".join(f"{side:,.1f}" for side in np.ptp(scene.bounds, axis=0))
     shot = take_shot(
         replace(drawn, actors=scene.actors).solid(0.0),

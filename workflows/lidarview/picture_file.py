@@ -229,7 +229,7 @@ class PictureContent:
         if self.face_materials is not None:
             arrays["face_materials"] = self.face_materials
         if self.scene.colors is not None:
-            arrays["colors"] = self.scene.colors.means()
+            arrays["colors"] = self.scene.colors.mean_colors()
         arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
         path.write_bytes(packed(arrays))
 
@@ -256,7 +256,7 @@ class PictureContent:
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colors is not None:
-                arrays[f"mesh{number}_colors"] = mesh.colors.means()
+                arrays[f"mesh{number}_colors"] = mesh.colors.mean_colors()
             if (animation := mesh.animation) is not None:
                 # Differences compress to a third of the size.
                 steps = np.diff(animation.vertices, axis=0, prepend=0)
@@ -369,7 +369,7 @@ def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
 
 def _colors(arrays: Mapping[str, Any], name: str) -> Colors | None:
     """Return the colors of faces, or None if the file has none."""
-    return Colors.of_faces(arrays[name]) if name in arrays else None
+    return Colors.from_face_colors(arrays[name]) if name in arrays else None
 
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:

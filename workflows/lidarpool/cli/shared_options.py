@@ -286,11 +286,11 @@ def _scheduler_address(
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
     """Yield a line on the coordinate system of what is written, and on its origin."""
-    from lidarsim.scene.files.coordinate_systems import named_system
+    from lidarsim.scene.files.coordinate_systems import describe_system
 
     if epsg is None and not any(origin):
         return
-    system = "no EPSG code" if epsg is None else named_system(epsg)
+    system = "no EPSG code" if epsg is None else describe_system(epsg)
     added = ", ".join(f"{value:,.12g}" for value in origin)
     moved = f"; ({added}) m is added to the coordinates of the scenario" if any(origin) else ""
     yield f"world       {system}{moved}"

@@ -19,7 +19,7 @@ from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import input_size
 from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import AnyArray, Floats
-from lidarsim.scene.files.intensity_scales import Limits, scales_of
+from lidarsim.scene.files.intensity_scales import Limits, common_limits
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
@@ -347,7 +347,7 @@ def _scale(headers: Sequence[Any]) -> _Scale:
             limits.append(None)
         else:
             limits.append(Limits(low, high))
-    scales = scales_of([limit for limit in limits if limit is not None])
+    scales = common_limits([limit for limit in limits if limit is not None])
     if scales is None:
         return _Scale([None] * len(headers))
     pairs = zip(headers, limits, strict=True)

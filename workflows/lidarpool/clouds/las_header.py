@@ -89,7 +89,7 @@ def las_system(path: Path) -> StatedSystem | None:
     with open_input(path) as file:
         (encoding,) = _unpacked(file, *_ENCODING)
         records = dict(_projection_records(file))
-    return StatedSystem.of_records(records, prefer_wkt=bool(encoding & _WKT_BIT))
+    return StatedSystem.from_records(records, prefer_wkt=bool(encoding & _WKT_BIT))
 
 
 def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:

@@ -14,7 +14,7 @@ from lidarsim.environment.extras import reading
 from lidarsim.io.input_files import open_input
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.numerics.arrays import AnyArray
-from lidarsim.scene.colors import as_float
+from lidarsim.scene.colors import pack_as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
@@ -63,7 +63,7 @@ class PCD(MultiFileFormat):
         columns = columns_of(number, points)
         colored = {*COLORS} <= {*columns}
         if colored:
-            fields.append(("rgb", as_float(*(points[name] for name in COLORS))))
+            fields.append(("rgb", pack_as_float(*(points[name] for name in COLORS))))
         for column in self.cloud.table:
             if (colored and column.name in COLORS) or (column.name == "time" and not as_fired):
                 continue

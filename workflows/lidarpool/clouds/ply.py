@@ -414,7 +414,7 @@ def _open_foreign(source: RecordingSource) -> Recording:
         return sweep_from_columns(read_ply_columns(read_input(source.path)))
 
     with reading(source.name):
-        system = StatedSystem.of_comments(ply_comments(read_input(source.path)))
+        system = StatedSystem.from_comments(ply_comments(read_input(source.path)))
         is_checked = system is not None and not source.as_stored
         positions = read(0).points if is_checked else np.zeros((0, 3))
         meters, notes = source.stated_meters(system, positions)

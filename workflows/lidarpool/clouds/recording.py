@@ -26,7 +26,7 @@ from lidarsim.errors import CutShortError, LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, OmittedPoints, usable_points
-from lidarsim.scene.files.pcd import unpacked_colors
+from lidarsim.scene.files.pcd import split_rgb
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import did_you_mean, joined, plural
@@ -193,7 +193,7 @@ class Recording:
                 self._omitted[number] = omitted
             if usable is not None:
                 sweep = sweep.select(usable)
-        standard = unpacked_colors(with_standard_names(sweep.columns))
+        standard = split_rgb(with_standard_names(sweep.columns))
         columns = self._chosen_intensity(sweep.columns, standard)
         points = sweep.points
         if self.meters != METERS:

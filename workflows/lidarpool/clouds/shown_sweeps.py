@@ -12,7 +12,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Floats32, Ints32
 from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplified
+from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplify_scene
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
@@ -50,11 +50,11 @@ class Surface:
         """Return the triangles of a scene and its instances, simplified to `max_triangles`."""
         drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
         if len(drawn.faces) > max_triangles:
-            drawn, _ = simplified(drawn, max_triangles)
+            drawn, _ = simplify_scene(drawn, max_triangles)
         return cls(
             drawn.vertices.astype(np.float32),
             drawn.faces.astype(np.int32),
-            None if drawn.colors is None else drawn.colors.means(),
+            None if drawn.colors is None else drawn.colors.mean_colors(),
             drawn.origin,
         )
 

@@ -780,4 +780,4 @@ def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
     if reflectances is None:
         return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)
-    return replace(mesh, colors=Colors.of_faces(as_srgb(light).repeat(2, axis=0)))
+    return replace(mesh, colors=Colors.from_face_colors(as_srgb(light).repeat(2, axis=0)))

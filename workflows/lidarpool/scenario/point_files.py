@@ -19,7 +19,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from lidarsim.scene.files.intensity_scales import from_zero
 from lidarsim.scene.files.mesh_formats import advice_on
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
-from lidarsim.scene.files.pcd import unpacked_colors
+from lidarsim.scene.files.pcd import split_rgb
 from lidarsim.scene.files.stated_system import Reprojection, check_metric_format, stated_meters
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.words import plural, printable
@@ -206,7 +206,7 @@ def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) ->
     The quantities in `missing_if_zero` are removed if all of their values are zero.
     """
     stored = {name: values for name, values in scan.columns.items() if values.ndim == 1}
-    columns = unpacked_colors(stored)
+    columns = split_rgb(stored)
     used = {
         name: values
         for names in _QUANTITIES

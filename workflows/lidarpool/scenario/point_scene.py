@@ -378,7 +378,7 @@ def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats
         return None
     _fill_from_neighbors(o3d, light, centers)
     colors: Bytes = np.where(np.isnan(light), GRAY[0], as_srgb(light))
-    return Colors.of_faces(colors.repeat(2, axis=0))
+    return Colors.from_face_colors(colors.repeat(2, axis=0))
 
 
 def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:

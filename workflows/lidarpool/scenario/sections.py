@@ -22,7 +22,12 @@ from pydantic import (
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import SemanticClass
 from lidarsim.motion.trajectory import Pose
-from lidarsim.scene.files.mesh_formats import endings, format_of, formats_with_plugins, lacking
+from lidarsim.scene.files.mesh_formats import (
+    endings,
+    format_of,
+    formats_with_plugins,
+    unsupported_options,
+)
 from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions, Opacity, UpAxis
 from lidarsim.scene.transform import Transform
 from lidarsim.schema.declared import (
@@ -146,7 +151,7 @@ class MeshFile(Section):
             if further and not isinstance(file, str):  # the error is the missing name of the file
                 return handler({name: v for name, v in value.items() if name not in further})
             if further:
-                problem = lacking(row, [name for name in value if name in further])
+                problem = unsupported_options(row, [name for name in value if name in further])
                 raise ValueError(f"{file} {problem}")
         except LidarError as error:  # error of a plug-in
             raise ValueError(str(error)) from error

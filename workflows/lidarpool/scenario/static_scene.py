@@ -28,7 +28,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.scene.transform import Transform, affine
-from lidarsim.scene.wheels import rolling
+from lidarsim.scene.wheels import animate_wheels
 from lidarsim.words import joined, plural
 
 from .ground import StandingSurfaces
@@ -292,7 +292,7 @@ class Shapes:
             )
             if wheels is not None:
                 with prefixed(path):
-                    objects = (*rolling(objects, wheels, self.findings.notes.append),)
+                    objects = (*animate_wheels(objects, wheels, self.findings.notes.append),)
             mesh = meshes[key] = join_meshes(name, objects)
             if animation is not None and mesh.animation is not None:
                 settings = {"speed_m_s": animation.speed_m_s, "repeat": animation.repeat}

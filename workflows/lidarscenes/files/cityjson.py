@@ -23,7 +23,7 @@ from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import (
-    crs_of_text,
+    crs_from_text,
     has_registry,
     horizontal_part,
     is_geocentric,
@@ -31,7 +31,7 @@ from lidarsim.scene.files.coordinate_systems import (
     scale_problem,
     suggested_epsg,
 )
-from lidarsim.scene.files.polygons import check_corners, triangulated, with_holes
+from lidarsim.scene.files.polygons import check_corners, triangulate, triangulate_with_holes
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -261,7 +261,7 @@ class _CityFile:
                 for (outline, *holes), material in self._surfaces(geometries):
                     if holes:
                         rings = [_integers(ring) for ring in (outline, *holes)]
-                        faces = with_holes(
+                        faces = triangulate_with_holes(
                             points, [r for r in rings if r is rings[0] or len(r) > 2]
                         )
                         polygons.holed_faces.append(faces)
@@ -282,7 +282,7 @@ class _CityFile:
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
         # Polygons do not share corners here, so each corner identifies the polygon of a triangle.
-        simple = triangulated(points[corners], np.arange(len(corners)), sizes)
+        simple = triangulate(points[corners], np.arange(len(corners)), sizes)
         polygon = np.searchsorted(np.cumsum(sizes), simple[:, 0], side="right")
         faces = np.concatenate([corners[simple], *polygons.holed_faces])
         owners = np.concatenate(
@@ -391,7 +391,7 @@ class _System:
         crs = None
         if has_registry():
             heights = f"+{codes[1][1]}" if len(codes) > 1 else ""
-            crs = crs_of_text(name + heights) or crs_of_text(name)
+            crs = crs_from_text(name + heights) or crs_from_text(name)
         if crs is None:
             return cls(name, epsg, None, is_of_angles)
         horizontal, up_m = horizontal_part(crs)

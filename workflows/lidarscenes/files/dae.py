@@ -27,7 +27,13 @@ from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.numerics.vectors import matmul, norm
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.companions import image_file
-from lidarsim.scene.files.polygons import check_corners, fanned, triangulated, unrolled, with_holes
+from lidarsim.scene.files.polygons import (
+    check_corners,
+    fan_triangles,
+    triangulate,
+    triangulate_with_holes,
+    unroll_strip,
+)
 from lidarsim.scene.files.scene_graph import (
     SMALLER,
     Content,
@@ -39,7 +45,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
     placed_nodes,
 )
-from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, read_colors, remembered
+from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, cache_with_errors, read_colors
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine, rotation_about
 
@@ -228,7 +234,9 @@ class _Document:
         faces = corners[:, offset][rows]
         colors = None
         if self._paint and material is not None and len(faces):
-            with self._paint.notes.without_color(material.get("name") or material.get("id") or ""):
+            with self._paint.notes.record_color_error(
+                material.get("name") or material.get("id") or ""
+            ):
                 colors = self._colors(self._paint, primitive, material, corners, rows)
         return Piece(points, faces, colors=colors)
 
@@ -321,7 +329,7 @@ class _Effects:
         self._path = path
         self._options = options
         self._allowance = allowance
-        self._texture = remembered(self._read_texture)
+        self._texture = cache_with_errors(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
         """Return the image or the color (1, 1, 3) of an effect, or None if it has none."""
@@ -378,9 +386,9 @@ def _triangles(
     if primitive.tag == "triangles":
         yield from (row[: len(row) // 3 * 3].reshape(-1, 3) for row in lists)
     elif primitive.tag == "tristrips":
-        yield from map(unrolled, lists)
+        yield from map(unroll_strip, lists)
     elif primitive.tag == "trifans":
-        yield from map(fanned, lists)
+        yield from map(fan_triangles, lists)
     elif primitive.tag == "polylist" and lists:
         counts = primitive.find("vcount")
         sizes = np.zeros(0, np.int64) if counts is None else _integers(counts)
@@ -390,13 +398,13 @@ def _triangles(
                 f"{_tag(primitive)} declares polygons with {sizes.sum():,} corners but contains "
                 f"{len(joined_corners):,}"
             )
-        yield triangulated(points, joined_corners, sizes)
+        yield triangulate(points, joined_corners, sizes)
     elif primitive.tag == "polygons":
         if lists:
             sizes = np.array([len(row) for row in lists])
-            yield triangulated(points, np.concatenate(lists), sizes)
+            yield triangulate(points, np.concatenate(lists), sizes)
         for holed in primitive.findall("ph"):
-            yield with_holes(points, [corners(ring) for ring in holed])
+            yield triangulate_with_holes(points, [corners(ring) for ring in holed])
 
 
 def _integers(element: Element) -> Ints:

@@ -25,7 +25,7 @@ from lidarsim.io.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.elementary import arctan2
 from lidarsim.scene.colors import Colors, as_bytes
-from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
+from lidarsim.scene.files.coordinate_systems import center_of, scale_problem, world_advice
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
     Content,
@@ -233,7 +233,7 @@ def _content(
     content.unit_m = 1.0
     content.up_axis = "z"
     content.classes = _classes({row[1] for row in frame["elements"]}, frame["ancestors"])
-    content.notes = [*_reference_notes(building, middle_of(content.meshes)), *shapes.notes.lines()]
+    content.notes = [*_reference_notes(building, center_of(content.meshes)), *shapes.notes.lines()]
     if missing:
         content.notes.append(f"was read without {missing}")
     if building["errors"]:

@@ -29,10 +29,10 @@ from lidarsim.numerics.elementary import decade
 from lidarsim.scene.files.coordinate_systems import (
     MAX_SCALE_ERROR,
     POLAR_EPSG,
+    crs_from_code,
+    crs_from_text,
     crs_key,
     crs_name,
-    crs_of_code,
-    crs_of_text,
     ground_scale,
     horizontal_part,
     is_local,
@@ -41,8 +41,8 @@ from lidarsim.scene.files.coordinate_systems import (
     missed_area,
     projjson,
     target_problem,
-    transformed,
-    zone_in_meters,
+    transform_coordinates,
+    utm_code,
 )
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
@@ -291,7 +291,7 @@ def _stated_crs(file: Any, path: Path) -> Any:
     if file.crs is not None or file.driver != "AAIGrid":
         return file.crs
     text = _read_beside(path, ".prj").decode("utf-8", "replace").strip()
-    crs = crs_of_text(text) if text else None
+    crs = crs_from_text(text) if text else None
     if text and crs is None:
         raise MeshFileError(
             f"has a coordinate system in {path.stem}.prj that PROJ cannot parse. Correct it, or "
@@ -424,11 +424,11 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
 
     Raises MeshFileError if it is not in meters that are true to scale.
     """
-    target = crs_of_code(epsg)
+    target = crs_from_code(epsg)
     place = middle
     if target is not None and crs is not None:
         with suppress(Exception):  # the classes of GDAL errors are private in rasterio
-            place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
+            place = transform_coordinates(crs, horizontal_part(target)[0], middle[None])[0]
     if problem := target_problem(epsg, *place.tolist()):
         raise MeshFileError(f"cannot be reprojected to world.epsg {problem}")
     return target
@@ -446,14 +446,14 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
             "and latitude. Reproject it to meters first, for example with `gdalwarp -t_srs "
             "SYSTEM IN OUT`"
         )
-    code = zone_in_meters(*place)
+    code = utm_code(*place)
     width_deg = _width_deg(source)
     if width_deg > _WIDEST_DEG and code not in POLAR_EPSG:
         raise MeshFileError(
             f"spans {width_deg:.4g} degrees, which is too wide for a UTM zone. Set world.epsg to "
             "the code of a projection in meters"
         )
-    return crs_of_code(code)
+    return crs_from_code(code)
 
 
 def _width_deg(source: _Source) -> float:
@@ -474,7 +474,7 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
     corners = _corners(source.file, source.affine)
     if source.crs is not None and source.crs != target:
         try:
-            corners = transformed(source.crs, horizontal_part(target)[0], corners)
+            corners = transform_coordinates(source.crs, horizontal_part(target)[0], corners)
         except Exception:  # the classes of GDAL errors are private in rasterio
             return 0.0
     horizontal, _ = horizontal_part(target)

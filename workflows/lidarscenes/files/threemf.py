@@ -83,7 +83,7 @@ class _MeshObject:
         colors = None
         corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
         if (corners != GRAY).any():
-            colors = Colors.of_corners(corners)
+            colors = Colors.from_vertex_colors(corners)
         materials = None
         if self.materials:
             names = tuple(dict.fromkeys(self.materials))

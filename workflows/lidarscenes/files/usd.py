@@ -26,9 +26,9 @@ from lidarsim.numerics.vectors import inverse, matmul
 from lidarsim.scene.actors import box
 from lidarsim.scene.animation import RATE_HZ
 from lidarsim.scene.face_materials import FaceMaterials
-from lidarsim.scene.files.companions import outside
+from lidarsim.scene.files.companions import outside_message
 from lidarsim.scene.files.gltf_animation import find_animation
-from lidarsim.scene.files.polygons import triangulated
+from lidarsim.scene.files.polygons import triangulate
 from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
     SHORTER,
@@ -45,7 +45,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
     placed_nodes,
 )
-from lidarsim.scene.scene_instances import SceneInstance, scales_of
+from lidarsim.scene.scene_instances import SceneInstance, polar_scales
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule, cylinder, revolve
 from lidarsim.scene.transform import UP_AXES
@@ -141,7 +141,9 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
                 raise MeshFileError(f"has more than {limit}. Export it in parts")
             for file in map(Path, frame.get("files", ())):
                 if not (options.allows(file) or file.samefile(path)):
-                    raise MeshFileError(outside(os.path.relpath(file, path.resolve().parent)))
+                    raise MeshFileError(
+                        outside_message(os.path.relpath(file, path.resolve().parent))
+                    )
                 allowance.add_file(file)
             yield frame, arrays
 
@@ -168,7 +170,7 @@ def _polygon_mesh(
             pieces = material_pieces(frame, arrays, vertices, (sizes, corners, solid), materials)
         else:
             outlines = corners[np.repeat(solid, sizes)]
-            pieces = iter([Piece(vertices, triangulated(vertices, outlines, sizes[solid]))])
+            pieces = iter([Piece(vertices, triangulate(vertices, outlines, sizes[solid]))])
         return join_pieces(name, pieces, allowance)
     except ValueError as error:
         raise ValueError(f"{name!r}: {error}") from error
@@ -186,7 +188,7 @@ def _shape_mesh(
     number = next((number for number, _ in frame["materials"]), None)
     # Shapes lack texture coordinates and therefore have no masks. This call only adds a note.
     materials.cutout(number, look, rows)
-    named = FaceMaterials.named(materials.name(number))
+    named = FaceMaterials.from_name(materials.name(number))
     return [replace(mesh, colors=materials.colors(number, look, rows), materials=named)]
 
 
@@ -252,7 +254,7 @@ def _content(
         matrices[number] = np.eye(4)
         scale = matrices[number, :3, :3]
         poses = motion[:, 1:].reshape(-1, 3, 4)
-        scale[:] = scales_of(poses[:1, :, :3])[0]
+        scale[:] = polar_scales(poses[:1, :, :3])[0]
         part = placed_content(placed_nodes([number], node, stem))
         content.skipped += part.skipped
         if part.meshes:
@@ -310,7 +312,7 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
         raise ValueError(f"the unit is {stage['unit_m']} meters, but it must be a positive number")
     if stage["up_axis"] not in UP_AXES:
         raise ValueError(f"the value of upAxis is {stage['up_axis'][:20]!r}, which is not an axis")
-    content.turned = "as the file states" if stage["up_stated"] else "the OpenUSD default"
+    content.rotation_note = "as the file states" if stage["up_stated"] else "the OpenUSD default"
     if not stage["unit_stated"]:
         content.unit_note = (
             "does not specify a length unit. Centimeters, the OpenUSD default, are assumed"

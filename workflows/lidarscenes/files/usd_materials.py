@@ -11,7 +11,7 @@ from lidarsim.io.allowance import Allowance
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.colors import LINEAR, Colors, as_srgb
-from lidarsim.scene.files.polygons import check_corners, triangulated
+from lidarsim.scene.files.polygons import check_corners, triangulate
 from lidarsim.scene.files.scene_graph import Piece, ReadOptions
 from lidarsim.scene.masks import (
     FACE_BYTES,
@@ -19,9 +19,9 @@ from lidarsim.scene.masks import (
     MaskNotes,
     Texture,
     Wrap,
+    cache_with_errors,
     read_colors,
     read_opacity,
-    remembered,
 )
 from lidarsim.scene.scene_mesh import Cutout
 
@@ -95,7 +95,7 @@ class MeshAppearance:
         colors = as_srgb(np.nan_to_num(values))
         if len(colors) == 1:
             return Colors.plain(colors[None], len(face_indices))
-        return Colors.of_corners(colors[corners])
+        return Colors.from_vertex_colors(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
         """Return values (c, width), and their indices (k, 3) at corners.
@@ -129,8 +129,8 @@ class UsdMaterials:
         # {number: (reason if the image is not read, content)}
         self._images: dict[int, tuple[str, bytes]] = {}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
-        self._shades = remembered(self._read_shades)
-        self._mask = remembered(self._read_mask)
+        self._shades = cache_with_errors(self._read_shades)
+        self._mask = cache_with_errors(self._read_mask)
         self.notes = MaskNotes()
 
     def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
@@ -156,7 +156,7 @@ class UsdMaterials:
         material = self._materials[number]
         source = material.get("color", _DISPLAY)
         for color_source in (source, source.get("instead", _DISPLAY)):
-            with self.notes.without_color(material["name"]):
+            with self.notes.record_color_error(material["name"]):
                 if not self._allowance.fits(FACE_BYTES * len(face_indices)):
                     raise MaskError("the mesh has too many triangles")
                 if "unread" in color_source:
@@ -174,7 +174,7 @@ class UsdMaterials:
         """Return the mask that a material gives to triangles, or None if they are opaque."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
-        with self.notes.without_mask(material["name"]):
+        with self.notes.record_mask_error(material["name"]):
             if "unread" in source:
                 raise MaskError(source["unread"])
             mask: Texture | Literal["glass"] | None = None
@@ -243,14 +243,14 @@ def material_pieces(
     Raises
     ------
     ValueError
-        If `triangulated` raises it.
+        If `triangulate` raises it.
     """
     sizes, corners, solid = polygons
     check_corners(corners, len(vertices))
     # Use corners instead of vertices, because colors of a vertex may differ between polygons.
     solid_corners = np.flatnonzero(np.repeat(solid, sizes))
     faces = solid_corners[
-        triangulated(vertices[corners[solid_corners]], np.arange(len(solid_corners)), sizes[solid])
+        triangulate(vertices[corners[solid_corners]], np.arange(len(solid_corners)), sizes[solid])
     ]
     polygon = np.repeat(np.arange(len(sizes)), sizes)[faces]
     value_indices = {"constant": np.zeros_like(faces), "uniform": polygon, "faceVarying": faces}

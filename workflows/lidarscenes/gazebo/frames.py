@@ -11,7 +11,7 @@ from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.vectors import matmul, norm
-from lidarsim.scene.transform import affine, inverted
+from lidarsim.scene.transform import affine, inverse_pose
 from lidarsim.schema.value_texts import shown
 from lidarsim.words import did_you_mean, printable
 
@@ -173,11 +173,11 @@ class FrameGraph:
 
     def transform_between(self, frame: str, target: str) -> Floats:
         """Return the matrix (4, 4) from a frame to another frame."""
-        return matmul(inverted(self.matrix(target)), self.matrix(frame))
+        return matmul(inverse_pose(self.matrix(target)), self.matrix(frame))
 
 
 def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
     """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose (4, 4)."""
     if not placement_frame:
         return pose
-    return matmul(pose, inverted(frames.matrix(placement_frame)))
+    return matmul(pose, inverse_pose(frames.matrix(placement_frame)))

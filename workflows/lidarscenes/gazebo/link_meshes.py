@@ -154,7 +154,7 @@ class LinkMeshes:
         if self.options.colors and color is not None and is_plain:
             mesh = replace(mesh, colors=Colors.plain(color, len(mesh.faces)))
         if self.options.materials and mesh.materials is None:
-            mesh = replace(mesh, materials=FaceMaterials.named(appearance.material))
+            mesh = replace(mesh, materials=FaceMaterials.from_name(appearance.material))
         return mesh
 
     def geometry_meshes(self, geometry: Element, source: Source) -> list[SceneMesh]:

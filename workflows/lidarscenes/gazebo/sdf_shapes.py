@@ -13,9 +13,9 @@ from lidarsim.errors import LidarError
 from lidarsim.io.allowance import Allowance
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.vectors import matmul, norm
-from lidarsim.scene.files.polygons import with_holes
+from lidarsim.scene.files.polygons import triangulate_with_holes
 from lidarsim.scene.masks import read_heights
-from lidarsim.scene.scene_mesh import SceneMesh, stacked
+from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 from lidarsim.scene.shapes import capsule, revolve
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
@@ -133,12 +133,12 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
         starts = np.cumsum([0, *map(len, members)])
         flat = np.concatenate([np.pad(ring, ((0, 0), (0, 1))) for ring in members])
         rows = [np.arange(a, b) for a, b in pairwise(starts.tolist())]
-        bottom = with_holes(flat, rows)[:, ::-1]  # outlines are counterclockwise
+        bottom = triangulate_with_holes(flat, rows)[:, ::-1]  # outlines are counterclockwise
         top = bottom[:, ::-1] + len(flat)
         walls = [_wall(ring, len(flat)) for ring in rows]
         vertices = np.concatenate([flat, flat + np.array([0, 0, height])])
         parts.append((vertices, np.concatenate([bottom, top, *walls])))
-    vertices, faces = stacked(parts)
+    vertices, faces = stack_meshes(parts)
     return SceneMesh("polyline", vertices, faces) if len(faces) else None
 
 

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import check_input, read_input
-from lidarsim.scene.files.companions import outside
+from lidarsim.scene.files.companions import outside_message
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 
 from ..files.lenient_xml import parse_lenient_xml
@@ -104,7 +104,7 @@ def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Pa
                 continue  # no file can have this name
             if is_file:
                 if not options.allows(resolved):
-                    raise MeshFileError(outside(name))
+                    raise MeshFileError(outside_message(name))
                 yield resolved
 
 

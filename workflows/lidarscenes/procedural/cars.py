@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarsim.numerics.arrays import Floats, Ints
-from lidarsim.scene.scene_mesh import SceneMesh, stacked
+from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 
 from .city_kinds import lay_down, loft, regular_polygon
 
@@ -80,7 +80,7 @@ def car(model: CarModel) -> SceneMesh:
     track = max(half for _, half, _, _ in model.stations) - 0.1
     down = -wheel.vertices[:, 1].min()
     wheels = [lay_down(wheel).translated(x, y, down) for x in model.axles for y in (-track, track)]
-    return SceneMesh(model.name, *stacked([_body(model), *wheels]))
+    return SceneMesh(model.name, *stack_meshes([_body(model), *wheels]))
 
 
 def all_cars() -> tuple[SceneMesh, ...]:

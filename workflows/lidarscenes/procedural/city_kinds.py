@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarsim.numerics.arrays import Floats, Ints
-from lidarsim.scene.scene_mesh import stacked
+from lidarsim.scene.scene_mesh import stack_meshes
 from lidarsim.scene.shapes import revolve
 
 
@@ -212,7 +212,7 @@ def join_solids(solids: Iterable[Solid]) -> Solid:
 
     Touching or overlapping parts keep their surfaces.
     """
-    return Solid(*stacked(solids))
+    return Solid(*stack_meshes(solids))
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_instances import SceneInstance
-from lidarsim.scene.scene_mesh import SceneMesh, stacked
+from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 
 SCALES = (0.7, 1.3)  # smallest and largest scale of trees in a scene
 MAX_TREES = 100_000  # mesh files are limited to 200,000 nodes
@@ -101,7 +101,7 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
         _tubes(twigs, twig_radii, _TWIG_SIDES),
         _leaves(species, twigs, rng),
     ]
-    return SceneMesh(species.name, *stacked(parts))
+    return SceneMesh(species.name, *stack_meshes(parts))
 
 
 def all_trees(seed: int, root_m: float) -> tuple[SceneMesh, ...]:

@@ -19,7 +19,7 @@ from lidarsim.io.allowance import Allowance
 from lidarsim.io.xmlfile import xml_root
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import Colors
-from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
+from lidarsim.scene.files.coordinate_systems import center_of, scale_problem, world_advice
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -191,7 +191,7 @@ def _notes(
     """Return notes on the coordinate system of a file, and on elements that are not read."""
     notes = []
     if header is not None:
-        notes = _reference_notes(header, middle_of(meshes))
+        notes = _reference_notes(header, center_of(meshes))
     listed = str(unread)
     if listed:
         notes.append(f"contains elements that were skipped: {listed}")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.elementary import sin_cos
 from lidarsim.numerics.vectors import matmul, matvec, norm
-from lidarsim.scene.files.polygons import with_holes
+from lidarsim.scene.files.polygons import triangulate_with_holes
 from lidarsim.scene.files.scene_graph import Piece
 
 MAX_SEGMENTS = 64
@@ -106,7 +106,7 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
         offset += len(ring)
     if closed:
         top_rings = [row for row in top_rings if len(row) > 2]
-        faces += [with_holes(points, top_rings)] if top_rings else []
+        faces += [triangulate_with_holes(points, top_rings)] if top_rings else []
     triangles = np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
     return Piece(points, triangles, material=material)
 

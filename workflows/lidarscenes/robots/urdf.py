@@ -172,7 +172,7 @@ def _name(element: Element) -> str:
 def _material(visual: Element) -> FaceMaterials | None:
     """Return the named material of a visual, or None."""
     material = visual.find("material")
-    return None if material is None else FaceMaterials.named(material.get("name", ""))
+    return None if material is None else FaceMaterials.from_name(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:

@@ -151,7 +151,9 @@ class _Writer:
         for cut in mesh.cutouts:
             rows = np.arange(first, first + len(cut.uv))
             # A material has room for one texture with its coordinates, which is the mask.
-            tints = None if colors is None else colors.take(rows).means()[:, None].repeat(3, 1)
+            tints = (
+                None if colors is None else colors.take(rows).mean_colors()[:, None].repeat(3, 1)
+            )
             attributes = self._corners(mesh, rows, cut.uv, tints)
             material = self._material(cut.mask, names[index[first]])
             primitives.append({"attributes": attributes, "material": material})

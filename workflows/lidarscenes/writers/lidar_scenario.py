@@ -16,7 +16,7 @@ from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.vectors import matmul
-from lidarsim.scene.transform import inverted
+from lidarsim.scene.transform import inverse_pose
 from lidarsim.survey.survey import MAX_SENSORS
 
 SCENARIO_FILE = "scenario.yaml"
@@ -140,7 +140,7 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
     for lidar in lidars:
         mount = lidar.matrix
         if of_one_model:
-            mount = matmul(inverted(lidar.model_matrix), mount)
+            mount = matmul(inverse_pose(lidar.model_matrix), mount)
         name = lidar.sensor if counts[lidar.sensor] == 1 else lidar.name
         min_range_m, max_range_m = lidar.range_m
         sensors[name] = {

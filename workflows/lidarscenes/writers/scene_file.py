@@ -16,7 +16,7 @@ from lidarsim.io.storage import Storage
 from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
-from lidarsim.scene.scene_mesh import stacked
+from lidarsim.scene.scene_mesh import stack_meshes
 from lidarsim.scene.simplified import SimplifiedScene
 
 from .glb_file import encode_glb
@@ -95,7 +95,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
     objects = trimesh.Scene()
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
         flat = [part.flat() if isinstance(part, SceneInstance) else part for part in parts]
-        vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
+        vertices, faces = stack_meshes((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)
     comments = "".join(f"# {line}\n" for line in _comments(scene))

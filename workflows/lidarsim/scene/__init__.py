@@ -1,1 +1,1 @@
-"""Scenes: meshes, files, transforms, and made-up ones."""
+"""Scenes, with their meshes, file formats, transforms and generated shapes."""

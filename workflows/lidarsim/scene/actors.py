@@ -1,4 +1,4 @@
-"""Actors: objects that move through the scene."""
+"""Actors, which are objects that move through the scene."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from ..schema.checks import check_fields, check_fits
 from ..schema.value_texts import one_line
 from . import face_materials
 from .colors import join_colors
-from .scene_instances import SceneInstance, parts_of
-from .scene_mesh import SceneMesh, stacked
+from .scene_instances import SceneInstance, split_by_masks
+from .scene_mesh import SceneMesh, stack_meshes
 
-MAX_SAMPLES = 200_000  # poses of all actors
-# Poses and longest duration for measuring trajectories of unknown classes.
+MAX_SAMPLES = 200_000  # drawn poses of all actors
+# Number of poses and maximum duration for measuring the length of user-defined trajectories.
 TRAJECTORY_POSES = 10_001
 MAX_DURATION_NS = 1e12
 AT_ZERO = Stations((CENTER,))
-CHECKED_TRAJECTORIES = (Track, Stations, StaticPose)  # classes whose rotations are rotations
+CHECKED_TRAJECTORIES = (Track, Stations, StaticPose)  # their rotations need no further checks
 
 
 class ActorSamples(NamedTuple):
-    """Poses of an actor at a few times."""
+    """Sampled poses of an actor."""
 
-    times_ns: Floats  # (k,), nanoseconds since the survey's start
-    positions: Floats  # (k, 3), meters, local
+    times_ns: Floats  # (k,), nanoseconds since the start of the survey
+    positions: Floats  # (k, 3), local coordinates in meters
     quaternions: Floats  # (k, 4)
 
 
@@ -92,16 +92,16 @@ class Actor:
             self._check_first_pose()
 
     def _check_first_pose(self) -> None:
-        """Check the first rotation of a trajectory of a class that may be a user's."""
+        """Check the first rotation of a trajectory whose class can be user-defined."""
         first_ns = max(presence_ns(self.trajectory)[0], 0.0)
         try:
             _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
-        except LidarError:  # the trajectory does not cover this time: `check` reports the error
+        except LidarError:  # the trajectory does not cover this time, which `check` reports
             return
         with prefixed(f"Actor {self.name!r}"):
             check_rotations(np.asarray(rotations, np.float64))
 
-    def following(self, trajectory: Trajectory) -> Actor:
+    def with_trajectory(self, trajectory: Trajectory) -> Actor:
         """Return a copy of the actor with another trajectory.
 
         Raises
@@ -109,7 +109,7 @@ class Actor:
         LidarError
             If the first rotation of the trajectory is not a valid rotation matrix.
         """
-        actor = object.__new__(type(self))  # `copy` takes ten times as long
+        actor = object.__new__(type(self))  # ten times as fast as `copy`
         vars(actor).update(vars(self), trajectory=trajectory)
         vars(actor).pop("_traveled", None)
         if not isinstance(trajectory, CHECKED_TRAJECTORIES):
@@ -137,16 +137,16 @@ class Actor:
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
-            vertices = animation.vertices_at(self.played(np.array([time_ns]))[0])[0][0]
+            vertices = animation.vertices_at(self.frames_at(np.array([time_ns]))[0])[0][0]
         vertices = rotate(vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
-        # Pictures, which call this, do not show masks.
+        # This method is only used for pictures, which do not show masks.
         return SceneMesh(
             self.name, vertices + positions[0], self.mesh.faces, colors=self.mesh.colors
         )
 
-    def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
+    def frames_at(self, times_ns: Floats) -> tuple[Floats, Floats]:
         """Return the animation frames and frame rates at several times.
 
         Times have shape (k,) and are in nanoseconds since the start of the survey. Frame
@@ -177,10 +177,10 @@ class Actor:
 
     @cached_property
     def _traveled(self) -> tuple[Floats, Floats]:
-        """Times (k,), ns, and the distances (k,) traveled until these times, meters.
+        """Sample times in nanoseconds, and the distances traveled up to these times in meters.
 
-        Distances driven backward count as negative. The actor is static before the first and after
-        the last time.
+        Distances decrease while the actor moves backward. The actor is stationary before the first
+        and after the last time. Both arrays have shape (k,).
         """
         trajectory = self.trajectory
         if not trajectory.moves:
@@ -231,10 +231,7 @@ class Actor:
 
 
 def check_spray(actors: Iterable[Actor]) -> None:
-    """Check that actors that raise spray have a size.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if an actor that raises spray is flat."""
     for actor in actors:
         if actor.spray and not (np.ptp(actor.mesh.vertices, axis=0) > 0).all():
             raise LidarError(
@@ -244,16 +241,19 @@ def check_spray(actors: Iterable[Actor]) -> None:
 
 
 def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
-    """Return the poses per actor that a drawing keeps: `max_samples`, or fewer for many actors."""
+    """Return the number of poses to draw for each actor.
+
+    The number is `max_samples`, or fewer if there are many actors, but at least 20.
+    """
     return max(20, min(max_samples, MAX_SAMPLES // max(len(actors), 1)))
 
 
 def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
-    """Return the distinct meshes (m,) of actors, and the index (a,) of each actor's mesh.
+    """Return the distinct meshes of actors, and the index of the mesh of each actor.
 
-    Meshes are the same if they share their arrays, which pickling preserves.
+    Two meshes are the same if they share their arrays. Pickling preserves this.
     """
-    mesh_indices: dict[tuple[int, ...], int] = {}  # {ids of the arrays: number of the mesh}
+    mesh_indices: dict[tuple[int, ...], int] = {}  # {ids of the arrays: index of the mesh}
     meshes: list[SceneMesh] = []
     indices = []
     for mesh in (actor.mesh for actor in actors):
@@ -273,12 +273,14 @@ def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
 
 
 def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
-    """Join objects to a mesh in world coordinates, with masks unless a mesh is animated.
+    """Merge objects into one mesh in world coordinates.
+
+    Masks are kept unless a mesh is animated.
 
     Raises
     ------
     LidarError
-        If a mesh with voxels would be joined to another mesh.
+        If a mesh with voxels would be merged with another mesh.
     """
     flat = [item.flat() if isinstance(item, SceneInstance) else item for item in objects]
     if any(part.voxels is not None for part in flat):
@@ -287,9 +289,9 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
         return replace(flat[0], name=name)
     if any(mesh.animation for mesh in flat):
         return _join_animated(name, flat)
-    parts = [part for mesh in flat for part in parts_of(mesh)]
+    parts = [part for mesh in flat for part in split_by_masks(mesh)]
     parts.sort(key=lambda part: part.mask is not None)  # parts with masks last
-    vertices, faces = stacked((part.vertices, part.faces) for part in parts)
+    vertices, faces = stack_meshes((part.vertices, part.faces) for part in parts)
     cutouts = [cutout for mesh in flat for cutout in mesh.cutouts]
     sizes = [len(part.faces) for part in parts]
     colors = join_colors([part.colors for part in parts], sizes)
@@ -298,7 +300,7 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
 
 
 def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
-    """Join meshes that are static or have poses of the same animation."""
+    """Merge meshes, each of which is either static or part of the same animation."""
     first = next(mesh.animation for mesh in meshes if mesh.animation)
     repeats = (len(first.vertices), 1, 1)
     poses = [
@@ -309,7 +311,7 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     sizes = [len(mesh.faces) for mesh in meshes]
     colors = join_colors([mesh.colors for mesh in meshes], sizes)
     materials = face_materials.join_materials([mesh.materials for mesh in meshes], sizes)
-    parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
+    parts = stack_meshes((mesh.vertices, mesh.faces) for mesh in meshes)
     return SceneMesh(name, *parts, colors=colors, animation=animation, materials=materials)
 
 

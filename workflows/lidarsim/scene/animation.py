@@ -1,4 +1,4 @@
-"""Animations of meshes: people who walk, wheels that turn."""
+"""Mesh animations, such as walking people and rotating wheels."""
 
 from __future__ import annotations
 
@@ -13,35 +13,37 @@ from ..numerics.vectors import rotate
 from ..schema.checks import as_array, check_fields
 from ..schema.value_texts import one_line
 
-RATE_HZ = 60.0  # least rate of baked poses
-# Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.
+RATE_HZ = 60.0  # minimum frame rate when animations are baked
+# Limit for the vertices of all keyframes in pictures. A walk compresses to 1.4 bytes per vertex.
 MAX_PICTURED_VERTICES = 500_000
 
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """Poses of a mesh, evenly spaced, between which its vertices move straight.
+    """Evenly spaced keyframes of a mesh, between which its vertices move linearly.
 
-    Actors of the same mesh share the animation; each plays it by its own clock
-    (`Actor.played`).
+    Actors with the same mesh share the animation, but each actor plays it at its own rate
+    (`Actor.frames_at`).
 
     Parameters
     ----------
     vertices
-        float64 (f, v, 3): the mesh's vertices in at least two poses, meters, in the mesh's frame.
+        Vertices of the mesh at two or more keyframes in the frame of the mesh, in meters. Shape
+        (f, v, 3), float64.
     step_s
-        Time from each pose to the next, seconds.
+        Time between two keyframes in seconds.
     speed_m_s
-        Speed of an actor that plays the animation in real time, m/s: an actor of half the speed
-        plays at half the rate, and a static actor keeps its pose. None plays by time.
+        Speed at which an actor plays the animation in real time, in m/s. An actor at half this
+        speed plays it at half the rate, and a stationary actor keeps its pose. With None, the
+        playback rate does not depend on the speed.
     repeat
-        Whether the animation starts again after its end; else the last pose remains.
+        Whether the animation repeats. Otherwise, the mesh keeps the last pose.
 
     Raises
     ------
     LidarError
-        If there are less than two poses, a number is not finite, or the step or speed is not
-        above 0.
+        If there are fewer than two keyframes, a number is not finite, or the step or the speed is
+        not positive.
     """
 
     vertices: Floats
@@ -68,13 +70,14 @@ class Animation:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last pose, seconds."""
+        """Time from the first to the last keyframe in seconds."""
         return (len(self.vertices) - 1) * self.step_s
 
     def frames(self, seconds: Floats) -> Floats:
-        """Return frames (n,) at seconds (n,) since the first pose.
+        """Return the frame numbers at given times.
 
-        Frame 1.5 is half way from the second pose to the third.
+        Times are in seconds since the first keyframe. Frame numbers can be fractional: frame 1.5 is
+        halfway between the second and the third keyframe.
         """
         last = len(self.vertices) - 1
         frames = seconds / self.step_s
@@ -83,9 +86,10 @@ class Animation:
     def vertices_at(
         self, frames: Floats, vertex: Indices | slice = slice(None)
     ) -> tuple[Floats, Floats]:
-        """Return vertices (n, k, 3) at frames (n,), and their steps (n, k, 3) to the next pose.
+        """Return interpolated vertices, and their displacements between adjacent keyframes.
 
-        `vertex` (n, k) selects vertices by their indices.
+        Frame numbers have shape (n,), and both results have shape (n, k, 3). To select vertices for
+        each frame, pass their indices as `vertex` with shape (n, k).
         """
         first_pose = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
         share = (frames - first_pose)[:, None, None]
@@ -96,17 +100,23 @@ class Animation:
 
     @cached_property
     def pictured(self) -> Animation:
-        """Animation for pictures: fewer poses of many vertices, rounded to 1/1024 m."""
+        """Animation for pictures, which has fewer keyframes if the mesh has many vertices.
+
+        Coordinates are rounded to 1/1024 m.
+        """
         steps = min(len(self.vertices), max(MAX_PICTURED_VERTICES // self.vertices.shape[1], 2)) - 1
         poses, _ = self.vertices_at(np.linspace(0, len(self.vertices) - 1, steps + 1))
         return replace(self, vertices=np.round(1024 * poses) / 1024, step_s=self.duration_s / steps)
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of all poses, meters: (2, 3)."""
+        """Bounding box of all keyframes in meters.
+
+        The shape is (2, 3).
+        """
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:
-        """Return the animation with all vertices at p -> linear @ p + offset."""
+        """Return the animation transformed by p -> linear @ p + offset."""
         points = rotate(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

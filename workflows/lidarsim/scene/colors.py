@@ -1,4 +1,4 @@
-"""Colors of triangles: images, plain colors, and colors of corners."""
+"""Colors of triangles, from images, plain colors, and vertex colors."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ..numerics.elementary import power
 from ..numerics.vectors import matmul
 from ..words import plural
 
-# Faces without a color are gray, of half of the light, as the default reflectance is.
+# Faces without a color have a linear gray value of 0.5, which is also the default reflectance.
 GRAY = np.full((1, 1, 3), 188, np.uint8)
 WHITE = np.full((1, 1, 3), 255, np.uint8)
 WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709
 BLOCK_FACES = 1 << 16
-_FLAT = 1e-200  # m⁴: the square of the area of a triangle that no ray hits, twice
+_FLAT = 1e-200  # m⁴, square of twice the area up to which a triangle counts as degenerate
 
 _byte = np.arange(256) / 255
 # {sRGB byte: linear light}, IEC 61966-2-1
@@ -30,32 +30,35 @@ _EDGES = (LINEAR[:-1] + LINEAR[1:]) / 2
 
 
 def as_srgb(linear: ArrayLike) -> Bytes:
-    """Return the nearest sRGB bytes of linear light, 0 to 1, of any shape."""
+    """Convert linear light from 0 to 1 to the nearest sRGB bytes."""
     return np.searchsorted(_EDGES, np.asarray(linear, np.float64)).astype(np.uint8)
 
 
 def as_bytes(shares: ArrayLike) -> Bytes:
-    """Return the bytes of sRGB values, 0 to 1, of any shape, and 0 for NaN."""
+    """Convert sRGB values from 0 to 1 to bytes.
+
+    NaN becomes 0.
+    """
     finite_shares = np.nan_to_num(np.asarray(shares, np.float64))
     return np.rint(255 * np.clip(finite_shares, 0, 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Colors:
-    """Colors of the faces of a mesh, in sRGB, as in files.
+    """Colors of the faces of a mesh in sRGB.
 
     Attributes
     ----------
     images
-        uint8 (h, w, 3) each. An image of a single element is a plain color.
+        Images of shape (h, w, 3) and type uint8. An image with a single pixel is a plain color.
     image
-        int32 (f,): index of each face's image.
+        Index of the image of each face. Shape (f,), int32.
     uv
-        float32 (f, 3, 2): texture coordinates of the corners (`Cutout`); None if there are only
-        plain colors.
+        Texture coordinates of the corners as in `Cutout`, or None if there are only plain colors.
+        Shape (f, 3, 2), float32.
     corners
-        uint8 (f, 3, 3): colors of the corners, factors of the colors of the images in linear
-        light; None for white.
+        Vertex colors of each face, or None for white. The colors of the images are multiplied by
+        these colors in linear light. Shape (f, 3, 3), uint8.
     """
 
     images: tuple[Bytes, ...]
@@ -68,18 +71,27 @@ class Colors:
 
     @classmethod
     def plain(cls, color: Bytes, faces: int) -> Colors:
-        """Return the same color (1, 1, 3) for all faces."""
+        """Create a single color for all faces.
+
+        `color` has shape (1, 1, 3).
+        """
         return cls((color,), np.zeros(faces, np.int32))
 
     @classmethod
-    def of_corners(cls, corners: Bytes) -> Colors:
-        """Return colors (f, 3, 3) of the corners of each face."""
+    def from_vertex_colors(cls, corners: Bytes) -> Colors:
+        """Create vertex colors for each face.
+
+        `corners` has shape (f, 3, 3).
+        """
         return cls((WHITE,), np.zeros(len(corners), np.int32), corners=corners)
 
     @classmethod
-    def of_faces(cls, colors: Bytes) -> Colors:
-        """Return a plain color for each face, from colors (f, 3)."""
-        return cls.of_corners(colors[:, None].repeat(3, axis=1))
+    def from_face_colors(cls, colors: Bytes) -> Colors:
+        """Create a plain color for each face.
+
+        `colors` has shape (f, 3).
+        """
+        return cls.from_vertex_colors(colors[:, None].repeat(3, axis=1))
 
     def take(self, face_selection: Integers | slice) -> Colors:
         """Return the colors of selected faces."""
@@ -87,27 +99,34 @@ class Colors:
         corners = None if self.corners is None else self.corners[face_selection]
         return Colors(self.images, self.image[face_selection], uv, corners)
 
-    def divided(self, face_indices: Integers, weights: Floats) -> Colors:
-        """Return the colors of pieces of faces, by the indices of the faces (k,).
+    def subdivide(self, face_indices: Integers, weights: Floats) -> Colors:
+        """Return the colors of pieces of faces.
 
-        `weights` (k, 3, 3) are the barycentric coordinates of the corners of each piece in its
-        face.
+        Parameters
+        ----------
+        face_indices
+            Index of the face to which each piece belongs. Shape (k,).
+        weights
+            Barycentric coordinates of the corners of each piece. Shape (k, 3, 3).
         """
         faces = self.take(face_indices)
         uv = None if faces.uv is None else matmul(weights, faces.uv).astype(np.float32)
         corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
         return replace(faces, uv=uv, corners=corners)
 
-    def mirrored(self) -> Colors:
+    def reverse_corners(self) -> Colors:
         """Return the colors with the corners of each face in reverse order."""
         uv = None if self.uv is None else self.uv[:, ::-1]
         corners = None if self.corners is None else self.corners[:, ::-1]
         return replace(self, uv=uv, corners=corners)
 
     def check(self, name: str, faces: int) -> None:
-        """Check that the shapes fit a number of faces of an object.
+        """Check that the colors match the faces of an object.
 
-        Raises LidarError if not.
+        Raises
+        ------
+        LidarError
+            If shapes, types or values are invalid.
         """
         shapes = [(self.image, (faces,)), (self.uv, (faces, 3, 2)), (self.corners, (faces, 3, 3))]
         valid = all(array is None or array.shape == shape for array, shape in shapes)
@@ -115,20 +134,22 @@ class Colors:
             valid &= image.dtype == np.uint8 and image.shape[2:] == (3,)
             valid &= image.size == 3 or (image.size > 3 and self.uv is not None)
         valid &= self.uv is None or bool(np.isfinite(self.uv).all())
-        if not valid or not are_indices(self.image, len(self.images)):
+        if not valid or not are_valid_indices(self.image, len(self.images)):
             raise LidarError(
                 f"The colors of {name!r} do not match its {faces} faces. Expected uint8 images (h, "
                 "w, 3), image (f,), finite uv (f, 3, 2) and corners (f, 3, 3)."
             )
 
-    def means(self) -> Bytes:
-        """Return the mean color of each face, in linear light, (f, 3).
+    def mean_colors(self) -> Bytes:
+        """Return the mean color of each face, computed in linear light.
 
-        The mean is taken over 4 points of the face, or of 100 if there are few faces.
+        The mean is taken over 4 points of each face, or over 100 points if the mesh has at most
+        `MAX_DENSE_FACES` faces. The shape is (f, 3).
         """
         mean_colors = np.empty((len(self), 3), np.uint8)
         steps = 10 if len(self) <= MAX_DENSE_FACES else 2
-        # Centers of the pieces into which lines parallel to the edges cut a face.
+        # The points are the centers of the pieces into which lines parallel to the edges divide a
+        # face.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
         upright = np.stack([i, j], axis=1)[i + j < steps] + 1 / 3
         inverted = np.stack([i, j], axis=1)[i + j < steps - 1] + 2 / 3
@@ -140,42 +161,41 @@ class Colors:
             light = np.zeros((len(block), 3))
             for u, v in points.tolist():
                 colors = lookup.colors_at(rows, np.tile([u, v, 0.0], (len(block), 1)))
-                light += LINEAR[unpacked(colors)]
+                light += LINEAR[unpack_colors(colors)]
             mean_colors[start : start + BLOCK_FACES] = as_srgb(light / len(points))
         return mean_colors
 
 
-MAX_DENSE_FACES = 20_000  # limit for meshes whose colors are averaged from 100 points a face
+MAX_DENSE_FACES = 20_000  # up to this size, colors are averaged over 100 points per face
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
-def are_indices(indices: Ints32, count: int) -> bool:
-    """Return True if all numbers, of any shape, are indices from 0 up and below `count`."""
+def are_valid_indices(indices: Ints32, count: int) -> bool:
+    """Return whether all numbers are valid indices for a sequence of length `count`."""
     return not indices.size or bool(0 <= indices.min() <= indices.max() < count)
 
 
 class Lookup:
-    """Lookup of colors by the index of a face and a point on the face, in a table of all texels.
+    """A lookup table for the colors of points on faces.
 
     Parameters
     ----------
     colors
         Colors of f faces.
     corners
-        (k, 3, 3) each: corners of the faces, block by block.
+        Corners of the faces in blocks of shape (k, 3, 3).
     """
 
     def __init__(self, colors: Colors, corners: Iterable[Floats]) -> None:
         images = colors.images
         tints = colors.corners
         self._image = colors.image
-        self._texels = np.concatenate([packed(image.reshape(-1, 3)) for image in images])
+        self._texels = np.concatenate([pack_colors(image.reshape(-1, 3)) for image in images])
         sizes = np.array([image.shape[:2] for image in images], np.int64)
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
         self._first = np.cumsum([0, *counts[:-1]])
-        # Texture coordinates of faces with images, and colors of corners, are stored as planes:
-        # linear functions of the position.
+        # Texture coordinates and vertex colors are stored as linear functions of the position.
         textured = (counts > 1)[self._image]
         tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
         textures = [np.zeros((0, 8))]
@@ -185,16 +205,20 @@ class Lookup:
             rows = slice(start, start + len(block))
             if colors.uv is not None:
                 uv = colors.uv[rows][textured[rows]]
-                textures.append(_planes(block[textured[rows]], uv.astype(np.float64)))
+                textures.append(_fit_planes(block[textured[rows]], uv.astype(np.float64)))
             if tints is not None:
                 light = LINEAR[tints[rows][tinted[rows]]]
-                lights.append(_planes(block[tinted[rows]], light))
+                lights.append(_fit_planes(block[tinted[rows]], light))
             start += len(block)
         self._texture = _Planes.joined(textured, textures)
         self._light = _Planes.joined(tinted, lights)
 
     def colors_at(self, face_indices: Integers, points: Floats) -> UInts32:
-        """Return the packed colors (n,) of points (n, 3) on faces (n,), the texel of an image."""
+        """Return the packed colors of points on given faces.
+
+        Image colors are those of the texel that contains the point. Face indices have shape (n,),
+        points have shape (n, 3), and the result has shape (n,).
+        """
         image = self._image.take(face_indices)
         texel = self._first.take(image)
         positions = np.ascontiguousarray(points.T)
@@ -202,35 +226,39 @@ class Lookup:
             selected, (u, v) = self._texture.values_at(face_indices, positions)
             image = image[selected]
             width = self._width.take(image)
-            row = _element(v, self._height.take(image))
-            texel[selected] += row * width + _element(u, width)
+            row = _texel_index(v, self._height.take(image))
+            texel[selected] += row * width + _texel_index(u, width)
         colors = self._texels.take(texel)
         if self._light is not None:
             selected, light = self._light.values_at(face_indices, positions)
-            tinted = LINEAR[unpacked(colors[selected])] * np.clip(light.T, 0, 1)
-            colors[selected] = packed(as_srgb(tinted))
+            tinted = LINEAR[unpack_colors(colors[selected])] * np.clip(light.T, 0, 1)
+            colors[selected] = pack_colors(as_srgb(tinted))
         return colors
 
 
 class _Planes(NamedTuple):
-    """Values on faces that are linear in the position."""
+    """Values on faces that are linear functions of the position."""
 
-    slope_rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
-    slopes: Floats  # (k, 4 w): for each of w values, slopes along x, y and z, and value at zero
-    everywhere: bool  # all faces have values
+    slope_rows: Ints32  # (f,), row of `slopes` for each face, or -1 for faces without values
+    slopes: Floats  # (k, 4 w), slopes along x, y and z and the value at zero for each of w values
+    everywhere: bool  # whether all faces have values
 
     @classmethod
     def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
-        """Join blocks of slopes (k, 4 w) of the faces that have values, None without any."""
+        """Concatenate blocks of slopes for the faces that have values.
+
+        Blocks have shape (k, 4 w). The result is None if no face has values.
+        """
         if not has_values.any():
             return None
         slope_rows = np.where(has_values, np.cumsum(has_values) - 1, -1).astype(np.int32)
         return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
     def values_at(self, face_indices: Integers, points: Floats) -> tuple[Any, Floats]:
-        """Return the selection of the faces (n,) with values, and the values at points (3, n).
+        """Return the values at points on given faces, and the selection of the points with values.
 
-        The selection is a slice of all, or indices (m,); the values are (w, m).
+        The selection is a slice for all points, or indices of shape (m,). Face indices have shape
+        (n,), points have shape (3, n), and values have shape (w, m).
         """
         selected: Any = slice(None)
         slope_rows = self.slope_rows.take(face_indices)
@@ -249,10 +277,11 @@ class _Planes(NamedTuple):
         return selected, values
 
 
-def _planes(corners: Floats, values: Floats) -> Floats:
-    """Return the slopes (k, 4 w) of `_Planes` for values (k, 3, w) at corners (k, 3, 3).
+def _fit_planes(corners: Floats, values: Floats) -> Floats:
+    """Return the slopes of `_Planes` for values at the corners of faces.
 
-    Flat triangles, which are not hit, have the value of their first corner.
+    Degenerate triangles, which rays never hit, have the value of their first corner. Corners have
+    shape (k, 3, 3), values have shape (k, 3, w), and slopes have shape (k, 4 w).
     """
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
@@ -268,33 +297,42 @@ def _planes(corners: Floats, values: Floats) -> Floats:
     return planes.reshape(len(corners), 4 * values.shape[2])
 
 
-def _element(coordinate: Floats, size: Ints) -> Ints:
-    """Return the row or column (n,) of a repeating image that contains a texture coordinate."""
+def _texel_index(coordinate: Floats, size: Ints) -> Ints:
+    """Return the row or column of a repeating image that contains a texture coordinate."""
     position = coordinate - np.floor(coordinate)
     position *= size
     return np.minimum(position.astype(np.int64), size - 1)
 
 
-def packed(colors: Bytes) -> UInts32:
-    """Return colors (n, 3) packed into a number each (n,), red in the lowest byte."""
+def pack_colors(colors: Bytes) -> UInts32:
+    """Pack colors into integers, with red in the lowest byte.
+
+    Colors have shape (n, 3), and the result has shape (n,).
+    """
     channels = np.zeros((len(colors), 4), np.uint8)
     channels[:, :3] = colors
     return channels.view("<u4")[:, 0]
 
 
-def unpacked(colors: UInts32) -> Bytes:
-    """Return the colors (n, 3) of packed colors (n,)."""
+def unpack_colors(colors: UInts32) -> Bytes:
+    """Unpack colors from integers.
+
+    Packed colors have shape (n,), and the result has shape (n, 3).
+    """
     return np.ascontiguousarray(colors, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
-def as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
-    """Return colors (n,) as in the field `rgb` of PCL and ROS: bits 0x00RRGGBB as a float."""
-    return packed(np.column_stack([blue, green, red])).view("<f4")
+def pack_as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
+    """Encode colors as in the `rgb` field of PCL and ROS.
+
+    The bits 0x00RRGGBB of each color are interpreted as a float. All arrays have shape (n,).
+    """
+    return pack_colors(np.column_stack([blue, green, red])).view("<f4")
 
 
 def luminance(colors: UInts32) -> Floats:
-    """Return the luminance (n,) of packed colors in linear light, 0 to 1."""
-    red, green, blue = map(np.take, _SHARES, unpacked(colors).T)
+    """Return the luminance of packed colors in linear light, from 0 to 1."""
+    red, green, blue = map(np.take, _SHARES, unpack_colors(colors).T)
     return np.asarray(red + green + blue)
 
 
@@ -302,9 +340,9 @@ _SHARES = WEIGHTS[:, None] * LINEAR
 
 
 def join_colors(mesh_colors: Sequence[Colors | None], sizes: Iterable[int]) -> Colors | None:
-    """Join the colors of meshes in order, or return None if no mesh has colors.
+    """Concatenate the colors of meshes, or return None if no mesh has colors.
 
-    `sizes` are the numbers of faces of the meshes; a mesh without colors becomes gray.
+    `sizes` contains the number of faces of each mesh. A mesh without colors becomes gray.
     """
     if not any(part is not None for part in mesh_colors):
         return None
@@ -312,9 +350,9 @@ def join_colors(mesh_colors: Sequence[Colors | None], sizes: Iterable[int]) -> C
         Colors.plain(GRAY, size) if part is None else part
         for part, size in zip(mesh_colors, sizes, strict=True)
     ]
-    image_numbers: dict[int, int] = {}  # {id of an image: its number}
+    image_numbers: dict[int, int] = {}  # {id of an image: index of the image}
     images: list[Bytes] = []
-    image_indices = []  # (f,) of each mesh
+    image_indices = []  # an array of shape (f,) for each mesh
     for part in colored:
         for pixels in part.images:
             if id(pixels) not in image_numbers:
@@ -339,7 +377,7 @@ def join_colors(mesh_colors: Sequence[Colors | None], sizes: Iterable[int]) -> C
 
 
 def colors_summary(mesh_colors: Iterable[Colors | None]) -> str:
-    """Return a summary of colors: «2 textures, 1 plain color, colors of vertices»."""
+    """Return a summary of the colors, such as "2 textures, 1 plain color, vertex colors"."""
     colored = [part for part in mesh_colors if part is not None]
     kinds = {
         id(part.images[number]): "texture" if part.images[number].size > 3 else "plain color"

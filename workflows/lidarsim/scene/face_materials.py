@@ -1,4 +1,4 @@
-"""Names that the materials of faces have in scene files."""
+"""Material names of faces, as stated in scene files."""
 
 from __future__ import annotations
 
@@ -9,43 +9,47 @@ import numpy as np
 
 from ..errors import LidarError
 from ..numerics.arrays import Integers, Ints32
-from .colors import are_indices
+from .colors import are_valid_indices
 
 
 @dataclass(frozen=True, eq=False)
 class FaceMaterials:
-    """Names of the materials of a mesh's faces.
+    """Material names of the faces of a mesh.
 
     Attributes
     ----------
     names
-        Distinct names; "" for faces without a material.
+        Distinct names. The empty string denotes faces without a material.
     index
-        int32 (f,): row of `names` for each face; None if all faces have the first.
+        Index into `names` for each face, or None if all faces have the first name. Shape (f,),
+        int32.
     """
 
     names: tuple[str, ...]
     index: Ints32 | None = None
 
     @classmethod
-    def named(cls, name: str) -> FaceMaterials | None:
-        """Return the same material for all faces, or None without a name."""
+    def from_name(cls, name: str) -> FaceMaterials | None:
+        """Assign the same material to all faces, or return None if the name is empty."""
         return cls((name,)) if name else None
 
     def take(self, face_selection: Integers | slice) -> FaceMaterials:
-        """Return the materials of selected faces, with the same names."""
+        """Return the materials of selected faces without removing unused names."""
         return self if self.index is None else FaceMaterials(self.names, self.index[face_selection])
 
     def check(self, name: str, faces: int) -> None:
-        """Check that names are distinct, and rows fit a number of faces.
+        """Check that the materials match the faces of an object.
 
-        Raises LidarError if not.
+        Raises
+        ------
+        LidarError
+            If names are not unique, or if the index has a wrong shape, type or value.
         """
         index = self.index
         fits = len(self.names) > 0 and len(set(self.names)) == len(self.names)
         if index is not None:
             fits = fits and index.shape == (faces,) and index.dtype == np.int32
-            fits = fits and are_indices(index, len(self.names))
+            fits = fits and are_valid_indices(index, len(self.names))
         if not fits:
             raise LidarError(
                 f"The materials of {name!r} do not match its {faces} faces. Names must be unique, "
@@ -55,15 +59,15 @@ class FaceMaterials:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMaterials:
-    """Names of the materials of a scene's objects, without actors.
+    """Material names of the static objects in a scene.
 
     Attributes
     ----------
     names
-        Names of the materials of each object; () for an object without materials.
+        Material names of each object, which are empty for objects without materials.
     index
-        int32 (f,) for the scene's faces: row of the names of the face's object; None if all faces
-        have the first name. Parts of instances have a separate index.
+        Index into the names of the object for each face in `Scene.faces`, or None if all faces have
+        the first name. Shape (f,), int32. Each part of an instance has a separate index.
     """
 
     names: tuple[tuple[str, ...], ...]
@@ -100,8 +104,8 @@ class ObjectMaterials:
         ]
         return cls(names, np.concatenate(rows))
 
-    def of_object(self, owner: int, faces: Integers) -> FaceMaterials | None:
-        """Return the materials of the scene's `faces` (k,), which belong to the object `owner`."""
+    def for_object(self, owner: int, faces: Integers) -> FaceMaterials | None:
+        """Return the materials of selected faces, which must all belong to the object `owner`."""
         if not self.names[owner]:
             return None
         single = self.index is None or len(self.names[owner]) == 1
@@ -113,14 +117,14 @@ class ObjectMaterials:
 def join_materials(
     mesh_materials: Sequence[FaceMaterials | None], sizes: Iterable[int]
 ) -> FaceMaterials | None:
-    """Join the materials of meshes in order, or return None if no mesh has materials.
+    """Concatenate the materials of meshes, or return None if no mesh has materials.
 
-    `sizes` are the numbers of faces of the meshes; faces without a material get the name "".
+    `sizes` contains the number of faces of each mesh. Faces without a material have an empty name.
     """
     if not any(part is not None for part in mesh_materials):
         return None
-    numbers: dict[str, int] = {}  # {name: row}
-    index: list[Ints32] = []  # (f,) of each mesh
+    numbers: dict[str, int] = {}  # {name: index}
+    index: list[Ints32] = []  # an array of shape (f,) for each mesh
     for part, size in zip(mesh_materials, sizes, strict=True):
         names = ("",) if part is None else part.names
         rows = [numbers.setdefault(name, len(numbers)) for name in names]

@@ -1,4 +1,4 @@
-"""Images of materials: masks, which say where triangles stop light, and colors."""
+"""Material images, which are colors and masks that define where triangles block light."""
 
 from __future__ import annotations
 
@@ -20,36 +20,40 @@ from ..words import printable
 from .colors import Colors
 from .scene_mesh import MAX_UV, Cutout
 
-# Further formats of Pillow are left out, since some run programs.
+# Other formats of Pillow are excluded because decoding some of them runs external programs.
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")
-HALF_OPACITY = 128  # least 8-bit opacity that stops light, unless a file states a cutoff
+HALF_OPACITY = 128  # minimum 8-bit opacity that blocks light, unless the file specifies a cutoff
 PIXEL_BYTES = 10  # memory of a pixel while its image is decoded
 FACE_BYTES = 120  # memory of a triangle while its texture coordinates are computed
-_MAX_NAMED = 3  # materials that a note names
-MAX_SIDE_PIXELS = 4096  # width and height of an image of colors; larger images are reduced
+_MAX_NAMED = 3  # maximum number of materials listed in a note
+MAX_SIDE_PIXELS = 4096  # maximum width and height of color images; larger images are downscaled
 
-Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
+Wrap = Literal["repeat", "mirror", "clamp", "black"]  # black is transparent in a mask
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 
 class MaskError(Exception):
-    """The reason why a mask cannot be read, as a clause."""
+    """An error whose message is a clause that states why an image cannot be read."""
 
 
 def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = False) -> Bytes | None:
-    """Return the opacity of an image: its alpha channel, or else, with `gray`, its brightness.
+    """Return the opacity of an image from its alpha channel.
+
+    If `gray` is set, images without an alpha channel, and images that are opaque everywhere, use
+    their brightness as opacity. Otherwise, None is returned for these images.
 
     Returns
     -------
-    (h, w), 0 to 255; None without an alpha channel, or if it is opaque everywhere.
+    Bytes or None
+        Opacity from 0 to 255. Shape (h, w).
 
     Raises
     ------
     MaskError
-        If the image cannot be decoded, or takes more memory than allowed.
+        If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         if not (gray or opened.has_transparency_data):
             return None
         pixels = opened.width * opened.height
@@ -61,23 +65,24 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = Fals
             alpha = np.asarray(rgba.getchannel("A"))
             if alpha.min() < 255:
                 return alpha
-        return np.asarray(_of_bytes(opened).convert("L")) if gray else None
+        return np.asarray(_as_8_bit(opened).convert("L")) if gray else None
 
 
 def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
-    """Return the colors of an image: (h, w, 3), sRGB.
+    """Return the sRGB colors of an image.
 
-    An image that is more than `MAX_SIDE_PIXELS` wide or high is reduced, which `notes` records.
+    An image that is more than `MAX_SIDE_PIXELS` wide or high is downscaled, which is recorded in
+    `notes`. The shape is (h, w, 3).
 
     Raises
     ------
     MaskError
-        If the image cannot be decoded, or takes more memory than allowed.
+        If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         if not allowance.fits(PIXEL_BYTES * opened.width * opened.height):
             raise _TooLargeError
-        rgb = _of_bytes(opened).convert("RGB")
+        rgb = _as_8_bit(opened).convert("RGB")
         if max(rgb.size) > MAX_SIDE_PIXELS:
             notes.reduced_sizes.append(f"{rgb.width:,} x {rgb.height:,}")
             rgb.thumbnail((MAX_SIDE_PIXELS, MAX_SIDE_PIXELS), Image.Resampling.BOX)
@@ -86,17 +91,18 @@ def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> 
 
 
 def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Floats:
-    """Return the brightness of an image, a height map: float64 (h, w), from 0 up.
+    """Return the brightness of a height map.
 
-    Memory for `bytes_per_pixel` more, for the mesh that is made of the pixels, is taken from the
-    allowance before the image is decoded.
+    Values are nonnegative. The shape is (h, w), and the type is float64. Before the image is
+    decoded, the memory for the result and another `bytes_per_pixel` bytes per pixel is deducted
+    from the allowance. The additional bytes are for the mesh that is created from the pixels.
 
     Raises
     ------
     MaskError
-        If the image cannot be decoded, or takes more memory than allowed.
+        If the image cannot be decoded or requires more memory than allowed.
     """
-    with _opened(image) as opened:
+    with _open_image(image) as opened:
         pixels = opened.width * opened.height
         if not allowance.fits((PIXEL_BYTES + bytes_per_pixel) * pixels):
             raise _TooLargeError
@@ -109,14 +115,12 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
 
 
 @contextmanager
-def _opened(image: Path | bytes) -> Iterator[Image.Image]:
-    """Open an image for the body.
-
-    Raises MaskError for all errors, those in the body included.
-    """
+def _open_image(image: Path | bytes) -> Iterator[Image.Image]:
+    """Open an image, and convert all errors, including those in the body, to MaskError."""
     name = image.name if isinstance(image, Path) else "its image"
     try:
-        # Pillow warns of images that it reads all the same, and of images that are too large.
+        # Pillow warns about images that it can read nevertheless, and about images that are too
+        # large.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -134,7 +138,7 @@ def _opened(image: Path | bytes) -> Iterator[Image.Image]:
     except InputFileError as error:
         raise MaskError(f"{name} cannot be read: {error.strerror}") from error
     except Exception as error:
-        # Decoders raise errors of any class: OSError, SyntaxError, struct.error, …
+        # Decoders raise errors of many classes, such as OSError, SyntaxError and struct.error.
         raise MaskError(f"{name} cannot be decoded") from error
 
 
@@ -142,8 +146,8 @@ class _TooLargeError(Exception):
     pass
 
 
-def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
-    """Cache a function, and its MaskErrors."""
+def cache_with_errors(read: Callable[[K], V]) -> Callable[[K], V]:
+    """Cache the results of a function and its MaskErrors."""
 
     @cache
     def result_or_error(key: K) -> V | MaskError:
@@ -161,22 +165,22 @@ def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
     return read_once
 
 
-def _of_bytes(image: Image.Image) -> Image.Image:
-    """Return an image of 8 bits, while Pillow would clip an image of 16 bits."""
+def _as_8_bit(image: Image.Image) -> Image.Image:
+    """Convert an image with 16 bits per channel to 8 bits, where Pillow would clip the values."""
     if not image.mode.startswith("I;16"):
         return image
     return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
 
 
 class Texture:
-    """A mask or an image, and its continuation beyond the edges, along u and along v.
+    """A mask or a color image that continues beyond its edges along u and v.
 
-    Materials should share textures, since each texture takes memory.
+    Each texture requires memory, so materials should share textures.
 
     Raises
     ------
     MaskError
-        If the texture takes more memory than allowed.
+        If the texture requires more memory than allowed.
     """
 
     def __init__(
@@ -184,64 +188,74 @@ class Texture:
     ) -> None:
         self._wraps = wraps
         self._allowance = allowance
-        _take(allowance, image.size)
+        _deduct(allowance, image.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
-            if wrap == "mirror":  # the image and its mirror image repeat
-                _take(allowance, 2 * image.size)
+            if wrap == "mirror":  # the image and its mirror image repeat alternately
+                _deduct(allowance, 2 * image.size)
                 image = np.concatenate([image, np.flip(image, axis)], axis)
         self._image = image
 
     def cutout(self, coordinates: AnyArray, corners: Ints) -> Cutout:
-        """Return the texture as the mask of triangles (`map_to_triangles`)."""
+        """Return the texture as the mask of triangles.
+
+        `map_to_triangles` describes the parameters.
+        """
         return Cutout(*self.map_to_triangles(coordinates, corners))
 
     def colors(self, coordinates: AnyArray, corners: Ints) -> Colors:
-        """Return the texture as the colors of triangles (`map_to_triangles`)."""
+        """Return the texture as the colors of triangles.
+
+        `map_to_triangles` describes the parameters.
+        """
         image, uv = self.map_to_triangles(coordinates, corners)
         return Colors((image,), np.zeros(len(uv), np.int32), uv)
 
     def map_to_triangles(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
-        """Return a repeating image, and texture coordinates (k, 3, 2), as in glTF.
+        """Return a repeating image and the texture coordinates of the corners of triangles.
+
+        Coordinates are defined as in glTF. Their shape is (k, 3, 2).
 
         Parameters
         ----------
         coordinates
-            Texture coordinates (c, 2).
+            Texture coordinates. Shape (c, 2).
         corners
-            (k, 3): rows of `coordinates` of the corners of each triangle.
+            Index into `coordinates` for each corner of each triangle. Shape (k, 3).
 
         Raises
         ------
         MaskError
-            If texture coordinates are missing, infinite, too large, or too far beyond an image that
-            does not repeat.
+            If texture coordinates are missing, infinite, too large, or too far outside an image
+            that does not repeat.
         """
         if not len(coordinates) or not 0 <= corners.min() <= corners.max() < len(coordinates):
             raise MaskError("texture coordinates are missing")
         if not self._allowance.fits(FACE_BYTES * len(corners)):
             raise MaskError("there are too many triangles")
         uv = coordinates[corners].astype(np.float64)
-        if not (np.abs(uv) < MAX_UV / 2).all():  # half, for what rounding adds
+        if not (np.abs(uv) < MAX_UV / 2).all():  # half, since rounding can increase the values
             raise MaskError("texture coordinates are infinite or too large")
         image = self._image
         for column, wrap in enumerate(self._wraps):
             if wrap == "mirror":
                 uv[..., column] /= 2
             elif wrap != "repeat":
-                image = self._continued(image, uv[..., column], 1 - column, wrap == "black")
+                image = self._extend(image, uv[..., column], 1 - column, wrap == "black")
         return image, uv.astype(np.float32)
 
-    def _continued(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
-        """Continue an image, by its edges or black, up to all coordinates (k, 3).
+    def _extend(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
+        """Extend an image until it covers all texture coordinates, with its edges or with black.
 
-        The coordinates are changed to fit the continued image. They may exceed the image by a
-        hundredth of a texel, which is the rounding of programs.
+        The coordinates are modified in place to match the extended image. Their shape is (k, 3).
+        Coordinates up to a hundredth of a texel outside the image are moved to its edge, because
+        programs round texture coordinates.
         """
         size = image.shape[axis]
         slack = 0.01 / size
         coordinates[(coordinates > -slack) & (coordinates < 0)] = 0
         coordinates[(coordinates > 1) & (coordinates < 1 + slack)] = 1
-        # Triangles wholly beyond an edge are in its last texels, or the first texels beyond.
+        # Triangles entirely beyond an edge use the texels at the edge, or the black texels next to
+        # it.
         upper = coordinates.max(axis=1)
         lower = coordinates.min(axis=1)
         coordinates[upper <= 0] = 0.5 / size
@@ -254,7 +268,7 @@ class Texture:
         if not texels_before and not texels_after:
             return image
         continued_size = size + texels_before + texels_after
-        _take(self._allowance, image.size // size * continued_size)
+        _deduct(self._allowance, image.size // size * continued_size)
         widths = [(0, 0)] * image.ndim
         widths[axis] = texels_before, texels_after
         coordinates *= size / continued_size
@@ -262,36 +276,33 @@ class Texture:
         return np.pad(image, widths, mode="constant" if black else "edge")
 
 
-def _take(allowance: Allowance, count: int) -> None:
-    """Take bytes of an image from the allowance.
-
-    Raises MaskError if the image is too large.
-    """
+def _deduct(allowance: Allowance, count: int) -> None:
+    """Deduct bytes from the allowance, or raise MaskError if there are not enough left."""
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
     allowance.take(count)
 
 
 class MaskNotes:
-    """Notes on masks and colors of a file's materials that are not read as stated."""
+    """Notes about masks and colors that are not read as the file specifies."""
 
     def __init__(self) -> None:
-        self.mask_errors: dict[str, str] = {}  # {material: why its triangles are solid}
+        self.mask_errors: dict[str, str] = {}  # {material: why its triangles are opaque}
         self.color_errors: dict[str, str] = {}  # {material: why its triangles have no color}
-        self.glass: dict[str, None] = {}  # {transparent material without holes: None}, in order
-        self.reduced_sizes: list[str] = []  # sizes of images of colors that are reduced
-        self.missing_files: list[str] = []  # files of materials that cannot be read
+        self.glass: dict[str, None] = {}  # transparent materials without holes, as an ordered set
+        self.reduced_sizes: list[str] = []  # original sizes of downscaled color images
+        self.missing_files: list[str] = []  # material files that cannot be read
 
-    def without_mask(self, material: str) -> AbstractContextManager[None]:
-        """Note MaskErrors of the body, and leave the triangles solid then."""
-        return _noted(self.mask_errors, material)
+    def record_mask_error(self, material: str) -> AbstractContextManager[None]:
+        """Catch errors of the body, record them for a material, and make its triangles opaque."""
+        return _record_error(self.mask_errors, material)
 
-    def without_color(self, material: str) -> AbstractContextManager[None]:
-        """Note errors of the body, and leave the triangles without color then."""
-        return _noted(self.color_errors, material)
+    def record_color_error(self, material: str) -> AbstractContextManager[None]:
+        """Catch errors of the body, record them for a material, and ignore its colors."""
+        return _record_error(self.color_errors, material)
 
     def lines(self) -> list[str]:
-        """Return notes, as clauses that follow the file's name."""
+        """Return the notes as clauses that follow the name of the file."""
         notes = []
         if self.missing_files:
             files = _listed(self.missing_files)
@@ -324,8 +335,8 @@ class MaskNotes:
 
 
 @contextmanager
-def _noted(reasons: dict[str, str], material: str) -> Iterator[None]:
-    """Note errors of the body in `reasons` of materials: the first of each material."""
+def _record_error(reasons: dict[str, str], material: str) -> Iterator[None]:
+    """Record errors of the body, unless an error is already recorded for the material."""
     try:
         yield
     except MaskError as error:
@@ -335,7 +346,7 @@ def _noted(reasons: dict[str, str], material: str) -> Iterator[None]:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first names in a row, with an ellipsis for the rest."""
+    """Return the first names, separated by commas, with an ellipsis if there are more."""
     return ", ".join(printable(name) for name in names[:_MAX_NAMED]) + ", …" * (
         len(names) > _MAX_NAMED
     )

@@ -1,4 +1,4 @@
-"""Names of objects: each name once, by numbers, or by joining the objects of a name."""
+"""Unique object names, which are created by appending numbers or by merging objects."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ def resolve_same_names(
     same_names: SameNames,
     tell: Callable[[str], None],
 ) -> list[SceneMesh | SceneInstance]:
-    """Return the objects of scene files, joined by name if `same_names` is "join".
+    """Merge objects with the same name if `same_names` is "join".
 
     Parameters
     ----------
     objects
         Objects in world coordinates, in the order of the files.
     same_names
-        With "join", all objects of a name become one object, in the order of the first. With
-        "number", the objects stay, and a scene numbers their names: Wall, Wall.2.
+        With "join", all objects with the same name become one object at the position of the first.
+        With "number", the objects are returned unchanged, since a scene appends numbers to
+        duplicate names (Wall, Wall.2).
     tell
-        Called with a line on names that a scene numbers.
+        Called with a message about duplicate names if `same_names` is "number".
 
     Raises
     ------
     LidarError
-        If voxels would be joined to another object.
+        If an object with voxels would be merged with another object.
     """
     if same_names == "join":
         groups: dict[str, list[SceneMesh | SceneInstance]] = {}
@@ -58,7 +59,7 @@ def resolve_same_names(
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return unique names, with a number for repeated names: Shelf, then Shelf.2.
+    """Make names unique by appending numbers to duplicates.
 
     Examples
     --------
@@ -67,7 +68,7 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
     """
     all_names = set(names)
     used: set[str] = set()
-    numbers: dict[str, int] = {}  # {name: last number used for the name}
+    numbers: dict[str, int] = {}  # {name: last number that was tried}
     numbered = []
     for name in names:
         unique = name

@@ -1,4 +1,4 @@
-"""The scene: triangles of all objects, near a local origin."""
+"""Scenes, which hold the triangles of all objects in coordinates relative to a local origin."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from ..schema.checks import as_array, check_fields, check_list
 from ..schema.value_texts import shown
 from ..words import listed, plural
 from .actors import Actor
-from .colors import GRAY, Colors, are_indices, join_colors
+from .colors import GRAY, Colors, are_valid_indices, join_colors
 from .face_materials import ObjectMaterials
 from .files.meshfile import Objects, load_objects, warn
 from .object_names import SameNames, resolve_same_names, unique_names
-from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
-from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
+from .scene_instances import Instances, MeshPart, SceneInstance, split_by_masks
+from .scene_mesh import Cutout, SceneMesh, drop_unused_vertices, points_array, stack_meshes
 from .shapes import seed_objects
 from .transform import Transform
 
-# Single precision, which ray casters use, resolves a millimeter up to this distance.
+# Up to this distance, the single precision of the ray casters resolves a millimeter.
 MAX_LOCAL_COORDINATE_M = 10_000.0
 
 _log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ class Scene:
         return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
 
     def _repr_html_(self) -> str:
-        """Return the table of the main figures, and a picture if a package draws scenes."""
+        """Return an HTML table of the main properties, with a picture if a plug-in draws scenes."""
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
         rows = {
             "scene": f"{plural(len(self.object_names), 'object')}: {listed(self.object_names, 8)}",
@@ -130,9 +130,9 @@ class Scene:
             raise LidarError(
                 f"The faces of a scene must have the shape (f, 3), but have {faces.shape}."
             )
-        if not are_indices(faces, len(vertices)):
+        if not are_valid_indices(faces, len(vertices)):
             raise LidarError(f"Faces must refer to the {len(vertices)} vertices, counted from 0.")
-        if owners.shape != faces.shape[:1] or not are_indices(owners, len(self.names)):
+        if owners.shape != faces.shape[:1] or not are_valid_indices(owners, len(self.names)):
             raise LidarError(
                 f"face_object must have the index of one of the {len(self.names)} objects, counted "
                 f"from 0, for each of the {len(faces)} faces."
@@ -140,7 +140,7 @@ class Scene:
         arrays = {"vertices": vertices, "faces": faces, "face_object": owners}
         arrays |= {"origin": origin, "world_origin": world_origin}
         for name, array in arrays.items():
-            # A read-only array is already another scene's: both keep the same Python object.
+            # A read-only array belongs to another scene. Both scenes share the same object.
             if array.flags.writeable:
                 array = array.view()
                 array.flags.writeable = False
@@ -235,8 +235,8 @@ class Scene:
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
         """Create a scene from the objects of mesh files.
 
-        If there are no static objects, the actors become static objects at their first pose. In
-        this case, `tell` is called with a message about the lost motion.
+        A scene requires at least one static object. If there are none, the actors become static
+        objects at their first pose, and `tell` is called with a warning that their motion is lost.
         """
         if not objects.static:
             note_start = "a scene requires at least one static object. This scene moves "
@@ -276,7 +276,7 @@ class Scene:
         vertices = np.zeros((0, 3))
         faces = np.zeros((0, 3), np.int64)
         if split.meshes:
-            vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in split.meshes)
+            vertices, faces = stack_meshes((mesh.vertices, mesh.faces) for mesh in split.meshes)
         instances = split.instances()
         corners = [vertices]
         if instances is not None:
@@ -532,7 +532,7 @@ class Scene:
         )
         sizes = [len(self.faces), *(len(faces) for _, faces in moving)]
         return Scene(
-            *stacked([(self.vertices, self.faces), *moving]),
+            *stack_meshes([(self.vertices, self.faces), *moving]),
             np.append(self.face_object, owners),
             self.object_names,
             self.origin,
@@ -565,8 +565,7 @@ class Scene:
         return tuple(item for items in by_object for item in items)
 
     def _mesh_of_faces(self, owner: int, face_indices: Indices) -> SceneMesh:
-        """Return faces of an object, by their indices (k,), as a mesh in world coordinates."""
-        points, faces = compacted(self.vertices, self.faces[face_indices])
+        points, faces = drop_unused_vertices(self.vertices, self.faces[face_indices])
         return SceneMesh(
             self.names[owner],
             points + self.origin,
@@ -574,13 +573,13 @@ class Scene:
             colors=self.colors and self.colors.take(face_indices),
             materials=None
             if self.materials is None
-            else self.materials.of_object(owner, face_indices),
+            else self.materials.for_object(owner, face_indices),
         )
 
     def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:
-        """Return a part of instances as a mesh, in the frame of the part.
+        """Return a part of the instances as a mesh in the frame of the part.
 
-        The mesh has the name of the first object that has the part.
+        The mesh is named after the first object that contains the part.
         """
         part = instances.mesh_parts[index]
         cutouts = () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),)
@@ -607,7 +606,10 @@ class Scene:
 
     @cached_property
     def _face_bounds(self) -> Floats:
-        """Lowest and highest corner of `faces`, local, meters: (2, 3), or (0, 3) without faces."""
+        """Bounding box of `faces` in local coordinates, in meters.
+
+        The shape is (2, 3), or (0, 3) if there are no faces.
+        """
         is_used = np.zeros(len(self.vertices), np.bool_)
         is_used[self.faces] = True
         used = self.vertices[is_used]
@@ -651,10 +653,6 @@ class Scene:
 
 
 def _world_position(value: ArrayLike) -> Floats:
-    """Return a position (3,) as read-only float64.
-
-    Raises LidarError if it is none.
-    """
     position = np.array(as_array("world_origin", value))
     if position.shape != (3,) or not np.isfinite(position).all():
         raise LidarError(f"world_origin must be x, y and z in meters, but is {shown(value)}.")
@@ -663,10 +661,11 @@ def _world_position(value: ArrayLike) -> Floats:
 
 
 def local_origin(vertices: Floats) -> Floats:
-    """Return the origin for world coordinates (v, 3): zero, or whole meters in their middle.
+    """Return a suitable local origin for world coordinates.
 
-    Whole meters are exact in double precision, so that subtracting and adding the origin again
-    gives the same coordinates.
+    The origin is zero, or the center of the bounding box in whole meters if that center is more
+    than `MAX_LOCAL_COORDINATE_M` away from zero along any axis. Whole meters are exact in double
+    precision, so that subtracting the origin and adding it again restores the coordinates.
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     if np.abs(middle).max() <= MAX_LOCAL_COORDINATE_M:
@@ -675,19 +674,19 @@ def local_origin(vertices: Floats) -> Floats:
 
 
 class _PlacedPart(NamedTuple):
-    """A part of a mesh at a pose in a scene."""
+    """A mesh part and its pose in the scene."""
 
     owner: int  # index of the object
     part: int  # index of the part
-    matrix: Floats  # (4, 4), from the part's coordinates to the world
+    matrix: Floats  # (4, 4), from the frame of the part to world coordinates
 
 
 @dataclass
 class _SplitObjects:
-    """Objects of a scene: meshes whose triangles are copied, and parts that instances share.
+    """Objects of a scene, split into meshes to copy and mesh parts to instantiate.
 
-    Meshes are in world coordinates, parts in the frame of their mesh; an owner is the index of an
-    object.
+    Meshes are in world coordinates. Parts are in the frame of their mesh. The owner of a mesh or
+    part is the index of its object.
     """
 
     meshes: list[SceneMesh] = field(default_factory=list)  # without masks and voxels
@@ -696,12 +695,12 @@ class _SplitObjects:
     placed_parts: list[_PlacedPart] = field(default_factory=list)
 
     def add_mesh(self, owner: int, mesh: SceneMesh) -> None:
-        """Add a mesh whose triangles are copied into the scene."""
+        """Add a mesh whose triangles are copied to the scene."""
         self.meshes.append(mesh)
         self.mesh_owners.append(owner)
 
     def instances(self) -> Instances | None:
-        """Return the placed parts in world coordinates, or None if there are no placed parts."""
+        """Return the instances in world coordinates, or None if there are none."""
         if not self.placed_parts:
             return None
         owners, parts, matrices = zip(*self.placed_parts, strict=True)
@@ -714,10 +713,6 @@ class _SplitObjects:
 
 
 def _check_objects(objects: Sequence[object]) -> None:
-    """Check that there are objects, each a mesh or an instance.
-
-    Raises LidarError if not.
-    """
     for item in objects:
         if not isinstance(item, (SceneMesh, SceneInstance)):
             raise LidarError(
@@ -728,11 +723,12 @@ def _check_objects(objects: Sequence[object]) -> None:
 
 
 def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObjects:
-    """Split objects into meshes to copy, and parts of meshes to place as instances.
+    """Split objects into meshes to copy and mesh parts to instantiate.
 
-    A `SceneMesh` without masks and voxels is copied. Other meshes are divided into parts, one for
-    each mask and one for the opaque triangles. Of a `SceneMesh`, the opaque part is copied and
-    the parts with a mask or voxels are placed; of a `SceneInstance`, all parts are placed.
+    A `SceneMesh` without masks and voxels is copied. All other meshes are divided into one part for
+    each mask and one part for the opaque triangles. The parts of a `SceneInstance` all become
+    instances. The opaque part of a `SceneMesh` is copied, whereas its parts with a mask or voxels
+    become instances.
     """
     split = _SplitObjects()
     part_indices: dict[SceneMesh, range] = {}
@@ -749,7 +745,7 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
             matrix = item.matrix
         if mesh not in part_indices:
             first = len(split.mesh_parts)
-            split.mesh_parts += parts_of(mesh)
+            split.mesh_parts += split_by_masks(mesh)
             part_indices[mesh] = range(first, len(split.mesh_parts))
         for index in part_indices[mesh]:
             part = split.mesh_parts[index]
@@ -761,7 +757,6 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
 
 
 def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
-    """Return a part without mask and voxels as a mesh, with the same frame and triangles."""
     return SceneMesh(
         name,
         part.vertices,
@@ -772,10 +767,7 @@ def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
 
 
 def _check_counts(split: _SplitObjects) -> None:
-    """Check that 32 bits can number the vertices and triangles of objects.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if there are more vertices or triangles than 32-bit integers can index."""
     vertices = sum(len(mesh.vertices) for mesh in split.meshes)
     triangles = sum(len(mesh.faces) for mesh in split.meshes)
     triangles += sum(len(split.mesh_parts[placed.part].faces) for placed in split.placed_parts)

@@ -1,4 +1,4 @@
-"""Meshes at many positions, each stored once."""
+"""Instances, which place the same mesh in a scene any number of times."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ..schema.checks import check_fields
 from ..schema.value_texts import one_line
 from .colors import Colors
 from .face_materials import FaceMaterials
-from .scene_mesh import Cutout, SceneMesh, Voxels, compacted
+from .scene_mesh import Cutout, SceneMesh, Voxels, drop_unused_vertices
 from .transform import Transform, affine
 
-# No point on Earth is farther from the origin of its map; see also `sections.Coordinate`.
+# No point on Earth is farther from the origin of its map. `sections.Coordinate` has the same limit.
 MAX_COORDINATE_M = 1e8
-_MAX_ITERATIONS = 64  # limit of Newton's method
-BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
+_MAX_ITERATIONS = 64  # of Newton's method
+BLOCK_POINTS = 1 << 15  # points that are transformed at a time, so that they fit in the CPU cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +117,7 @@ class SceneInstance:
 
 
 def check_coordinate(position: Floats) -> None:
-    """Check that a position (3,) is within `MAX_COORDINATE_M` of zero.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if a coordinate of a position exceeds `MAX_COORDINATE_M`."""
     if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise LidarError(
             f"The position of an instance must be in meters and within {MAX_COORDINATE_M:g} of "
@@ -129,25 +126,25 @@ def check_coordinate(position: Floats) -> None:
 
 
 class MeshPart(NamedTuple):
-    """Triangles that instances share: all opaque, or all with the same mask."""
+    """Triangles that instances share, which are either all opaque or have the same mask."""
 
     vertices: Floats  # (v, 3), in the frame of the mesh
     faces: Ints32  # (f, 3)
-    mask: Bools | None = None  # (h, w), of a `Cutout`
+    mask: Bools | None = None  # (h, w), as in `Cutout`
     uv: Floats32 | None = None  # (f, 3, 2)
     colors: Colors | None = None
     voxels: Voxels | None = None  # leaves within the surface
-    materials: FaceMaterials | None = None  # they include all names of the mesh
+    materials: FaceMaterials | None = None  # with the names of all materials in the mesh
 
 
-def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
-    """Yield the parts of a mesh, divided by its masks, with the triangles in order."""
+def split_by_masks(mesh: SceneMesh) -> Iterator[MeshPart]:
+    """Divide a mesh by its masks, and yield the parts in the order of the triangles."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
 
     def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:
         rows = slice(first, stop)
         return MeshPart(
-            *_compacted(mesh.vertices, mesh.faces[rows]),
+            *_drop_unused_vertices(mesh.vertices, mesh.faces[rows]),
             mask=None if cut is None else cut.mask,
             uv=None if cut is None else cut.uv,
             colors=mesh.colors and mesh.colors.take(rows),
@@ -162,33 +159,34 @@ def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
         start += len(cut.uv)
 
 
-def _compacted(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
-    """Return the vertices that faces use, and the renumbered faces as int32."""
-    points, corners = compacted(vertices, faces)
+def _drop_unused_vertices(vertices: Floats, faces: Ints) -> tuple[Floats, Ints32]:
+    """Remove unused vertices and return the renumbered faces as int32."""
+    points, corners = drop_unused_vertices(vertices, faces)
     return points, corners.astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Parts of meshes, and the instances that place the parts in a scene.
+    """Mesh parts and their instances in a scene.
 
     Attributes
     ----------
     mesh_parts
-        Parts, each once.
+        Mesh parts, each of which is stored once.
     part
-        intp (n,): index of each instance's part.
+        Index of the mesh part of each instance. Shape (n,), intp.
     transforms
-        float64 (n, 3, 4): from the frame of the part to the scene's local coordinates.
+        Transforms from the frame of the part to the local coordinates of the scene. Shape
+        (n, 3, 4), float64.
     owner
-        int32 (n,): index of each instance's object.
+        Index of the object to which each instance belongs. Shape (n,), int32.
     """
 
     mesh_parts: tuple[MeshPart, ...]
     part: Indices
     transforms: Floats
     owner: Ints32
-    # Bounds before some instances moved, (n, 2, 3), and whether each instance has moved since, (n,)
+    # Earlier bounds, (n, 2, 3), and whether each instance has moved since they were computed, (n,)
     _earlier_bounds: tuple[Floats, Bools] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
@@ -196,14 +194,19 @@ class Instances:
 
     @cached_property
     def _by_owner(self) -> tuple[Indices, Ints32]:
-        """Rows of the instances by their objects, (n,), and the objects in this order, (n,)."""
+        """Instance indices sorted by object, and the sorted object indices.
+
+        Both have shape (n,).
+        """
         order = np.argsort(self.owner, kind="stable")
         return order, self.owner[order]
 
     def rows_of(self, owners: Integers) -> tuple[Indices, Indices]:
-        """Return the rows (m,) of the instances of objects (k,), and the index in `owners` of each.
+        """Return the indices of all instances of the given objects.
 
-        Rows are in the order of `owners`, which has no duplicates.
+        `owners` contains unique object indices and has shape (k,). The instances are in the order
+        of `owners`. The second array contains the index into `owners` for each instance. Both
+        arrays have shape (m,).
         """
         order, sorted_owners = self._by_owner
         starts = np.searchsorted(sorted_owners, owners, "left")
@@ -214,21 +217,30 @@ class Instances:
 
     @cached_property
     def sizes(self) -> Ints:
-        """Number of triangles of each instance, (n,)."""
+        """Number of triangles of each instance.
+
+        The shape is (n,).
+        """
         return np.array([len(part.faces) for part in self.mesh_parts], np.int64)[self.part]
 
     @property
     def triangles(self) -> int:
-        """Number of triangles of all instances."""
+        """Total number of triangles of all instances."""
         return int(self.sizes.sum())
 
     def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
-        """Return the objects of the instances whose part fulfills a condition."""
+        """Return the object index of each instance whose part satisfies a condition.
+
+        Indices are repeated if several of these instances belong to the same object.
+        """
         fulfilled = np.array([condition(part) for part in self.mesh_parts], np.bool_)
         return self.owner[fulfilled[self.part]]
 
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
-        """Yield blocks of instances (k,) of the same part, and their vertices: (k, 3, v), local."""
+        """Yield blocks of instances of the same part, and their vertices in local coordinates.
+
+        Instance indices have shape (k,), and vertices have shape (k, 3, v).
+        """
         for number in np.unique(self.part):
             part = self.mesh_parts[number]
             rows = np.flatnonzero(self.part == number)
@@ -237,8 +249,8 @@ class Instances:
                 block = rows[start : start + step]
                 points = np.empty((len(block), 3, len(part.vertices)))
                 x, y, z = part.vertices.T
-                # Element by element, which has the same bits everywhere, unlike a product of
-                # matrices, and is faster.
+                # Unlike a matrix product, elementwise operations have the same result on all
+                # machines. They are also faster.
                 for row in range(3):
                     a, b, c, d = self.transforms[block, row].T[:, :, None]
                     points[:, row] = a * x + b * y + c * z + d
@@ -246,7 +258,10 @@ class Instances:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of each instance, local, meters: (n, 2, 3)."""
+        """Bounding box of each instance in local coordinates, in meters.
+
+        The shape is (n, 2, 3).
+        """
         if self._earlier_bounds is not None:
             earlier, changed = self._earlier_bounds
             corners = earlier.copy()
@@ -264,7 +279,10 @@ class Instances:
         return corners
 
     def reach(self, centers: Floats) -> Floats:
-        """Return the radius (n,), seen from above, of each instance around its center (n, 2)."""
+        """Return the horizontal radius of each instance around a given center.
+
+        `centers` has shape (n, 2), and the result has shape (n,).
+        """
         radii = np.empty(len(self))
         for rows, points in self.placed():
             x, y = np.moveaxis(points[:, :2] - centers[rows, :, None], 1, 0)
@@ -272,32 +290,48 @@ class Instances:
         return radii
 
     def relative_to(self, origin: Floats) -> Instances:
-        """Return the instances in coordinates relative to an origin (3,)."""
+        """Return the instances in coordinates relative to an origin."""
         bounds = self.bounds - origin
         shift = np.pad(origin[:, None], ((0, 0), (3, 0)))
         instances = replace(self, transforms=self.transforms - shift)
-        vars(instances)["bounds"] = bounds  # shifted, since computing bounds again takes time
+        vars(instances)["bounds"] = bounds  # faster than computing them from the vertices again
         return instances
 
     @cached_property
     def _scales(self) -> _Scales:
-        """Scales of instances that have moved, shared by all copies: moves keep the scales."""
+        """Cache of the scales of moved instances.
+
+        All copies of the instances share the cache, since moving an instance does not change its
+        scale.
+        """
         return _Scales(np.zeros((len(self), 3, 3)), np.zeros(len(self), np.bool_))
 
     def _scales_of(self, instance_indices: Indices) -> Floats:
-        """Return the scales (m, 3, 3) of instances, by their indices (m,)."""
         scales, is_known = self._scales
         unknown = instance_indices[~is_known[instance_indices]]
         if len(unknown):
-            scales[unknown] = scales_of(self.transforms[unknown, :, :3])
+            scales[unknown] = polar_scales(self.transforms[unknown, :, :3])
             is_known[unknown] = True
         return np.asarray(scales[instance_indices])
 
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Instances:
-        """Return the instances, with instances at other poses by their indices (m,).
+        """Return the instances with new poses for some of them.
 
-        Poses are positions (m, 3) and rotations (m, 3, 3). The moved instances keep their scales.
-        Rows have no duplicates. LidarError if a position is too far from zero.
+        Moved instances keep their scales.
+
+        Parameters
+        ----------
+        instance_indices
+            Unique indices of the instances to move. Shape (m,).
+        positions
+            New positions in local coordinates, in meters. Shape (m, 3).
+        rotations
+            New rotation matrices. Shape (m, 3, 3).
+
+        Raises
+        ------
+        LidarError
+            If a position is too far from zero.
         """
         if not (np.abs(positions) <= MAX_COORDINATE_M).all():
             for position in positions:
@@ -308,8 +342,8 @@ class Instances:
         instances = copy(self)
         object.__setattr__(instances, "transforms", transforms)
         earlier_bounds = self._earlier_bounds
-        # Computing bounds takes long: only the bounds of moved instances are computed again, on
-        # demand.
+        # Computing bounds is expensive, so only the bounds of moved instances are computed again,
+        # and only when they are needed.
         bounds = vars(instances).pop("bounds", None)
         if bounds is not None:
             earlier_bounds = bounds, np.zeros(len(self), np.bool_)
@@ -323,17 +357,18 @@ class Instances:
 
 
 class _Scales(NamedTuple):
-    """Scales of instances, as far as they are known."""
+    """A cache of instance scales, which are computed on demand."""
 
     scales: Floats  # (n, 3, 3)
     is_known: Bools  # (n,)
 
 
-def scales_of(matrices: Floats) -> Floats:
-    """Return the scalings and mirrorings (m, 3, 3) of matrices (m, 3, 3), by polar decomposition.
+def polar_scales(matrices: Floats) -> Floats:
+    """Return the scaling, including mirroring, of each matrix by polar decomposition.
 
-    The rotation is found by Newton's method (Higham 1986). The result is rounded to 12 digits, so
-    that a factor of 1.4 stays 1.4 however often an instance is moved.
+    Matrices and scales have shape (m, 3, 3). The rotation is computed by Newton's method (Higham
+    1986). The result is rounded to 12 digits, so that a scale factor of 1.4 remains 1.4 no matter
+    how often an instance is moved.
     """
     rotations = matrices
     for _ in range(_MAX_ITERATIONS):

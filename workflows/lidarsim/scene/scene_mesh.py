@@ -1,4 +1,4 @@
-"""One named triangle mesh, from a mesh file or a generated shape."""
+"""Triangle meshes with a name, which come from mesh files or are generated."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from .animation import Animation
 from .colors import Colors
 from .face_materials import FaceMaterials
 
-MAX_UV = 1 << 30  # texture coordinates beyond this have no digits left
-MAX_VOXELS = 10_000  # along each axis: light takes as many steps
+MAX_UV = 1 << 30  # larger texture coordinates have no fractional digits in single precision
+MAX_VOXELS = 10_000  # per axis, since a ray takes a step for each voxel
 MAX_LEAF_DENSITY = 1e4  # leaf area density, m²/m³
 
 
 @dataclass(frozen=True, eq=False)
 class Cutout:
-    """A mask of faces that stop light only in part: leaves on cards, a wire fence.
+    """An opacity mask for faces that block light only in part, such as leaves or a wire fence.
 
     Attributes
     ----------
     mask
-        bool (h, w): True where light is stopped.
+        True where light is blocked. Shape (h, w), bool.
     uv
-        float32 (k, 3, 2): texture coordinates of the corners of k faces. As in glTF, (0, 0) is the
-        outer corner of the mask's first element, u grows along its rows, v along its columns, and
-        the mask repeats beyond.
+        Texture coordinates of the corners of k faces. Shape (k, 3, 2), float32. As in glTF, (0, 0)
+        is the outer corner of the first mask element, u increases along the rows of the mask, v
+        increases along its columns, and the mask repeats beyond its edges.
     """
 
     mask: Bools
@@ -43,22 +43,28 @@ class Cutout:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Leaf densities in a grid within a closed surface, without leaves outside the surface.
+    """A grid of leaf densities inside a closed surface.
+
+    There are no leaves outside the surface.
 
     Attributes
     ----------
     density
-        float32 (nx, ny, nz): one-sided leaf area, m²/m³, finite and not negative.
+        One-sided leaf area per volume in m²/m³. Values are finite and nonnegative. Shape
+        (nx, ny, nz), float32.
     matrix
-        float64 (3, 4): from grid coordinates, where voxels have the edge 1 and the first voxel
-        starts at zero, to coordinates of the mesh.
+        Transform from grid coordinates to mesh coordinates. In grid coordinates, voxels are unit
+        cubes, and the first voxel starts at zero. Shape (3, 4), float64.
     """
 
     density: Floats32
     matrix: Floats
 
     def moved(self, linear: Floats, offset: Floats) -> Voxels:
-        """Return the voxels at p -> linear @ p + offset, with the same densities per m³."""
+        """Return the voxels transformed by p -> linear @ p + offset.
+
+        The leaf area per volume does not change.
+        """
         shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
         return Voxels(self.density, matmul(linear, self.matrix) + shift)
 
@@ -166,7 +172,7 @@ class SceneMesh:
         if determinant(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
-            colors = colors and colors.mirrored()
+            colors = colors and colors.reverse_corners()
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
         vertices = rotate(self.vertices, linear) + offset
@@ -183,10 +189,6 @@ class SceneMesh:
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:
-    """Check shapes, types and values of the voxels of a mesh.
-
-    Raises LidarError if they are wrong.
-    """
     density = voxels.density
     matrix = voxels.matrix
     valid = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
@@ -202,10 +204,6 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
 
 
 def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
-    """Check shapes, types and values of the cutouts of a mesh.
-
-    Raises LidarError if they are wrong.
-    """
     for cut in cutouts:
         valid = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
         valid = valid and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
@@ -219,8 +217,11 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         raise LidarError(f"{name!r} has {faces} faces, but its cutouts have {cutout_faces}.")
 
 
-def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
-    """Concatenate pairs of vertices (v, 3) and faces (f, 3), with faces renumbered."""
+def stack_meshes(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+    """Concatenate pairs of vertices and faces, and renumber the faces accordingly.
+
+    Vertices have shape (v, 3), and faces have shape (f, 3).
+    """
     vertices = []
     faces = []
     offset = 0
@@ -231,8 +232,11 @@ def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyA
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
-    """Return the vertices that faces use, in order, and the faces with the new numbers."""
+def drop_unused_vertices(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
+    """Remove unused vertices and renumber the faces accordingly.
+
+    The order of the remaining vertices does not change.
+    """
     if faces.size < len(vertices):
         used, corners = np.unique(faces, return_inverse=True)
         return vertices[used], corners.reshape(-1, 3)
@@ -244,12 +248,14 @@ def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
 
 
 def points_array(name: str, points: ArrayLike) -> Floats:
-    """Return `points` as a contiguous float64 (n, 3) array of finite numbers.
+    """Return points as a contiguous float64 array of finite numbers.
+
+    The shape is (n, 3). The object `name` appears in error messages.
 
     Raises
     ------
     LidarError
-        If the shape is wrong, or a number is NaN or infinite; the message names the object `name`.
+        If the shape is wrong, or if a number is NaN or infinite.
     """
     array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
     if array.ndim != 2 or array.shape[1] != 3:
@@ -266,7 +272,10 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 
 
 def triangle_areas(corners: AnyFloats) -> Floats:
-    """Return the areas (n,) of triangles from their corners (n, 3, 3)."""
+    """Return the areas of triangles.
+
+    `corners` has shape (n, 3, 3), and the result has shape (n,).
+    """
     sides = corners[:, 1:] - corners[:, :1]
     doubled = norm(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(doubled / 2, np.float64)

@@ -1,4 +1,4 @@
-"""Generated objects: surfaces of revolution, and the six objects of the demo."""
+"""Generated meshes, which are surfaces of revolution and the six objects of the demo scene."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SEED_POSITIONS = (
     (5.0, 5.0),
 )
 
-# Control polygons from the lower pole to the upper one: (radius, height) in meters. The first
-# and the last leg are level, so that the surface is smooth at the axis; a doubled
-# point makes a tighter bend. The widest radius is stretched to SEED_RADIUS_M afterwards.
+# Control polygons from the lower pole to the upper pole, as (radius, height) in meters. The first
+# and the last segment are horizontal, so that the surface is smooth at the axis. A repeated point
+# makes a tighter bend. Radii are scaled afterward so that the largest is SEED_RADIUS_M.
 SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
     "Vase": (
         (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.2, 0.3), (2.4, 1.4), (2.0, 2.9), (0.7, 3.4),
@@ -43,7 +43,7 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
         (0.0, 0.0), (0.25, 0.0), (0.5, 0.6), (2.2, 1.7), (2.2, 2.1), (0.9, 2.6), (0.4, 3.6),
         (0.6, 3.9), (0.3, 4.3), (0.0, 4.3),
     ),
-    # Low, because the pawn is behind it as seen from the default poses.
+    # The bowl is low because it would hide the pawn from the default poses otherwise.
     "Bowl": (
         (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.0, 0.25), (0.5, 0.4), (0.5, 0.55), (1.9, 0.7),
         (2.2, 1.6), (2.0, 2.2), (1.85, 2.2), (2.0, 1.6), (1.7, 0.95), (0.0, 0.8),
@@ -52,10 +52,11 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[SceneMesh, ...]:
-    """Make the six objects of the demo: sphere, vase, bell, pawn, spindle, bowl.
+    """Create the six objects of the demo scene.
 
-    Each stands on z = 0 at its position in `SEED_POSITIONS`, has a radius of `SEED_RADIUS_M` and
-    `2 * rings * segments` triangles: by default 76,800 in all.
+    These are a sphere, a vase, a bell, a pawn, a spindle and a bowl. Each object is placed on the
+    plane z = 0 at its position in `SEED_POSITIONS` and has a radius of `SEED_RADIUS_M`. Each has
+    `2 * rings * segments` triangles, which is a total of 76,800 by default.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)
     sphere = SEED_RADIUS_M * np.stack([cos(angles), 1 + sin(angles)], axis=1)
@@ -71,14 +72,21 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
 
 
 def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneMesh:
-    """Rotate a profile about the z axis to a closed surface.
+    """Create a closed surface of revolution about the z axis.
 
-    `profile` (n, 2), n >= 3, has radius and height in meters, from the lower pole on the axis round
-    the outside to the upper pole. The radii of the first and last point are taken as zero, all
-    other radii must be positive. There are at least 3 `segments` around the axis.
+    The mesh has `2 * (n - 2) * segments` triangles with outward normals, a single vertex at each
+    pole, and no duplicate vertices at the seam. It is watertight if the profile does not intersect
+    itself.
 
-    The mesh has `2 * (n - 2) * segments` triangles, outward normals, a single vertex at each pole
-    and no duplicates at the seam: it is watertight if the profile does not cross itself.
+    Parameters
+    ----------
+    profile
+        Radii and heights in meters, from the lower pole to the upper pole. The first and last
+        radius are replaced by zero, and all other radii must be positive. Shape (n, 2) with n >= 3.
+    segments
+        Number of segments around the axis, at least 3.
+    name
+        Name of the mesh.
     """
     line = np.asarray(profile, dtype=np.float64)
     rings = len(line) - 2
@@ -94,7 +102,10 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 
 
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Make a ball around zero, stretched at its equator by a height, which may be zero, meters."""
+    """Create an upright capsule around zero.
+
+    The height in meters is the length of the cylindrical part. A height of zero creates a sphere.
+    """
     angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     ball = radius * np.stack(sin_cos(angles)[::-1], axis=1)
     up = [0, height / 2]
@@ -104,13 +115,16 @@ def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh
 
 
 def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Make an upright cylinder around zero."""
+    """Create an upright cylinder centered at zero."""
     half = height / 2
     return revolve([(0, -half), (radius, -half), (radius, half), (0, half)], segments, name)
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Return faces over `rings` circles of `segments` vertices, with two poles as last vertices."""
+    """Return the faces of a surface of `rings` circles with `segments` vertices each.
+
+    The last two vertices are the lower pole and the upper pole.
+    """
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
     lower = grid[:-1]
@@ -129,10 +143,10 @@ def _revolved_faces(rings: int, segments: int) -> Ints:
 
 
 def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
-    """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974), but keep both ends.
+    """Smooth a polyline by cutting its corners (Chaikin 1974), without moving its ends.
 
-    The limit is a quadratic B-spline, which never leaves the convex hull of three neighboring
-    control points, so radii stay positive.
+    The limit is a quadratic B-spline, which never leaves the convex hull of three adjacent control
+    points. Radii therefore remain positive. The polyline has shape (n, d).
     """
     line = np.asarray(outline, dtype=np.float64)
     for _ in range(rounds):
@@ -144,7 +158,10 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
 
 
 def resample(line: ArrayLike, count: int) -> Floats:
-    """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
+    """Place equidistant points along a polyline, including both ends.
+
+    The polyline has shape (n, d), and the points have shape (count, d).
+    """
     points = np.asarray(line, dtype=np.float64)
     distances = np.concatenate([[0.0], np.cumsum(norm(np.diff(points, axis=0)))])
     even_distances = np.linspace(0.0, distances[-1], count)

@@ -1,4 +1,7 @@
-"""Scenes for pictures and plans: all triangles, with instances simplified if they are many."""
+"""Simplified scenes for pictures and plans, in which instances are replaced by triangles.
+
+If a scene has many instances, they are drawn with fewer triangles.
+"""
 
 from __future__ import annotations
 
@@ -13,25 +16,25 @@ from .colors import Colors, join_colors
 from .face_materials import ObjectMaterials
 from .scene import Scene
 from .scene_instances import Instances, MeshPart
-from .scene_mesh import stacked, triangle_areas
+from .scene_mesh import stack_meshes, triangle_areas
 
-DRAWN_TRIANGLES = 2_000_000  # limit for all instances; parts of more triangles are simplified
-MIN_PART_TRIANGLES = 32  # least number for a simplified part
-CUT_TRIANGLES = 50_000  # pieces of a part with a mask
-CUT_STEPS = 128  # pieces along the edge of a triangle
-_MAX_POSITIONS = 200  # distances are measured to so many positions
+DRAWN_TRIANGLES = 2_000_000  # total limit for instances, which are simplified if they exceed it
+MIN_PART_TRIANGLES = 32  # minimum for a simplified part
+CUT_TRIANGLES = 50_000  # maximum number of pieces into which a masked part is divided
+CUT_STEPS = 128  # maximum number of pieces along the edge of a triangle
+_MAX_POSITIONS = 200  # maximum number of positions to which distances are measured
 
 
 @dataclass(frozen=True, eq=False)
 class SimplifiedScene:
-    """A scene without instances, whose triangles know their hit counters.
+    """A scene without instances, and the hit counter of each of its triangles.
 
     Attributes
     ----------
     scene
-        The scene; the original scene if that has no instances.
+        The scene without instances. It is the original scene if that scene has no instances.
     counter
-        intp (f,): hit counter of each triangle (`Scene.counters`).
+        Index of the hit counter of each triangle (`Scene.counters`). Shape (f,), intp.
     is_original
         Whether `scene` is the original scene.
     """
@@ -47,22 +50,28 @@ class SimplifiedScene:
         max_triangles: int = DRAWN_TRIANGLES,
         near_positions: Sequence[Floats] = (),
     ) -> SimplifiedScene:
-        """Copy all instances to their positions, with at most about `max_triangles` in total.
+        """Replace the instances of a scene by copies of their triangles.
 
-        Instances close to `near_positions`, (k, 3) each, local, keep more triangles.
+        The copies have about `max_triangles` triangles or fewer in total. Instances close to
+        `near_positions` keep more of their triangles. Each array in `near_positions` contains local
+        coordinates and has shape (k, 3).
         """
         if (shared := scene.instances) is None:
             return cls(scene, np.arange(len(scene.faces)), is_original=True)
         shares = _triangle_shares(shared, max_triangles, near_positions)
         copies = _CopiedInstances(scene)
         for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = _drawn_part(shared.mesh_parts[index], share)
+            part = _simplify_for_drawing(shared.mesh_parts[index], share)
             for row in np.flatnonzero((shared.part == index) & (shares == share)):
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
 
     def triangle_hit_counts(self, counts: AnyArray) -> AnyArray:
-        """Return the hits of each triangle, and of the actors' triangles, from hit counters."""
+        """Distribute hit counts over triangles in proportion to their area.
+
+        `counts` contains one value per hit counter. The result contains one value per triangle of
+        `scene`, followed by the triangles of the actors.
+        """
         if self.is_original:
             return counts
         area = triangle_areas(self.scene.vertices[self.scene.faces]) + np.finfo(np.float64).tiny
@@ -72,16 +81,16 @@ class SimplifiedScene:
 
 
 class _DrawnPart(NamedTuple):
-    """A part of instances, perhaps simplified, for drawings."""
+    """A mesh part as it is drawn, with fewer triangles if necessary."""
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3)
     colors: Colors | None  # a plain color for each face
-    materials: Ints32 | None  # (f,): row of the names of the object's materials; None for the first
+    materials: Ints32 | None  # (f,), index into the material names of the object; None for zeros
 
 
 class _CopiedInstances:
-    """Triangles of a scene, and copies of its instances' triangles."""
+    """A collection of the triangles of a scene and of copies of its instances."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -94,7 +103,7 @@ class _CopiedInstances:
         self._mirrored = np.linalg.det(scene.instances.transforms[:, :, :3]) < 0
 
     def add(self, part: _DrawnPart, shared: Instances, row: int) -> None:
-        """Copy a part to the instance `row`."""
+        """Add a copy of a part, transformed to the instance with index `row`."""
         matrix = shared.transforms[row]
         count = len(part.faces)
         corners = part.faces[:, ::-1] if self._mirrored[row] else part.faces
@@ -105,8 +114,8 @@ class _CopiedInstances:
         self.counters.append(np.full(count, len(self._scene.faces) + row))
 
     def scene(self) -> Scene:
-        """Return the scene of all triangles, with the actors, without instances."""
-        vertices, faces = stacked(self._meshes)
+        """Return a scene with all triangles and actors, but without instances."""
+        vertices, faces = stack_meshes(self._meshes)
         return Scene(
             vertices,
             faces,
@@ -119,7 +128,6 @@ class _CopiedInstances:
         )
 
     def _object_materials(self) -> ObjectMaterials | None:
-        """Return the materials of all triangles."""
         if self._scene.materials is None:
             return None
         rows = [
@@ -129,23 +137,23 @@ class _CopiedInstances:
         return ObjectMaterials(self._scene.materials.names, np.concatenate(rows))
 
 
-def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
-    """Return a part with a share of its triangles, and the mean color of each triangle."""
+def _simplify_for_drawing(part: MeshPart, share: float) -> _DrawnPart:
+    """Return a part with the given share of its triangles, each of which has its mean color."""
     vertices = part.vertices
     faces = part.faces
     rows = np.arange(len(part.faces))
     count = max(MIN_PART_TRIANGLES, int(len(faces) * share))
     if count < len(faces):
-        vertices, faces, rows = _simplified_part(part, count)
-    colors = part.colors and Colors.of_faces(part.colors.take(rows).means())
+        vertices, faces, rows = _simplify_part(part, count)
+    colors = part.colors and Colors.from_face_colors(part.colors.take(rows).mean_colors())
     materials = part.materials and part.materials.take(rows)
     return _DrawnPart(vertices, faces, colors, None if materials is None else materials.index)
 
 
 def cut_masks(scene: Scene) -> Scene:
-    """Return a scene for pictures, with small opaque triangles in place of masked triangles.
+    """Replace masked triangles by small opaque triangles, for pictures.
 
-    The hit counters stay the same.
+    The hit counters of the scene do not change.
     """
     shared = scene.instances
     masked = sum(part.mask is not None for part in shared.mesh_parts) if shared else 0
@@ -160,10 +168,10 @@ def cut_masks(scene: Scene) -> Scene:
 
 
 def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
-    """Divide a part with a mask into about `max_pieces`, and return the opaque pieces.
+    """Divide the triangles of a masked part into pieces, and return the opaque pieces.
 
-    The mask is sampled at a random point of each piece: the share of opaque pieces is right,
-    however fine the mask.
+    There are about `max_pieces` pieces in total. The mask is sampled at one random point in each
+    piece, so that the proportion of opaque pieces is correct for arbitrarily fine masks.
     """
     if part.mask is None or part.uv is None:
         return part
@@ -176,10 +184,10 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
     row = (v % 1 * height).astype(int)
     column = (u % 1 * width).astype(int)
     opaque = part.mask[np.minimum(row, height - 1), np.minimum(column, width - 1)]
-    opaque[0, 0] |= not opaque.any()  # no part is empty
+    opaque[0, 0] |= not opaque.any()  # a part must not be empty
     face, piece = np.nonzero(opaque)
     vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
-    colors = part.colors and part.colors.divided(face, corners[piece])
+    colors = part.colors and part.colors.subdivide(face, corners[piece])
     return MeshPart(
         vertices,
         np.arange(len(vertices), dtype=np.int32).reshape(-1, 3),
@@ -189,9 +197,12 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
 
 
 def _piece_corners(steps: int) -> Floats:
-    """Return barycentric corners (steps², 3, 3) of the pieces of a triangle, `steps` an edge."""
+    """Return the barycentric coordinates of the corners of the pieces of a triangle.
+
+    Each edge of the triangle is divided into `steps` segments. The shape is (steps², 3, 3).
+    """
     i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
-    # Pieces beyond the diagonal are rotated by 180 degrees, into the gaps between the others.
+    # Pieces beyond the diagonal are rotated by 180 degrees to fill the gaps between the others.
     first = np.stack([[i, j], [i + 1, j], [i, j + 1]], axis=-1).transpose(1, 2, 0)
     pieces = np.where((i + j < steps)[:, None, None], first, steps - first)
     return np.asarray(
@@ -202,10 +213,11 @@ def _piece_corners(steps: int) -> Floats:
 def _triangle_shares(
     shared: Instances, max_triangles: int, near_positions: Sequence[Floats]
 ) -> Floats:
-    """Return the share of its triangles that each instance keeps in a drawing, (n,).
+    """Return the share of its triangles that each instance keeps when it is drawn.
 
-    Half of the triangles are shared evenly, the other half by the square of the distance to the
-    nearest position: then all triangles have about the same size in a picture from there.
+    Half of the triangles are distributed evenly. The other half is distributed by the squared
+    distance to the nearest position, so that all triangles appear about equally large from there.
+    The shape is (n,).
     """
     even_share = min(1.0, max_triangles / shared.triangles)
     positions = np.concatenate([np.empty((0, 3)), *near_positions])
@@ -216,9 +228,9 @@ def _triangle_shares(
     for position in positions[:: len(positions) // _MAX_POSITIONS + 1]:
         np.minimum(distance, np.linalg.norm(middles - position, axis=1), out=distance)
     distance += 1e-3
-    full_distance = distance.max()  # up to this distance instances keep all triangles
+    full_distance = distance.max()  # up to this distance, instances keep all triangles
     while True:
-        # In steps of four, since each step makes another mesh.
+        # Shares are powers of four, since each distinct share requires a separate mesh.
         near_share = 4.0 ** np.floor(np.log2(np.minimum(full_distance / distance, 1)))
         shares = np.maximum(near_share, even_share / 2)
         if shares @ shared.sizes <= max_triangles:
@@ -227,22 +239,22 @@ def _triangle_shares(
 
 
 class _SimplifiedPart(NamedTuple):
-    """A part of fewer triangles."""
+    """A mesh part with fewer triangles."""
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (k, 3)
-    face_indices: Indices  # (k,), the original face of each face
+    face_indices: Indices  # (k,), index of the original face
 
 
-def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
-    """Return a part with at most `max_triangles`, which looks like the original.
+def _simplify_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
+    """Reduce a part to at most `max_triangles` while preserving its appearance.
 
-    If a part has many small pieces, such as the leaves of a tree, merging vertices would leave
-    little. There the largest triangles stay, as of trunk and boughs, and a random choice of the
-    others, enlarged to stand for all small triangles (Cook et al., 2007); long triangles are
-    enlarged less, since they would stick out.
+    Merging vertices would remove most of a part that consists of many small pieces, such as the
+    leaves of a tree. In this case, the largest triangles (trunk and branches) are kept, and the
+    other triangles are sampled at random and enlarged to preserve the total area (Cook et al.,
+    2007). Long triangles are enlarged less because they would stick out.
     """
-    # A single surface has half as many vertices as faces.
+    # A connected surface has about half as many vertices as faces.
     has_pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)
     merged = _merge_vertices(part.vertices, part.faces, max_triangles)
     if not has_pieces and len(merged.face_indices) >= max_triangles // 4:
@@ -266,11 +278,14 @@ def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
     return _SimplifiedPart(enlarged.reshape(-1, 3), faces, rows)
 
 
-def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
-    """Return a scene of at most `max_triangles`, and the substitute (f,) of each original triangle.
+def simplify_scene(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
+    """Reduce a scene to at most `max_triangles`, and map the original triangles to the new ones.
 
-    The substitute is the triangle of the new scene that stands for the original triangle, or -1
-    for small objects that vanish.
+    Returns
+    -------
+    tuple[Scene, Ints]
+        The reduced scene, and the index of the triangle that replaces each original triangle. The
+        index is -1 for triangles of small objects that disappear. Shape (f,).
     """
     merged = _merge_vertices(scene.vertices, scene.faces, max_triangles)
     owners = scene.face_object[merged.face_indices]
@@ -281,29 +296,27 @@ def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
 
 
 class _MergedMesh(NamedTuple):
-    """A mesh whose vertices in the same cell of a grid are merged."""
+    """A mesh in which all vertices in the same grid cell are merged."""
 
     vertices: Floats  # (v, 3)
-    faces: Ints32  # (f, 3), all faces, with the new vertices
-    face_indices: Indices  # (k,), faces to keep: with an area, and each only once
-    substitutes: (
-        Ints  # (f,), index into `face_indices` of the face that stands for each face; -1 for none
-    )
+    faces: Ints32  # (f, 3), indices of the merged vertices for all original faces
+    face_indices: Indices  # (k,), distinct faces that are not collapsed
+    substitutes: Ints  # (f,), index into `face_indices` of the replacement of each face, or -1
 
 
 def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _MergedMesh:
-    """Merge vertices in the same cell of a grid (Rossignac and Borrel, 1993).
+    """Merge all vertices in the same grid cell (Rossignac and Borrel, 1993).
 
-    Cells are as small as `max_triangles`, the number of faces to keep, allows.
+    The cell size is about the smallest one that leaves at most `max_triangles` faces.
     """
     area = float(triangle_areas(points[corners]).sum())
     cell = (2 * area / max_triangles) ** 0.5
     while True:
-        merged, counts = _cells(points, cell)
+        merged, counts = _grid_cells(points, cell)
         faces = merged[corners].astype(np.int32)
         collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
         full = np.flatnonzero(~collapsed)
-        keys = _row_numbers(np.sort(faces[full], axis=1))
+        keys = _sort_keys(np.sort(faces[full], axis=1))
         _, distinct, group = np.unique(keys, return_index=True, return_inverse=True)
         if len(distinct) <= max_triangles:
             break
@@ -318,21 +331,28 @@ def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _Mer
 
 
 def _face_at_vertex(faces: Ints32, vertex_count: int) -> Ints:
-    """Return a face at each vertex (v,), -1 at vertices without faces."""
+    """Return the index of an adjacent face for each vertex, or -1 for isolated vertices."""
     face_at_vertex = np.full(vertex_count, -1, np.int64)
     face_at_vertex[faces.ravel()] = np.repeat(np.arange(len(faces)), 3)
     return face_at_vertex
 
 
-def _cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
-    """Return the number (n,) of each point's cell in a grid, and the points of each cell (c,)."""
+def _grid_cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
+    """Return the grid cell of each point, and the number of points in each cell.
+
+    Only cells that contain points are numbered.
+    """
     columns = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    _, merged, counts = np.unique(_row_numbers(columns), return_inverse=True, return_counts=True)
+    _, merged, counts = np.unique(_sort_keys(columns), return_inverse=True, return_counts=True)
     return merged, counts
 
 
-def _row_numbers(rows: AnyArray) -> Ints:
-    """Return numbers (n,) in the order of rows (n, 3) of natural numbers, as faster sort keys."""
+def _sort_keys(rows: AnyArray) -> Ints:
+    """Return numbers that sort in the same order as rows of nonnegative integers.
+
+    Sorting the numbers is faster than sorting the rows. Rows have shape (n, 3), and the result has
+    shape (n,).
+    """
     row_numbers = np.zeros(len(rows), np.int64)
     for column in rows.T.astype(np.int64):
         leading = _compact(row_numbers)
@@ -342,7 +362,7 @@ def _row_numbers(rows: AnyArray) -> Ints:
 
 
 def _compact(numbers: Ints) -> Ints:
-    """Return numbers in the same order below 2³¹, so that a product of two fits 64 bits."""
+    """Map numbers to values below 2³¹ in the same order, so that a product of two fits 64 bits."""
     if numbers.max(initial=0) >= 1 << 31:
         return np.unique(numbers, return_inverse=True)[1]
     return numbers

@@ -1,4 +1,4 @@
-"""Units, up axes and placements: from mesh file coordinates to world coordinates."""
+"""Transforms from mesh file coordinates to world coordinates."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..numerics.elementary_scalars import sin_cos_of
 from ..numerics.vectors import matmul, matvec, norm, rank
 from ..schema.checks import as_array
 
-# Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
-# rotating large coordinates loses no digit.
+# Proper rotations that map the named axis to +z. They contain only 0 and ±1, so that rotating large
+# coordinates does not lose precision.
 UP_AXES = {
     "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -25,7 +25,11 @@ UP_AXES = {
 
 
 def affine(linear: Floats, offset: Floats) -> Floats:
-    """Return matrices (..., 4, 4) of p -> linear @ p + offset, from (..., 3, 3) and (..., 3)."""
+    """Return the homogeneous matrices of p -> linear @ p + offset.
+
+    `linear` has shape (..., 3, 3), `offset` has shape (..., 3), and the result has shape
+    (..., 4, 4).
+    """
     matrices = np.zeros((*np.shape(offset)[:-1], 4, 4))
     matrices[..., :3, :3] = linear
     matrices[..., :3, 3] = offset
@@ -33,14 +37,20 @@ def affine(linear: Floats, offset: Floats) -> Floats:
     return matrices
 
 
-def inverted(matrix: Floats) -> Floats:
-    """Return the inverse (4, 4) of the matrix (4, 4) of a pose."""
+def inverse_pose(matrix: Floats) -> Floats:
+    """Return the inverse of a pose matrix.
+
+    Both matrices have shape (4, 4). The upper left block must be a rotation.
+    """
     back = matrix[:3, :3].T
     return affine(back, -matvec(back, matrix[:3, 3]))
 
 
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
-    """Return the rotation (3, 3) about an axis that is not zero (Rodrigues 1840)."""
+    """Return the rotation matrix for an angle about a nonzero axis (Rodrigues 1840).
+
+    The shape is (3, 3).
+    """
     cross = np.cross(np.eye(3), np.array(axis) / norm(np.array(axis, np.float64)))
     sine, cosine = sin_cos_of(math.radians(degrees))
     rotation: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
@@ -49,19 +59,19 @@ def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """An affine placement in the world: p -> linear @ p + offset.
+    """An affine transform to world coordinates, p -> linear @ p + offset.
 
     Parameters
     ----------
     linear
-        float64 (3, 3), invertible.
+        Invertible matrix. Shape (3, 3), float64.
     offset
-        float64 (3,), meters.
+        Translation in meters. Shape (3,), float64.
 
     Raises
     ------
     LidarError
-        If the numbers are not finite or `linear` flattens the mesh.
+        If a shape is wrong, a number is not finite, or `linear` is singular.
     """
 
     linear: Floats
@@ -84,7 +94,7 @@ class Transform:
 
     @property
     def keeps_xy(self) -> bool:
-        """True if x and y stay as they are."""
+        """Whether the transform leaves x and y unchanged."""
         return not self.offset[:2].any() and bool((self.linear[:2] == np.eye(3)[:2]).all())
 
     @classmethod
@@ -94,16 +104,16 @@ class Transform:
         rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         scale: float | tuple[float, float, float] = 1.0,
     ) -> Transform:
-        """Make a transform that scales, then rotates about the world's x, y and z axes, then moves.
+        """Create a transform that scales, then rotates, then translates.
 
         Parameters
         ----------
         translation
-            Translation, meters.
+            Translation in meters.
         rotation_deg
-            Rotations about x, y and z in this order, degrees.
+            Rotations about the x, y and z axes of the world in degrees, applied in this order.
         scale
-            A factor for all axes, or three factors; not zero.
+            Nonzero scale factor for all axes, or one factor for each axis.
         """
         roll, pitch, yaw = rotation_deg
         rotation = Pose(
@@ -113,7 +123,10 @@ class Transform:
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
-        """Make a transform of a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
+        """Create a transform from a homogeneous matrix.
+
+        The shape is (4, 4), and the last row must be 0 0 0 1.
+        """
         array = as_array("transform", matrix)
         if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
             raise LidarError(

@@ -1,4 +1,4 @@
-"""Wheels that turn as a car drives."""
+"""Wheels that rotate while a vehicle moves."""
 
 from __future__ import annotations
 
@@ -16,37 +16,40 @@ from .animation import Animation
 from .scene_instances import SceneInstance
 from .scene_mesh import SceneMesh
 
-_POSES_PER_REVOLUTION = 64  # between two poses, a wheel is 0.12 % smaller
-# Revolutions of the smallest wheel in a revolution of the largest: all wheels have as many poses.
+_POSES_PER_REVOLUTION = 64  # linear interpolation between poses shrinks a wheel by up to 0.12 %
+# Maximum revolutions of a wheel per revolution of the largest wheel. All wheels have the same
+# number of poses, so fast wheels increase the number of poses of the other wheels.
 _MAX_REVOLUTIONS = 10
-_ROUNDNESS = 0.05  # difference between length and height of a wheel, relative to the height
+_ROUNDNESS = 0.05  # maximum difference between length and height, relative to the height
 
 
-def rolling(
+def animate_wheels(
     objects: Sequence[SceneMesh | SceneInstance], wheels: Sequence[str], tell: Callable[[str], None]
 ) -> list[SceneMesh]:
-    """Animate wheels, which roll along x and rotate about y around their middles.
+    """Animate wheels that roll along x and rotate about y around their centers.
 
-    The largest wheels make a revolution while an actor drives their circumference; smaller wheels
-    make a whole number of revolutions meanwhile.
+    The largest wheels make one revolution while the actor travels the length of their
+    circumference. In the same time, smaller wheels make a whole number of revolutions.
 
     Parameters
     ----------
     objects
-        Objects of a file; all but the wheels stay as they are.
+        Objects of a scene file. Objects that are not wheels do not change.
     wheels
-        Names of the objects that are wheels, with * and ?.
+        Names of the wheels, which can contain the wildcards * and ?.
     tell
-        Called with a line on wheels that are not round, or are small beside other wheels.
+        Called with a message for each wheel that is not round or is too small compared to other
+        wheels.
 
     Returns
     -------
-    The objects, wheels with an animation for 1 m/s.
+    list[SceneMesh]
+        All objects. Wheels have an animation for a speed of 1 m/s.
 
     Raises
     ------
     LidarError
-        If no object has one of the names, or no object with such a name is round.
+        If no object matches one of the names, or if none of the matching objects is round.
     """
     meshes = [item.flat() if isinstance(item, SceneInstance) else item for item in objects]
     _check_names(wheels, [mesh.name for mesh in meshes])
@@ -70,10 +73,7 @@ def rolling(
 
 
 def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
-    """Check that each pattern of `wheels` matches a name of an object.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError if a pattern in `wheels` does not match the name of any object."""
     for wheel in wheels:
         if not any(name == wheel or fnmatchcase(name, wheel) for name in names):
             raise LidarError(
@@ -84,7 +84,7 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
 def _radii(
     meshes: Sequence[SceneMesh], wheels: Sequence[str]
 ) -> tuple[dict[int, float], list[str]]:
-    """Return the radii of round wheels, {index of the mesh: meters}, and notes on oval wheels."""
+    """Return the radii of round wheels in meters by mesh index, and messages about other wheels."""
     radii: dict[int, float] = {}
     notes: list[str] = []
     for index, mesh in enumerate(meshes):
@@ -101,7 +101,10 @@ def _radii(
 
 
 def _rotated_vertices(mesh: SceneMesh, revolutions: int, steps: int) -> Floats:
-    """Return the vertices (steps + 1, v, 3) of a mesh that rotates about its middle, about y."""
+    """Return the vertices of a mesh in all steps of a rotation about its center.
+
+    The axis is parallel to y. The shape is (steps + 1, v, 3).
+    """
     middle = mesh.bounds.mean(axis=0)
     angles = 2 * np.pi * revolutions * np.linspace(0, 1, steps + 1)
     sine, cosine = np.array(sin_cos(angles))[..., None]

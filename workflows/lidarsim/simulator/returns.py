@@ -21,7 +21,7 @@ from ..numerics.arrays import (
     Records,
     UInts32,
 )
-from ..scene.colors import GRAY, packed
+from ..scene.colors import GRAY, pack_colors
 
 T = TypeVar("T")
 
@@ -144,7 +144,7 @@ def returns_without_surface(
         distance,
         np.full(count, NO_SURFACE, np.int32),
         energy,
-        None if template.color is None else np.full(count, packed(GRAY[0])[0]),
+        None if template.color is None else np.full(count, pack_colors(GRAY[0])[0]),
         np.full(count, cause, np.uint8),
         amplitude=None if template.amplitude is None else energy,
     )

@@ -448,7 +448,7 @@ class Scanner:
         """
         actors = self._actors.copy()
         for index, trajectory in moves:
-            actors[index] = actors[index].following(trajectory)
+            actors[index] = actors[index].with_trajectory(trajectory)
         return actors
 
     def _follow(self, actors: list[Actor]) -> None:

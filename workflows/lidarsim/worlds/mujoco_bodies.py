@@ -14,7 +14,7 @@ from ..numerics.arrays import Bytes, Floats
 from ..numerics.vectors import matmul, matvec, norm, rotate
 from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
-from ..scene.scene_mesh import SceneMesh, stacked
+from ..scene.scene_mesh import SceneMesh, stack_meshes
 from ..words import name_hint, plural
 from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
 
@@ -186,13 +186,13 @@ def _mesh_of_geoms(
     """
     shapes = [_placed_geom(model, geom, choice) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
-    vertices, faces = stacked((shape.vertices, shape.faces) for shape in shapes)
+    vertices, faces = stack_meshes((shape.vertices, shape.faces) for shape in shapes)
     face_colors = [_srgb_of(model, geom, colors[geom]) for geom in geoms]
     return SceneMesh(
         "",
         vertices,
         faces,
-        colors=Colors.of_faces(np.repeat(face_colors, counts, axis=0)),
+        colors=Colors.from_face_colors(np.repeat(face_colors, counts, axis=0)),
         materials=_materials_of(model, geoms, counts),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
-from lidarsim.scene.colors import packed, unpacked
+from lidarsim.scene.colors import pack_colors, unpack_colors
 
 from .theme import apply_colormap, object_colors
 
@@ -78,9 +78,9 @@ def column_values(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
     `read` returns the values of a column by its name.
     """
     if column is RGB:
-        return packed(np.stack([read(name) for name in COLORS], axis=1))
+        return pack_colors(np.stack([read(name) for name in COLORS], axis=1))
     if column is NORMALS:
-        return packed(normal_colors(np.stack([read(name) for name in NORMAL], axis=1)))
+        return pack_colors(normal_colors(np.stack([read(name) for name in NORMAL], axis=1)))
     return read(column.name)
 
 
@@ -130,7 +130,7 @@ def make_coloring(
         Ends of a scale, in its unit. By default, they are percentiles of the values.
     """
     if column in (RGB, NORMALS):
-        return Coloring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
+        return Coloring(lambda packs: unpack_colors(packs) / 255, column.name, "", column.meaning)
     spread: tuple[float, float] = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
         values = values.astype(np.int64)

@@ -42,7 +42,7 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
     if scene.colors is not None:
         page = Page(shot.camera.size)
-        page.show(shot, shot.paint(scene.colors.means() / 255))
+        page.show(shot, shot.paint(scene.colors.mean_colors() / 255))
         page.title("Scene", f"{words} · {shot.caption}", shot.models)
         return page
     kinds, names = _group_objects(scene.names, shot.actors)

@@ -10,7 +10,7 @@ from lidarsim.columns.table import OBJECT, TABLE
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from lidarsim.scene.colors import as_bytes
 from lidarsim.scene.scene import Scene
-from lidarsim.scene.simplified import simplified
+from lidarsim.scene.simplified import simplify_scene
 
 from ..render.coloring import NORMALS, make_coloring, normal_colors
 from ..render.hit_density import density_label, hit_colors, hits_title
@@ -63,7 +63,7 @@ class DisplayMesh:
         # (f,) displayed triangle that replaces each triangle of the scene, -1 if there is none
         self._replacements = np.arange(len(scene.faces))
         if len(scene.faces) > max_triangles:
-            self.coarse, self._replacements = simplified(scene, max_triangles)
+            self.coarse, self._replacements = simplify_scene(scene, max_triangles)
         self._material_names = material_names
         self._materials: Ints | None = None  # (shown triangles,)
         if face_materials is not None:
@@ -121,7 +121,7 @@ class DisplayMesh:
             colors = normal_colors(normals / np.where(lengths > 0, lengths, np.nan)) / 255
             legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
         elif by == "color" and self.coarse.colors is not None:
-            colors = self.coarse.colors.means() / 255
+            colors = self.coarse.colors.mean_colors() / 255
         else:
             return arrays, None
         corners = as_bytes(colors).repeat(3, axis=0).reshape(-1, 3, 3)

@@ -390,7 +390,7 @@ class View:
         for k, mesh in enumerate(meshes):
             arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colors is not None:  # repeated for each corner
-                arrays[f"mesh{k}_colors"] = mesh.colors.means().repeat(3, axis=0)
+                arrays[f"mesh{k}_colors"] = mesh.colors.mean_colors().repeat(3, axis=0)
             if mesh.animation is not None:
                 arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
                 arrays[f"mesh{k}_faces"] = mesh.faces.astype(np.int32)

@@ -13,7 +13,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, SURFACE_COLUMNS, VELOCITY
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Records
-from lidarsim.scene.colors import as_float
+from lidarsim.scene.colors import pack_as_float
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.lidar_traits import LidarTraits
@@ -346,7 +346,7 @@ def encode_points(
         since_ns = since_stamp_ns(points, sweeps, sweep)
         values[layout.time_field] = layout.times(since_ns, message_stamp_ns(sweeps, sweep))
     if "rgb" in (row.names or ()):
-        values["rgb"] = as_float(*(columns[name] for name in COLORS))
+        values["rgb"] = pack_as_float(*(columns[name] for name in COLORS))
     same_names = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
     for name, column in (*same_names, ("label", "class")):
         if name in (row.names or ()):

@@ -1,1 +1,1 @@
-"""Readers of mesh files: bytes in, meshes and scene graphs out."""
+"""Readers of mesh and point cloud files."""

@@ -1,4 +1,4 @@
-"""Formats of cloud files that are read as scans: a row for each ending."""
+"""Readers of point cloud files by file extension."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .pts import read_pts
 from .ptx import read_ptx
 from .text_cloud import read_text_cloud
 
-# {ending: reader, which raises ValueError for a broken file}
+# {extension: reader, which raises ValueError if a file is invalid}
 SCAN_READERS: dict[str, Callable[[Path], list[Sweep]]] = {
     ".pcd": read_pcd,
     ".xyz": read_text_cloud,

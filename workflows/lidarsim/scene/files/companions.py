@@ -1,4 +1,4 @@
-"""Files that a mesh file names: buffers, materials, images."""
+"""Access to the files that a mesh file refers to, such as buffers, materials and images."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from ..masks import MaskError
 from .scene_graph import MeshFileError, ReadOptions
 
 
-def named_file(
+def find_named_file(
     mesh: Path, name: str, options: ReadOptions, *, allow_moved: bool = True
 ) -> Path | None:
-    """Return the path of a file that a mesh file names, or None if the file does not exist.
+    """Return the path of a file that a mesh file refers to, or None if the file does not exist.
 
-    Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
-    be of another machine: then their last part counts, if `allow_moved`, in the folder of the mesh
-    file and in the folders of assets. A pipe does not count as a file, since reading a pipe would
-    wait for ever.
+    The name can be escaped like a URI, since the standard requires it but not all programs comply.
+    It can also contain backslashes, or be a path on another machine. In this case, if `allow_moved`
+    is set, the last component of the path is looked up in the folder of the mesh file and in the
+    asset folders. Pipes do not count as files because reading a pipe can block forever.
 
     Raises
     ------
     MeshFileError
-        If the file is only in folders that are not allowed.
+        If the file only exists in folders that are not allowed.
     """
     name = name.strip().removeprefix("file://")
     windows = PureWindowsPath(unquote(name))
@@ -42,20 +42,20 @@ def named_file(
         except (OSError, ValueError, RuntimeError):
             continue  # no file can have this name
     if refused:
-        raise MeshFileError(outside(name))
+        raise MeshFileError(outside_message(name))
     return None
 
 
 def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance) -> Path:
-    """Return the path of an image that a mesh file names, and add its bytes to the allowance.
+    """Return the path of an image that a mesh file refers to, and add its size to the allowance.
 
     Raises
     ------
     MaskError
-        If the image does not exist, or is only in folders that are not allowed.
+        If the image does not exist, or only exists in folders that are not allowed.
     """
     try:
-        file = named_file(mesh, name, options)
+        file = find_named_file(mesh, name, options)
     except MeshFileError as error:
         raise MaskError(str(error)) from error
     if file is None:
@@ -64,8 +64,11 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
     return file
 
 
-def outside(name: str) -> str:
-    """Return a clause on a file that may not be read."""
+def outside_message(name: str) -> str:
+    """Return the error message for a file outside the allowed folders.
+
+    The message is a clause that follows the name of the mesh file.
+    """
     return (
         f"takes data from {name[-80:]!r}, but only files in its own folder are read. Set assets "
         "to the folder that contains that file"

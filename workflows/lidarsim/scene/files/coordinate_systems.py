@@ -1,7 +1,8 @@
-"""Coordinate systems on Earth: where their meters are meters on the ground, by rasterio's PROJ.
+"""Coordinate reference systems, and how much they distort lengths on the ground.
 
-A map projection stretches lengths. National grids and UTM zones do so by less than 1 % where they
-are meant to be used; Web Mercator (EPSG:3857) by 47 % in Zurich, with heights as they are.
+All map projections distort lengths. National grids and UTM zones do so by less than 1 % within
+their area of use. Web Mercator (EPSG:3857) stretches horizontal lengths by 47 % in Zurich, but not
+heights. Distortions are computed with PROJ, which is part of rasterio.
 """
 
 from __future__ import annotations
@@ -26,32 +27,33 @@ from ...schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 
-MAX_SCALE_ERROR = 0.01  # error of lengths that count as true
+MAX_SCALE_ERROR = 0.01  # maximum relative error of lengths that count as true to scale
 UTM_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
-_UTM_MIDDLE_M = 500_000.0  # easting of the meridian in the middle of a zone
-_UTM_HALF_WIDTH_M = 900_000.0  # at this distance from the middle lengths are wrong by 0.96 %
-_GROUND_STEP_M = 10.0  # step of the differences that a scale is computed by
-_BLOCK_POINTS = 100_000  # reprojected at a time, through lists of Python
-UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
-POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
-_POLAR_DEG = 84.0  # from this latitude on, the polar stereographic projection replaces UTM
-# Systems are used beyond the area that the registry states, but not this far, degrees of arc: UTM
-# zone 33 serves all of Norway, 30 degrees wide, and zone 32 all of Bavaria.
+_UTM_MIDDLE_M = 500_000.0  # easting of the central meridian
+_UTM_HALF_WIDTH_M = 900_000.0  # at this distance from it, the length error is 0.96 %
+_GROUND_STEP_M = 10.0  # step of the finite differences from which scales are computed
+_BLOCK_POINTS = 100_000  # points transformed at a time, since rasterio uses Python lists
+UNNAMED = ("unnamed", "unknown", "")  # names that GDAL and PROJ use for systems without a name
+POLAR_EPSG = (5041, 5042)  # universal polar stereographic, north and south
+_POLAR_DEG = 84.0  # from this latitude on, universal polar stereographic replaces UTM
+# Systems are also used outside their area of use, but not this far outside, in degrees. For
+# example, UTM zone 33 is used in all of Norway, which is 30 degrees wide, and zone 32 in all of
+# Bavaria.
 _AREA_MARGIN_DEG = 5.0
-_ELSEWHERE_DEG = 20.0  # coordinates this far from the area are likely those of another system
-_AREA_LETTERS = 90  # of the name of an area in messages
-# Northings within the zones of each family of UTM codes, in meters, for places that need no
-# registry to be recognized.
+_ELSEWHERE_DEG = 20.0  # coordinates this far outside probably belong to another system
+_AREA_LETTERS = 90  # maximum length of the name of an area in messages
+# Range of northings in meters for each family of UTM codes, for recognizing locations without
+# loading the registry.
 _UTM_NORTHINGS_M = {
     range(32601, 32661): (0.0, 9.4e6),
     range(32701, 32761): (1.1e6, 10e6),
     range(25828, 25839): (4e6, 9.4e6),
     range(26901, 26924): (1.6e6, 9.4e6),
 }
-_UTM_ZONE_HALF_WIDTH_M = 400_000.0  # a zone at the equator reaches to 333 km from its middle
+_UTM_ZONE_HALF_WIDTH_M = 400_000.0  # a zone at the equator has a half width of 333 km
 _WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in meters, inverse flattening
 
-# Projections that are made for lengths of countries, by letters of their names.
+# Patterns in the names of projections that are used by national grids
 _OF_COUNTRIES = re.compile(
     "transversemercator|gausskruger|conformalconic|conicconformal|obliquestereographic|"
     "doublestereographic|hotine|obliquemercator|swissoblique|rectifiedskew|krovak|cassini|"
@@ -61,24 +63,27 @@ _OF_COUNTRIES = re.compile(
 
 @dataclass(frozen=True)
 class GroundScale:
-    """True lengths of a meter of a coordinate system at a place, by its direction."""
+    """The range of ground lengths to which one meter in a projected system corresponds.
+
+    The length depends on the direction.
+    """
 
     shortest: float  # meters
     longest: float  # meters
 
     @property
     def error(self) -> float:
-        """Largest relative error of a length, in any direction."""
+        """Maximum relative length error in any direction."""
         return max(abs(self.shortest - 1), abs(self.longest - 1))
 
     @property
     def is_true(self) -> bool:
-        """Whether lengths in all directions are true within `MAX_SCALE_ERROR`."""
+        """Whether lengths in all directions are correct within `MAX_SCALE_ERROR`."""
         return self.error <= MAX_SCALE_ERROR
 
     @property
     def is_even(self) -> bool:
-        """Whether lengths in all directions are stretched alike, within `MAX_SCALE_ERROR`."""
+        """Whether lengths in all directions have the same scale within `MAX_SCALE_ERROR`."""
         return self.longest - self.shortest <= MAX_SCALE_ERROR * self.longest
 
     def __str__(self) -> str:
@@ -89,14 +94,14 @@ class GroundScale:
 
 @dataclass(frozen=True)
 class AreaOfUse:
-    """The area on Earth where a coordinate system is meant to be used.
+    """The area of use of a coordinate system.
 
     Attributes
     ----------
     name
-        The area in words, by the registry.
+        Description of the area in the EPSG registry.
     west, south, east, north
-        Bounds in degrees; `west` is greater than `east` if the area crosses the date line.
+        Bounds in degrees. `west` is greater than `east` if the area crosses the antimeridian.
     """
 
     name: str
@@ -115,7 +120,10 @@ class AreaOfUse:
         return (self.east - self.west) % 360 or 360.0
 
     def reaches(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
-        """Return True for a place within `margin_deg` of the area, in degrees of arc."""
+        """Return whether a location is inside the area or within `margin_deg` of it.
+
+        The margin is an angular distance in degrees.
+        """
         if not self.south - margin_deg <= latitude <= self.north + margin_deg:
             return False
         cosine = float(sin_cos(np.radians(np.array([latitude])))[1][0])
@@ -126,14 +134,19 @@ class AreaOfUse:
 
 
 def has_registry() -> bool:
-    """Return True if rasterio is installed, which has PROJ and the registry of EPSG."""
+    """Return whether rasterio is installed, which includes PROJ and the EPSG registry."""
     return find_spec("rasterio") is not None
 
 
-def need_registry(purpose: str) -> None:
-    """Check that rasterio is installed.
+def require_registry(purpose: str) -> None:
+    """Raise an error if rasterio is not installed.
 
-    Raises LidarError if not. `purpose` starts the error.
+    `purpose` is the subject of the error message.
+
+    Raises
+    ------
+    LidarError
+        If rasterio is not installed.
     """
     if not has_registry():
         raise LidarError(
@@ -142,10 +155,10 @@ def need_registry(purpose: str) -> None:
         )
 
 
-def crs_of_text(text: str) -> Any:
-    """Return the `rasterio.crs.CRS` of WKT, a code such as EPSG:3857, or a definition of PROJ.
+def crs_from_text(text: str) -> Any:
+    """Return the `rasterio.crs.CRS` for WKT, a code such as EPSG:3857, or a PROJ string.
 
-    None for a text that PROJ does not understand.
+    The result is None if PROJ does not understand the text.
     """
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
@@ -157,46 +170,46 @@ def crs_of_text(text: str) -> Any:
 
 
 @lru_cache(maxsize=32)
-def _crs_of_json(text: str) -> Any:
-    """Return the `rasterio.crs.CRS` of PROJJSON, which takes 20 ms to read."""
-    return crs_of_text(text)
+def _crs_from_json(text: str) -> Any:
+    """Return the `rasterio.crs.CRS` for PROJJSON, cached because parsing takes 20 ms."""
+    return crs_from_text(text)
 
 
-def crs_of_code(epsg: int) -> Any:
-    """Return the `rasterio.crs.CRS` of an EPSG code, or None if the code is unknown."""
-    return crs_of_text(f"EPSG:{epsg}")
+def crs_from_code(epsg: int) -> Any:
+    """Return the `rasterio.crs.CRS` for an EPSG code, or None if the code is unknown."""
+    return crs_from_text(f"EPSG:{epsg}")
 
 
 def projjson(crs: Any) -> dict[str, Any]:
-    """Return the PROJJSON of a coordinate system, without a datum bound to the system."""
+    """Return the PROJJSON of a coordinate system, or of the source system if it is bound."""
     return _unbound(crs.to_dict(projjson=True))
 
 
 def _unbound(described: dict[str, Any]) -> dict[str, Any]:
-    """Return the PROJJSON of a system that may be bound to a datum."""
+    """Return the PROJJSON of the source system if a system is bound to a datum."""
     source: dict[str, Any] = described.get("source_crs", described)
     return source
 
 
 def horizontal_part(crs: Any) -> tuple[Any, float | None]:
-    """Return the horizontal system of a system on Earth, and meters in its unit of heights.
+    """Return the horizontal part of a coordinate system, and its height unit in meters.
 
-    The unit is None for a system without heights.
+    The height unit is None if the system has no heights.
     """
     described = projjson(crs)
     parts = [_unbound(part) for part in described.get("components", [described])]
     axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
-    horizontal = _crs_of_json(json.dumps(parts[0])) if len(parts) > 1 else crs
+    horizontal = _crs_from_json(json.dumps(parts[0])) if len(parts) > 1 else crs
     if not units:
         return horizontal, None
     return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
 
 
 def is_local(crs: Any) -> bool:
-    """Return True for a system with axes of length that has no place on Earth, such as a site grid.
+    """Return whether a system has length units but no georeference, such as a site grid.
 
-    The types LOCAL_CS of WKT 1 and ENGCRS of WKT 2. `crs` must not be compound.
+    Such systems have the type LOCAL_CS in WKT 1 and ENGCRS in WKT 2. `crs` must not be compound.
     """
     return bool(projjson(crs)["type"] == "EngineeringCRS" and linear_unit(crs) is not None)
 
@@ -204,7 +217,8 @@ def is_local(crs: Any) -> bool:
 def linear_unit(crs: Any) -> tuple[str, float] | None:
     """Return the name of the unit of x and y and its length in meters, or None for angles.
 
-    `crs` must not be compound. GDAL knows the unit of projected systems only.
+    `crs` must not be compound. PROJJSON is used because GDAL reports the unit only for projected
+    systems.
     """
     axes = projjson(crs).get("coordinate_system", {}).get("axis", ())
     unit = axes[0].get("unit") if axes else None
@@ -218,14 +232,14 @@ def linear_unit(crs: Any) -> tuple[str, float] | None:
 
 
 def is_geocentric(crs: Any) -> bool:
-    """Return True for a system with its origin in the middle of the Earth."""
+    """Return whether a system is Cartesian with its origin at the center of the Earth."""
     described = projjson(crs)
     axes = described.get("coordinate_system", {})
     return described["type"] == "GeodeticCRS" and axes.get("subtype") == "Cartesian"
 
 
 def crs_key(crs: Any) -> tuple[str, int | None]:
-    """Return a text that identifies a coordinate system, and its EPSG code if that is certain."""
+    """Return a string that identifies a coordinate system, and its EPSG code if it is certain."""
     if crs is None:
         return "", None
     code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
@@ -241,17 +255,17 @@ def crs_name(crs: Any) -> str:
     return f"EPSG:{code}" if name in UNNAMED else f"EPSG:{code} ({name})"
 
 
-def named_system(epsg: int) -> str:
-    """Return an EPSG code and, if rasterio is installed and knows the code, the system's name."""
-    crs = crs_of_code(epsg) if has_registry() else None
+def describe_system(epsg: int) -> str:
+    """Return an EPSG code, with the name of the system if rasterio is installed and knows it."""
+    crs = crs_from_code(epsg) if has_registry() else None
     return f"EPSG:{epsg}" if crs is None else crs_name(crs)
 
 
-def transformed(source: Any, target: Any, points: Floats) -> Floats:
-    """Return points (n, 2) or (n, 3) in another coordinate system.
+def transform_coordinates(source: Any, target: Any, points: Floats) -> Floats:
+    """Transform points to another coordinate system.
 
-    Infinite where a coordinate is not finite; any exception where a point is outside of what one of
-    the systems can represent.
+    The shape of the points is (n, 2) or (n, 3). Points with coordinates that are not finite become
+    infinite. If a point is outside the domain of a system, any exception can be raised.
     """
     from rasterio.warp import transform
 
@@ -263,27 +277,30 @@ def transformed(source: Any, target: Any, points: Floats) -> Floats:
 
 
 def longitude_latitude(crs: Any, x: float, y: float) -> tuple[float, float] | None:
-    """Return longitude and latitude (WGS 84) of a place, degrees, or None outside of the system."""
-    places = _transformed_places(crs, crs_of_code(4326), np.array([[x, y]]))
+    """Return the WGS 84 longitude and latitude of a location in degrees.
+
+    The result is None if the location is outside the domain of the system.
+    """
+    places = _transform_locations(crs, crs_from_code(4326), np.array([[x, y]]))
     return None if places is None else (float(places[0, 0]), float(places[0, 1]))
 
 
-def _transformed_places(source: Any, target: Any, places: Floats) -> Floats | None:
-    """Return places (n, 2) in another system, or None if one of them has no coordinates there."""
+def _transform_locations(source: Any, target: Any, places: Floats) -> Floats | None:
+    """Transform locations, or return None if any of them cannot be transformed."""
     try:
-        moved = transformed(source, target, places)
-    except Exception:  # errors of GDAL have classes that rasterio keeps private
+        moved = transform_coordinates(source, target, places)
+    except Exception:  # rasterio does not export the classes of GDAL errors
         return None
     return moved if np.isfinite(moved).all() else None
 
 
 def area_of_use(crs: Any) -> AreaOfUse | None:
-    """Return the area of use of a coordinate system, or None if the registry states none.
+    """Return the area of use of a coordinate system, or None if it is not registered.
 
     `crs` must not be compound.
     """
     code = crs.to_epsg(confidence_threshold=90)
-    described = projjson(crs_of_code(code) if code else crs)
+    described = projjson(crs_from_code(code) if code else crs)
     stated = [part for part in (described, *described.get("usages", ())) if part.get("bbox")]
     if not stated:
         return None
@@ -295,16 +312,19 @@ def area_of_use(crs: Any) -> AreaOfUse | None:
 def missed_area(
     crs: Any, x: float, y: float, margin_deg: float = _ELSEWHERE_DEG
 ) -> AreaOfUse | None:
-    """Return the area of use of a system if a place is not within `margin_deg` of it, else None.
+    """Return the area of use of a system if a location is outside it, or None otherwise.
 
-    None also for a system whose area is not known.
+    Locations within `margin_deg` of the area are not considered outside. The result is also None if
+    the area is unknown.
 
     Parameters
     ----------
     crs
-        A `rasterio.crs.CRS`, not compound.
+        A `rasterio.crs.CRS`, which must not be compound.
     x, y
-        Coordinates of the place, in the unit of the system.
+        Coordinates of the location in the unit of the system.
+    margin_deg
+        Angular distance in degrees.
     """
     area = area_of_use(crs)
     if area is None:
@@ -315,15 +335,15 @@ def missed_area(
 
 
 def outside_system(epsg: int, x: float, y: float) -> str:
-    """Return a clause that names a system and its area of use if a place is far outside, else "".
+    """Describe the area of use of a system if a location is far outside it.
 
-    Far is 5 degrees of arc. The clause is such as «the area of use of EPSG:2056 (CH1903+ / LV95),
-    which is Liechtenstein; Switzerland». Empty for a code that is not known, for a system that is
-    not projected, and without rasterio.
+    Far means more than 5 degrees. The result is a phrase such as "the area of use of EPSG:2056
+    (CH1903+ / LV95), which is Liechtenstein; Switzerland". It is an empty string if the location is
+    not far outside, if the code is unknown, if the system is not projected, and without rasterio.
     """
     if _is_in_zone(epsg, x, y) or not has_registry():
         return ""
-    crs = crs_of_code(epsg)
+    crs = crs_from_code(epsg)
     horizontal = None if crs is None else horizontal_part(crs)[0]
     if horizontal is None or not horizontal.is_projected:
         return ""
@@ -335,7 +355,10 @@ def outside_system(epsg: int, x: float, y: float) -> str:
 
 
 def _is_in_zone(epsg: int, x: float, y: float) -> bool:
-    """Return True for a place in a UTM zone without the registry, which takes half a second."""
+    """Return whether a location is in a UTM zone, without loading the registry.
+
+    Loading the registry takes half a second.
+    """
     for codes, (south_m, north_m) in _UTM_NORTHINGS_M.items():
         if epsg in codes:
             return abs(x - _UTM_MIDDLE_M) <= _UTM_ZONE_HALF_WIDTH_M and south_m <= y <= north_m
@@ -343,55 +366,59 @@ def _is_in_zone(epsg: int, x: float, y: float) -> bool:
 
 
 def zone_in_area(epsg: int, x: float, y: float) -> int | None:
-    """Return the only UTM zone by which a place is in the area of use of a system, an EPSG code.
+    """Return the UTM zone in which a location would be in the area of use of a system.
 
-    For coordinates of a UTM zone that were taken for coordinates of the system. None if no zone
-    fits, or several, and without rasterio.
+    This identifies coordinates in a UTM zone that were mistaken for coordinates in the system. The
+    zone is an EPSG code. The result is None if no zone or several zones fit, and without rasterio.
     """
-    crs = crs_of_code(epsg) if has_registry() else None
+    crs = crs_from_code(epsg) if has_registry() else None
     area = None if crs is None else area_of_use(horizontal_part(crs)[0])
     if area is None:
         return None
     longitudes = np.arange(area.west, area.west + area.width, 1.0).tolist()
     latitude = (area.south + area.north) / 2
-    codes = {zone_in_meters((at + 180) % 360 - 180, latitude) for at in longitudes}
-    places = {code: longitude_latitude(crs_of_code(code), x, y) for code in codes - {epsg}}
+    codes = {utm_code((at + 180) % 360 - 180, latitude) for at in longitudes}
+    places = {code: longitude_latitude(crs_from_code(code), x, y) for code in codes - {epsg}}
     fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
     return fitting[0] if len(fitting) == 1 else None
 
 
 def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
-    """Return the scale of a projected system at a place in its own unit.
+    """Return the scale of a projected system at a location.
 
-    The lengths on the ellipsoid of steps along x and y, as PROJ's factors have them; rasterio has
-    no function for these. None outside of the system, and for a system that is not projected.
+    The scale is computed from the ellipsoidal lengths of steps along x and y, which has the same
+    result as PROJ's factors. rasterio does not provide them. The result is None if the location is
+    outside the domain of the system, or if the system is not projected.
 
     Parameters
     ----------
     crs
-        A `rasterio.crs.CRS`, not compound.
+        A `rasterio.crs.CRS`, which must not be compound.
     x, y
-        Coordinates of the place, in the unit of the system.
+        Coordinates of the location in the unit of the system.
     """
     if not crs.is_projected:
         return None
     base = projjson(crs).get("base_crs")
-    geographic = _crs_of_json(json.dumps(base)) if base else None
+    geographic = _crs_from_json(json.dumps(base)) if base else None
     step = _GROUND_STEP_M / crs.linear_units_factor[1]
     places = np.array([x, y]) + step / 2 * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
-    degrees = _transformed_places(crs, geographic or crs_of_code(4326), places)
+    degrees = _transform_locations(crs, geographic or crs_from_code(4326), places)
     if degrees is None:
         return None
     degrees = degrees * _degrees_per_unit(base or {})
-    east_m, north_m = _ground_meters_of_degrees(base or {}, degrees[:, 1].mean())
-    longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps may cross the date line
+    east_m, north_m = _degree_lengths_m(base or {}, degrees[:, 1].mean())
+    longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps can cross 180 degrees
     latitude = np.diff(degrees[:, 1])[::2]
     steps = np.stack([longitude * east_m, latitude * north_m]) / _GROUND_STEP_M
-    return _ellipse(steps)
+    return _tissot_axes(steps)
 
 
-def _ellipse(steps: Floats) -> GroundScale:
-    """Return the half axes of Tissot's ellipse: the singular values of steps (2, 2)."""
+def _tissot_axes(steps: Floats) -> GroundScale:
+    """Return the semi-axes of Tissot's indicatrix, which are the singular values of the steps.
+
+    The shape of the steps is (2, 2).
+    """
     squares = float((steps * steps).sum())
     east, north = steps
     difference = float((east * east).sum() - (north * north).sum())
@@ -403,14 +430,17 @@ def _ellipse(steps: Floats) -> GroundScale:
 
 
 def _degrees_per_unit(base: dict[str, Any]) -> float:
-    """Return the degrees in the unit of a geographic system: France's old grids are in grads."""
+    """Return the angular unit of a geographic system in degrees.
+
+    Old French grids use gradians.
+    """
     axes = base.get("coordinate_system", {}).get("axis", ({},))
     unit = axes[0].get("unit", "degree")
     return 1.0 if isinstance(unit, str) else float(np.degrees(unit["conversion_factor"]))
 
 
-def _ground_meters_of_degrees(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
-    """Return the lengths of a degree of longitude and of latitude on an ellipsoid, meters."""
+def _degree_lengths_m(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
+    """Return the ellipsoidal lengths of a degree of longitude and of latitude in meters."""
     datum = base.get("datum") or base.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
     axis, inverse = _WGS84_ELLIPSOID
@@ -429,10 +459,11 @@ def _ground_meters_of_degrees(base: dict[str, Any], latitude_deg: float) -> tupl
     )
 
 
-def zone_in_meters(longitude: float, latitude: float) -> int:
-    """Return the EPSG code of the UTM zone (WGS 84) of a place, beyond 84 degrees of a polar one.
+def utm_code(longitude: float, latitude: float) -> int:
+    """Return the EPSG code of the WGS 84 UTM zone that contains a location.
 
-    Universal polar stereographic has a scale of 0.994 to 0.997 there.
+    At latitudes of 84 degrees and more, return the code of the universal polar stereographic
+    system, which has a scale of 0.994 to 0.997 there.
     """
     if abs(latitude) >= _POLAR_DEG:
         return POLAR_EPSG[0] if latitude > 0 else POLAR_EPSG[1]
@@ -441,22 +472,23 @@ def zone_in_meters(longitude: float, latitude: float) -> int:
 
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
-    """Return the EPSG code of a system in true meters at a place, or None if it is not on Earth.
+    """Return the EPSG code of a system that is true to scale at a location, or None.
 
-    None also for a place far outside the system's area of use, whose coordinates are likely those
-    of another system.
+    The result is None if the location cannot be transformed, or if it is far outside the area of
+    use of its system, since its coordinates probably belong to another system then.
     """
     horizontal = horizontal_part(crs)[0]
     if missed_area(horizontal, x, y) is not None:
         return None
     place = longitude_latitude(horizontal, x, y)
-    return None if place is None else zone_in_meters(*place)
+    return None if place is None else utm_code(*place)
 
 
 def projection_kind(name: str) -> bool | None:
-    """Return whether a projection is made for true lengths, by its name, or None if unknown.
+    """Return whether a projection with a given name preserves lengths, or None if it is unknown.
 
-    For where PROJ cannot tell the scale: False for Mercator's.
+    The name is used where PROJ cannot compute the scale. The result is False for Mercator
+    projections.
     """
     letters = re.sub("[^a-z]", "", name.lower())
     if _OF_COUNTRIES.search(letters):
@@ -464,17 +496,20 @@ def projection_kind(name: str) -> bool | None:
     return False if "mercator" in letters else None
 
 
-def middle_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
-    """Return x and y in the middle of the middles of objects, (2,), zero without any."""
+def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
+    """Return the center of the bounding rectangle of the centers of objects.
+
+    The result contains x and y, which are zero if there are no objects.
+    """
     if not objects:
         return np.zeros(2)
-    middles = np.array([_middle(item)[:2] for item in objects])
+    middles = np.array([_center(item)[:2] for item in objects])
     middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
     return middle
 
 
-def _middle(item: SceneMesh | SceneInstance) -> Floats:
-    """Return the middle of an object's bounds in the world, (3,)."""
+def _center(item: SceneMesh | SceneInstance) -> Floats:
+    """Return the center of the bounding box of an object in world coordinates."""
     if isinstance(item, SceneMesh):
         return np.asarray(item.bounds.mean(axis=0))
     middle = item.mesh.bounds.mean(axis=0)
@@ -482,26 +517,27 @@ def _middle(item: SceneMesh | SceneInstance) -> Floats:
 
 
 def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
-    """Return why lengths are not true at a place of a system, as a clause, empty if they are.
+    """Return why the lengths in a system are not true to scale at a location.
 
-    For systems of meshes, in meters. The clause follows the name of the system, such as «whose
-    meter is 0.68 m long on the ground here».
+    The result is a clause that follows the name of the system, such as "whose meter is 0.68 m long
+    on the ground here". It is an empty string if lengths are true to scale. The system must have
+    meters as its unit.
 
     Parameters
     ----------
     system
-        A code such as EPSG:3857, WKT, or a definition of PROJ. Of a system that is not understood,
-        and without rasterio, only `WORLD_EPSG` are known.
+        An EPSG code such as EPSG:3857, WKT, or a PROJ string. If the system is not understood, the
+        result is an empty string. Without rasterio, only the systems in `WORLD_EPSG` are known.
     x, y
-        Coordinates of the place, in the unit of the system.
+        Coordinates of the location in the unit of the system.
     in_system
-        Whether the mesh has coordinates of the system, so that the clause says what placement makes
-        its lengths true.
+        Whether the mesh has coordinates in this system. In this case, the clause suggests a scale
+        factor that corrects the lengths.
     """
     if not has_registry():
         is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
         return "whose meters are not true to scale" if is_known else ""
-    crs = crs_of_text(system)
+    crs = crs_from_text(system)
     horizontal = None if crs is None else horizontal_part(crs)[0]
     scale = None if crs is None else ground_scale(horizontal, x, y)
     if scale is None or scale.is_true:
@@ -516,7 +552,10 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
 
 
 def world_advice(x: float, y: float, z: float) -> str:
-    """Return advice, a sentence without a period, on a file that states a map offset."""
+    """Return a suggestion to use the map offset in a file as the world origin.
+
+    The result is a sentence without a period.
+    """
     return (
         f"Alternatively, set world.origin to [{x:.12g}, {y:.12g}, {z:.9g}], which leaves the "
         "scene and the poses of a scenario unchanged and writes output files in this system"
@@ -524,18 +563,18 @@ def world_advice(x: float, y: float, z: float) -> str:
 
 
 def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
-    """Return why lengths in a chosen system are not true meters at a place of that system.
+    """Return why the lengths in a target system are not true to scale at a location.
 
-    A clause that begins with the code, such as «EPSG:3857 (WGS 84 / Pseudo-Mercator), whose …»;
-    empty if lengths are true within `MAX_SCALE_ERROR`. Systems of the whole Earth (`WORLD_EPSG`)
-    are refused everywhere. Without rasterio, only these systems are known. `why_there` follows the
-    coordinates in the message.
+    The result is a clause that starts with the system, such as "EPSG:3857 (WGS 84 /
+    Pseudo-Mercator), whose …". It is an empty string if lengths are correct within
+    `MAX_SCALE_ERROR`. Systems of the whole Earth (`WORLD_EPSG`) are rejected everywhere. Without
+    rasterio, only these systems are known. `why_there` follows the coordinates in the message.
     """
     if is_utm(epsg) and is_true_in_utm(np.array([x])):
-        return ""  # reading the registry takes half a second
+        return ""  # avoids loading the registry, which takes half a second
     if not has_registry():
         return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
-    crs = crs_of_code(epsg)
+    crs = crs_from_code(epsg)
     if crs is None:
         return f"EPSG:{epsg}, which is unknown to rasterio"
     name = f"EPSG:{epsg} ({projjson(crs)['name']})"
@@ -551,15 +590,18 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return ""
     advice = "Use a system for this location"
     if place := longitude_latitude(horizontal, x, y):
-        advice = f"Use EPSG:{zone_in_meters(*place)}, which is true to scale there"
+        advice = f"Use EPSG:{utm_code(*place)}, which is true to scale there"
     return f"{name}, whose meter is {scale} long at x {x:.9g}, y {y:.9g}{why_there}. {advice}"
 
 
 def is_utm(epsg: int) -> bool:
-    """Return True for UTM zones of WGS 84, ETRS89 and NAD83."""
+    """Return whether an EPSG code is that of a UTM zone of WGS 84, ETRS89 or NAD83."""
     return any(epsg in codes for codes in UTM_EPSG)
 
 
 def is_true_in_utm(eastings: Floats) -> bool:
-    """Return True if lengths at all eastings (n,) of a UTM zone, meters, are true."""
+    """Return whether lengths at all given eastings of a UTM zone are true to scale.
+
+    Eastings have shape (n,) and are in meters.
+    """
     return bool((np.abs(eastings - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M).all())

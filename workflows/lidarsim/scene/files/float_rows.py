@@ -1,4 +1,4 @@
-"""Sweeps of float32 in rows: .bin of KITTI, and .pcd.bin of nuScenes."""
+"""Reader of sweeps that consist of float32 rows, such as .bin (KITTI) and .pcd.bin (nuScenes)."""
 
 from __future__ import annotations
 
@@ -10,22 +10,28 @@ from ...columns.sweep import Sweep
 from ...io.input_files import read_input
 from ...numerics.arrays import AnyArray
 
-# Columns of the formats.
+# Columns in each format
 KITTI = ("x", "y", "z", "intensity")
 NUSCENES = (*KITTI, "channel")
 _NUSCENES_ENDING = ".pcd.bin"
 
 
 def columns_by_name(path: Path) -> tuple[str, ...]:
-    """Return the columns of a file by its ending."""
+    """Return the column names of a file according to its extension."""
     return NUSCENES if path.name.lower().endswith(_NUSCENES_ENDING) else KITTI
 
 
 def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
-    """Return the columns of a sweep, {name: (n,)}, which are `KITTI` or `NUSCENES`.
+    """Read the columns of a sweep by name.
 
-    ValueError for a partial row, or if the rings are not rings; OSError if the file
-    cannot be read.
+    `names` is `KITTI` or `NUSCENES`. Each column has shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the last row is incomplete, or if a ring number is invalid.
+    OSError
+        If the file cannot be read.
     """
     data = read_input(path)
     row_size = 4 * len(names)
@@ -49,11 +55,16 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
 
 
 def read_float_rows(path: Path) -> list[Sweep]:
-    """Read the points of a sweep, of the format that its ending tells.
+    """Read the points of a sweep in the format that its extension specifies.
 
-    Errors as of `read_float_columns`.
+    Raises
+    ------
+    ValueError
+        If the last row is incomplete, or if a ring number is invalid.
+    OSError
+        If the file cannot be read.
     """
     columns = read_float_columns(path, columns_by_name(path))
-    with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
+    with np.errstate(invalid="ignore"):  # converting signaling NaN is an invalid operation
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [Sweep(positions, columns)]

@@ -1,9 +1,9 @@
-"""glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
+"""Reader of glTF 2.0 files, .glb and .gltf, according to the Khronos Group specification (2021).
 
-trimesh 5.2 is not used, since it places a node of several parents only once, loses the children of
-a camera, ignores sparse and normalized positions, skins and required extensions, and reads neither
-fans nor files without scenes; nor is assimp, which skips content that it cannot read. Only
-triangles are read, and masks and base colors of materials.
+trimesh 5.2 is not used because it places a node with several parents only once, loses the children
+of cameras, ignores sparse and normalized positions, skins and required extensions, and reads
+neither triangle fans nor files without scenes. assimp is not used because it skips content that it
+cannot read. This reader only reads triangles, and the masks and base colors of materials.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from ...numerics.vectors import matmul, matvec, norm
 from ...words import listed, plural, printable
 from ..animation import RATE_HZ
 from ..scene_mesh import SceneMesh
-from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keys_of, sample_channels
-from .gltf_draco import DRACO, unpacked
+from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keyframe_range, sample_channels
+from .gltf_draco import DRACO, decompress_draco
 from .gltf_file import (
     INSTANCING,
     VISIBILITY,
     GltfFile,
     check_readable,
-    chunks,
     extension,
     extension_notes,
     natural,
     root_nodes,
+    split_chunks,
 )
 from .gltf_materials import GltfMaterials
-from .polygons import fanned, unrolled
+from .polygons import fan_triangles, unroll_strip
 from .scene_graph import (
     GENERATOR,
     MAX_NODES,
@@ -57,11 +57,12 @@ from .scene_graph import (
 
 
 def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the default scene of a file, or all nodes of a file without scenes.
+    """Read the default scene of a file, or all nodes if the file has no scenes.
 
-    Without the option masks, triangles are solid; without masks and colors, no image is read.
+    If `options.masks` is not set, all triangles are opaque. If `options.colors` is not set either,
+    no images are read.
     """
-    header, body = chunks(data)
+    header, body = split_chunks(data)
     check_readable(header)
     allowance = Allowance(len(data), SMALLER if options.animation is None else SHORTER)
     file = GltfFile(header, body, path, options, allowance)
@@ -73,7 +74,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
         content = reader.animated_content(options.animation)
     content.unit_m = 1.0
     content.up_axis = "y"
-    content.turned = "as glTF requires"
+    content.rotation_note = "as glTF requires"
     notes = [*reader.visibility_notes(), *extension_notes(header)]
     if notes and not content.meshes:
         raise MeshFileError(f"contains no readable triangles, because it {'; it '.join(notes)}")
@@ -88,37 +89,37 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _NodeReader:
-    """Reader of nodes, meshes and skins by their indices, each of them once."""
+    """A reader of nodes, meshes and skins, each of which is read once."""
 
     def __init__(self, file: GltfFile, materials: GltfMaterials) -> None:
         self._file = file
         self._materials = materials
         self._allowance = file.allowance
-        self._first_meshes: dict[str, int] = {}  # {primitives: first mesh with these primitives}
+        self._first_meshes: dict[str, int] = {}  # {primitives: first mesh that has them}
         nodes = file.header.get("nodes", ())
         self._parents = {
             child: index for index, node in enumerate(nodes) for child in node.get("children", ())
         }
-        self._posed = cache(self._read_posed)  # keys are (mesh, weights of its targets, skin)
+        self._posed = cache(self._read_posed)  # keys are (mesh, morph target weights, skin)
         self._mesh = cache(partial(self._read_posed, weights=(), skin=None))
         self._hidden_nodes: dict[int, str] = {}  # {node: name}
         self._channels: AnimatedNodes = {}
         self._frame = 0
         self._local = cache(self._read_local)
         self._joints = cache(self._read_joints)
-        self._worlds: dict[int, Floats] = {}  # {node: matrix to the scene}, at the frame
+        self._worlds: dict[int, Floats] = {}  # {node: transform to the scene} in this frame
 
     def animated_content(self, name: str) -> Content:
-        """Read the scene with meshes animated by an animation, from its first key to its last."""
+        """Read the scene and bake an animation into its meshes, from the first to the last key."""
         animation = find_animation(self._file.header.get("animations", []), name)
-        first, last = keys_of(animation, self._file.accessor)
+        first, last = keyframe_range(animation, self._file.accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
         self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
         return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
-        """Yield the content at each time of an animation, with colors in the first only."""
+        """Yield the content at each time of an animation, with colors only at the first."""
         self._channels = sample_channels(animation, times_s, self._file.accessor)
         if not self._channels:
             raise MeshFileError(
@@ -128,7 +129,7 @@ class _NodeReader:
             self._file.part("nodes", index)
         roots = root_nodes(self._file.header)
         for self._frame in range(len(times_s)):
-            for cached in (self._local, self._joints, self._posed):  # hold the previous frame
+            for cached in (self._local, self._joints, self._posed):  # depend on the frame
                 cached.cache_clear()
             self._worlds.clear()
             yield placed_content(
@@ -137,7 +138,7 @@ class _NodeReader:
             self._materials.options = self._materials.options._replace(colors=False)
 
     def _read_local(self, index: int) -> Floats:
-        """Return the matrix (4, 4) of a node, at the frame of the animation, if any."""
+        """Return the local transform of a node in the current animation frame."""
         node = self._file.part("nodes", index)
         animated = {
             path: self._channels[index, path][self._frame]
@@ -149,9 +150,9 @@ class _NodeReader:
         return _matrix({**node, **animated})
 
     def node(self, index: int) -> Node:
-        """Return a node, with the name of its mesh if the node has no name.
+        """Return a node, which is named after its mesh if it has no name.
 
-        A hidden node has neither meshes nor children.
+        Hidden nodes are returned without meshes and children.
         """
         data = self._file.part("nodes", index)
         name = str(data.get("name") or "")
@@ -161,7 +162,8 @@ class _NodeReader:
         copies = None
         if "mesh" in data:
             name = name or str(self._file.part("meshes", data["mesh"]).get("name") or "")
-            # Some programs write a mesh for each node, all of the same accessors.
+            # Some programs write a separate mesh for each node, although the accessors are the
+            # same.
             content = json.dumps(
                 self._file.part("meshes", data["mesh"])["primitives"], sort_keys=True
             )
@@ -178,10 +180,7 @@ class _NodeReader:
         return Node(name, self._local(index), meshes, children, copies, skinned)
 
     def _is_hidden(self, index: int, data: dict[str, Any]) -> bool:
-        """Return True for a node that is hidden.
-
-        Raises ValueError if the file does not say it clearly.
-        """
+        """Return whether a node is hidden, and record hidden nodes."""
         visible = extension(data, VISIBILITY).get("visible", True)
         if not isinstance(visible, bool):
             raise ValueError(
@@ -192,7 +191,7 @@ class _NodeReader:
         return not visible
 
     def visibility_notes(self) -> list[str]:
-        """Return a note on hidden nodes, if any."""
+        """Return a note on hidden nodes if there are any."""
         if not self._hidden_nodes:
             return []
         names = [*self._hidden_nodes.values()]
@@ -203,7 +202,10 @@ class _NodeReader:
         ]
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
-        """Return matrices (k, 4, 4) of the copies of a node's mesh, or None without copies."""
+        """Return the transforms of the instances of a node's mesh, or None without instancing.
+
+        The shape is (k, 4, 4).
+        """
         names = ("TRANSLATION", "ROTATION", "SCALE")
         indices = {name: attributes[name] for name in names if name in attributes}
         if not indices:
@@ -228,7 +230,7 @@ class _NodeReader:
         return _matrices(*(rows.get(name) for name in names))
 
     def motion_notes(self) -> list[str]:
-        """Return notes on animations that are not played, or on masks of an animated scene."""
+        """Return notes on animations that are not played, or on masks in an animated scene."""
         posed_count = self._posed.cache_info().currsize
         animation_count = len(self._file.header.get("animations", ()))
         meshes = (f" with {plural(posed_count, 'deformed mesh', 'deformed meshes')}") * bool(
@@ -247,7 +249,7 @@ class _NodeReader:
         return [f"has {plural(animation_count, 'animation')}{meshes}. {advice}"]
 
     def _weights(self, index: int, node: dict[str, Any]) -> tuple[float, ...]:
-        """Return the weights of the morph targets of a node's mesh."""
+        """Return the morph target weights of a node's mesh in the current animation frame."""
         mesh = self._file.part("meshes", node["mesh"])
         if not any("targets" in primitive for primitive in mesh["primitives"]):
             return ()
@@ -262,7 +264,7 @@ class _NodeReader:
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
     def _world(self, index: int) -> Floats:
-        """Return the matrix (4, 4) from a node's coordinates to the scene's."""
+        """Return the transform from node coordinates to scene coordinates."""
         path = [index]
         worlds = self._worlds
         while path[-1] not in worlds and path[-1] in self._parents:
@@ -279,9 +281,10 @@ class _NodeReader:
     def _read_posed(
         self, index: int, weights: tuple[float, ...], skin: int | None
     ) -> list[SceneMesh]:
-        """Return a mesh with morph targets applied or, with a skin, in the scene's coordinates.
+        """Return a mesh with morph targets applied.
 
-        All primitives, which differ by material only, are joined.
+        A mesh with a skin is returned in scene coordinates. All primitives of the mesh are merged,
+        since they differ only in their materials.
         """
         mesh = self._file.part("meshes", index)
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
@@ -303,13 +306,16 @@ class _NodeReader:
                 if weight and "POSITION" in target:
                     vertices += weight * self._file.accessor(target["POSITION"])
             if joints is not None:
-                vertices = self._skinned(vertices, primitive["attributes"], joints)
+                vertices = self._apply_skin(vertices, primitive["attributes"], joints)
             return unposed._replace(vertices=vertices)
 
         return join_pieces(name, map(piece, surfaces), self._allowance)
 
     def _read_joints(self, skin: int) -> Floats:
-        """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene, by glTF 2.0, 3.7.3."""
+        """Return the transforms of the joints of a skin from mesh to scene coordinates.
+
+        See glTF 2.0, section 3.7.3. The shape is (j, 4, 4).
+        """
         skin_data = self._file.part("skins", skin)
         if not skin_data.get("joints"):
             raise MeshFileError("has a skin without joints. Export it without the skin")
@@ -319,8 +325,8 @@ class _NodeReader:
             worlds = matmul(worlds, columns.reshape(len(worlds), 4, 4).transpose(0, 2, 1))
         return worlds
 
-    def _skinned(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
-        """Return vertices (v, 3) moved by the weighted joints (j, 4, 4) of each vertex."""
+    def _apply_skin(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
+        """Return vertices transformed by the weighted joints of each vertex."""
         blend = np.zeros((len(vertices), 4, 4))
         total = np.zeros(len(vertices))
         sets = (
@@ -337,7 +343,7 @@ class _NodeReader:
                     )
                 blend += weight[:, None, None] * joints[joint]
                 total += weight
-        unweighted = np.flatnonzero(total <= 0)  # other readers move these by the first joint
+        unweighted = np.flatnonzero(total <= 0)  # use the first joint, as other readers do
         blend[unweighted] = joints[
             self._file.accessor(attributes["JOINTS_0"])[unweighted, 0].astype(np.int64)
         ]
@@ -347,20 +353,20 @@ class _NodeReader:
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
-        """Return the triangles of a primitive, with mask, colors and material."""
+        """Return the triangles of a primitive with their mask, colors and material."""
         position = primitive["attributes"].get("POSITION")
         index = primitive.get("indices")
         packed = primitive.get("extensions", {}).get(DRACO)
         if position is None:
             return Piece(np.empty((0, 3)), np.empty((0, 3), np.int64))
         if packed and "bufferView" not in self._file.part("accessors", position):
-            mesh = unpacked(bytes(self._file.view(packed["bufferView"])), self._allowance)
+            mesh = decompress_draco(bytes(self._file.view(packed["bufferView"])), self._allowance)
             vertices = np.asarray(mesh.points).reshape(-1, 3)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
             return self._materials.with_material(Piece(vertices, faces), primitive, mesh)
         vertices = self._file.accessor(position)
         mode = primitive.get("mode", 4)
-        # The corners, and the triangles of strips and fans, before they are checked.
+        # Reserve memory for the corners and for the triangles of strips and fans.
         count = len(vertices if index is None else self._file.accessor(index))
         self._allowance.take((8 if mode == 4 else 24) * count)
         corners = np.arange(count)
@@ -369,12 +375,15 @@ class _NodeReader:
         if mode == 4:
             faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
         else:
-            faces = unrolled(corners) if mode == 5 else fanned(corners)
+            faces = unroll_strip(corners) if mode == 5 else fan_triangles(corners)
         return self._materials.with_material(Piece(vertices, faces), primitive)
 
 
 def _matrix(node: dict[str, Any]) -> Floats:
-    """Return the matrix (4, 4) of a node: of columns, or of translation, rotation and scale."""
+    """Return the local transform of a node.
+
+    It is stated as a matrix in column-major order, or as translation, rotation and scale.
+    """
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     rows = (
@@ -390,7 +399,10 @@ def _matrices(
     rotation: Floats | None,
     scale: Floats | None,
 ) -> Floats | None:
-    """Return matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
+    """Return transforms composed from translations, quaternions and scales.
+
+    Their shapes are (k, 3), (k, 4) and (k, 3), and the shape of the result is (k, 4, 4).
+    """
     rows = next((part for part in (translation, rotation, scale) if part is not None), None)
     if rows is None:
         return None

@@ -1,4 +1,4 @@
-"""Animations of glTF 2.0: values of samplers at times (specification, 3.11 and appendix C)."""
+"""Animations of glTF 2.0 files, with samplers as in section 3.11 and appendix C."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from ...numerics.vectors import norm
 from ...words import did_you_mean
 from .scene_graph import MeshFileError
 
-# {path of a target: numbers of its value}; further paths are weights.
+# {target path: components of a value}. The number of weights depends on the mesh.
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
-_VALUES = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}  # {interpolation: values of a key}
+_VALUES = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}  # {interpolation: values per keyframe}
 
 AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, path): values at each time, (t, width)}
 
 
 def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return the animation of a name, or of a number for a nameless animation.
+    """Return the animation with a given name.
 
-    The name "" stands for the first animation.
+    Animations without a name are identified by their number. An empty name selects the first
+    animation.
 
     Raises
     ------
@@ -41,13 +42,17 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
     return animations[names.index(name) if name else 0]
 
 
-def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tuple[float, float]:
-    """Return the first and last time of all keys, where `read` returns an accessor's numbers.
+def keyframe_range(
+    animation: Mapping[str, Any], read: Callable[[Any], AnyArray]
+) -> tuple[float, float]:
+    """Return the times of the first and the last keyframe of an animation.
+
+    `read` returns the values of an accessor.
 
     Raises
     ------
     ValueError
-        If times do not ascend.
+        If keyframe times are not increasing.
     """
     times = [read(sampler["input"])[:, 0].astype(np.float64) for sampler in animation["samplers"]]
     if any((np.diff(t) <= 0).any() or not np.isfinite(t).all() for t in times):
@@ -58,19 +63,21 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
 def sample_channels(
     animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
 ) -> AnimatedNodes:
-    """Return the values of animated nodes at times (t,), where `read` returns accessors' numbers.
+    """Return the values of animated nodes at given times.
+
+    `at_s` has shape (t,), and `read` returns the values of an accessor.
 
     Raises
     ------
     ValueError
-        If keys have a wrong number of values.
+        If a keyframe has a wrong number of values.
     """
     channels: AnimatedNodes = {}
     for channel in animation["channels"]:
         target = channel["target"]
         sampler = animation["samplers"][channel["sampler"]]
         if "node" not in target or target["path"] not in (*WIDTHS, "weights"):
-            continue  # targets of extensions do not reflect light
+            continue  # targets defined by extensions do not affect triangles
         keys = read(sampler["input"])[:, 0].astype(np.float64)
         kind = sampler.get("interpolation", "LINEAR")
         path = target["path"]
@@ -81,14 +88,18 @@ def sample_channels(
                 f"keyframes of a {path} must have {WIDTHS[path]} numbers, but have "
                 f"{values.shape[2]}"
             )
-        channels[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
+        channels[target["node"], path] = _interpolate(keys, values, at_s, kind, path == "rotation")
     return channels
 
 
-def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool) -> Floats:
-    """Return values (t, w) at times (t,), between values (k, 1 or 3, w) at key times (k,).
+def _interpolate(
+    keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool
+) -> Floats:
+    """Interpolate keyframe values at given times.
 
-    A spline has three values at each key: tangent in, value, tangent out.
+    Times have shape (t,), keyframe times have shape (k,), and the result has shape (t, w). Keyframe
+    values have shape (k, 1, w), or (k, 3, w) for splines, which have an in-tangent, a value and an
+    out-tangent for each keyframe.
     """
     start = np.searchsorted(keys, at_s, "right") - 1
     start = start.clip(0, max(len(keys) - 2, 0))
@@ -117,7 +128,10 @@ def _sampled(keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotation
 
 
 def _slerp(u: Floats, start: Floats, stop: Floats) -> Floats:
-    """Return quaternions (t, 4) at shares (t, 1) of the shorter rotation (Shoemake, 1985)."""
+    """Interpolate along the shorter rotation between quaternions (Shoemake, 1985).
+
+    Fractions have shape (t, 1), and quaternions have shape (t, 4).
+    """
     start, stop = (q / norm(q)[:, None] for q in (start, stop))
     stop = np.where((start * stop).sum(axis=1, keepdims=True) < 0, -stop, stop)
     angle = 2 * arctan2(norm(stop - start), norm(stop + start))[:, None]

@@ -1,4 +1,4 @@
-"""Meshes that glTF files pack with Draco, unpacked by DracoPy."""
+"""Decompression of Draco meshes in glTF files with DracoPy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from .scene_graph import MeshFileError
 DRACO = "KHR_draco_mesh_compression"
 
 
-def unpacked(data: bytes, allowance: Allowance) -> Any:
-    """Return a mesh that is packed with Draco."""
+def decompress_draco(data: bytes, allowance: Allowance) -> Any:
+    """Decompress a Draco mesh."""
     try:
         import DracoPy
     except ImportError as error:
@@ -25,9 +25,9 @@ def unpacked(data: bytes, allowance: Allowance) -> Any:
 
 
 def _draco_counts(data: bytes) -> tuple[int, int]:
-    """Return the numbers of faces and vertices that a Draco mesh of format 2.2 announces.
+    """Return the numbers of faces and vertices that the header of a Draco 2.2 mesh declares.
 
-    The decoder allocates as many, though a few bytes can announce any number.
+    The decoder allocates memory for these numbers, although a small file can declare any number.
     """
     magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
     if magic != b"DRACO" or kind != 1 or method > 1:
@@ -37,11 +37,12 @@ def _draco_counts(data: bytes) -> tuple[int, int]:
             "has Draco data with metadata or with a version other than 2.2, which is not "
             "supported. Export it again"
         )
-    # Numbers of seven bits a byte, lowest first; the second method has a byte more before these.
+    # The numbers are stored with seven bits per byte, least significant byte first. The second
+    # encoding method has an additional byte before them.
     first, second = re.findall(rb"(?s)[\x80-\xff]*[\0-\x7f]", data[11 + method : 31])[:2]
     return _varint(first), _varint(second)
 
 
 def _varint(data: bytes) -> int:
-    """Return a number stored as seven bits a byte, lowest first."""
+    """Decode an integer that is stored with seven bits per byte, least significant byte first."""
     return sum((byte & 0x7F) << 7 * position for position, byte in enumerate(data))

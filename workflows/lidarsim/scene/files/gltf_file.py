@@ -1,4 +1,4 @@
-"""Content of a glTF 2.0 file by its indices: parts, accessors, buffers and images."""
+"""Access to the parts, accessors, buffers and images of a glTF 2.0 file."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from ...io.allowance import Allowance
 from ...io.input_files import read_input
 from ...numerics.arrays import AnyArray
 from ...words import listed, printable
-from .companions import image_file, named_file
+from .companions import find_named_file, image_file
 from .gltf_draco import DRACO
 from .scene_graph import MeshFileError, ReadOptions
 
 INSTANCING = "EXT_mesh_gpu_instancing"
-VISIBILITY = "KHR_node_visibility"  # extension for a node, and for all nodes below
+VISIBILITY = "KHR_node_visibility"  # applies to a node and its descendants
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
     r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization|"
     rf"({DRACO}|{INSTANCING}|{VISIBILITY})$"
 )
-# Extensions that change neither shapes nor colors, and are not worth a note.
+# Extensions that affect neither shapes nor colors, so that users need not know about them.
 _WITHOUT_SHAPE = re.compile(
     r"(KHR_xmp(_json_ld)?|KHR_node_(selectability|hoverability)|KHR_audio_emitter|EXT_lights_\w+|"
     r"EXT_(structural_metadata|mesh_features|instance_features)|CESIUM_primitive_outline)$"
@@ -41,8 +41,8 @@ _OLD = "is glTF 1.0, which is not supported. Convert it to glTF 2.0"
 V = TypeVar("V")
 
 
-def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON object, and the binary buffer of a .glb."""
+def split_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the JSON object of a file, and the binary buffer of a .glb file."""
     body = b""
     if data[:4] == b"glTF" and len(data) >= 20:
         version, total, size = struct.unpack_from("<III", data, 4)
@@ -51,7 +51,7 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         if len(data) < total:
             raise MeshFileError(f"is truncated: it declares {total} bytes, but has {len(data)}")
         body = data[28 + size : total]
-        data = data[20 : 20 + size].rstrip(b"\0")  # some programs pad it with these
+        data = data[20 : 20 + size].rstrip(b"\0")  # some programs pad the chunk with zeros
     elif data[:1] not in b"{[ \t\r\n":
         raise MeshFileError("is not glTF")
     try:
@@ -64,11 +64,8 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def check_readable(header: dict[str, Any]) -> None:
-    """Check that a file is glTF 2.0 and requires no unknown extension.
-
-    Raises MeshFileError if not.
-    """
-    # Version 1.0 names parts, instead of numbering them.
+    """Raise MeshFileError if a file is not glTF 2.0 or requires an unsupported extension."""
+    # In version 1.0, parts have names instead of indices.
     if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
         header.get("nodes"), dict
     ):
@@ -82,7 +79,7 @@ def check_readable(header: dict[str, Any]) -> None:
 
 
 def extension_notes(header: dict[str, Any]) -> list[str]:
-    """Return a note on the extensions that a file uses and does not require, if any is unknown."""
+    """Return a note about unsupported extensions that a file uses but does not require."""
     names = dict.fromkeys(printable(str(name))[:60] for name in header.get("extensionsUsed", ()))
     unknown = [name for name in names if not (_READ.match(name) or _WITHOUT_SHAPE.match(name))]
     return (
@@ -93,7 +90,7 @@ def extension_notes(header: dict[str, Any]) -> list[str]:
 
 
 def root_nodes(header: dict[str, Any]) -> list[int]:
-    """Return the indices of the outermost nodes."""
+    """Return the indices of the root nodes of the default scene, or of the file without scenes."""
     nodes = header.get("nodes", ())
     if scenes := header.get("scenes"):
         return list(scenes[header.get("scene", 0)].get("nodes", ()))
@@ -102,7 +99,7 @@ def root_nodes(header: dict[str, Any]) -> list[int]:
 
 
 class GltfFile:
-    """Parts, numbers, buffers and images of a file by their indices, each of them read once."""
+    """A glTF file, whose accessors and buffers are read on demand and cached."""
 
     def __init__(
         self,
@@ -122,9 +119,12 @@ class GltfFile:
         self._buffer = cache(self._read_buffer)
 
     def part(self, kind: str, index: Any) -> dict[str, Any]:
-        """Return a part of the file by its index.
+        """Return an element of a top-level array in the file.
 
-        Raises ValueError without such a part.
+        Raises
+        ------
+        ValueError
+            If the index is out of range.
         """
         entries: list[dict[str, Any]] = self.header.get(kind, [])
         number = natural(index)
@@ -135,7 +135,10 @@ class GltfFile:
         return entries[number]
 
     def _read_accessor(self, index: int) -> AnyArray:
-        """Return the numbers (count, width) of an accessor, if possible without a copy."""
+        """Return the values of an accessor, without copying them if possible.
+
+        The shape is (count, width).
+        """
         accessor = self.part("accessors", index)
         count = natural(accessor["count"])
         if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
@@ -164,14 +167,17 @@ class GltfFile:
         return self.normalized(numbers) if accessor.get("normalized") else numbers
 
     def normalized(self, numbers: AnyArray) -> AnyArray:
-        """Return the fractions that integers encode, by glTF 2.0, 3.6.2.2."""
+        """Convert normalized integers to floating-point values (glTF 2.0, section 3.6.2.2)."""
         if numbers.dtype.kind not in "iu":
             return numbers
         self.allowance.take(8 * numbers.size)
         return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
     def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
-        """Return numbers (count, width) of a buffer view, from `part['byteOffset']` on."""
+        """Return values in a buffer view, starting at `part['byteOffset']`.
+
+        The shape is (count, width).
+        """
         row = kind.itemsize * width
         stride = self.part("bufferViews", part["bufferView"]).get("byteStride", row)
         view = self.view(part["bufferView"])[part.get("byteOffset", 0) :]
@@ -190,7 +196,7 @@ class GltfFile:
         return memoryview(self._buffer(view["buffer"]))[start : start + view["byteLength"]]
 
     def _read_buffer(self, index: int) -> bytes:
-        """Return the bytes of a buffer, of the file itself, a data URI or a further file."""
+        """Return the bytes of a buffer, which is in the file itself, a data URI or another file."""
         buffer = self.part("buffers", index)
         uri = buffer.get("uri")
         if uri is None:
@@ -201,7 +207,7 @@ class GltfFile:
                 )
             content = self._body
         elif uri.startswith("data:"):
-            content = _inline(uri)
+            content = _decode_data_uri(uri)
         else:
             content = self._buffer_file(uri)
         if len(content) < buffer["byteLength"]:
@@ -212,8 +218,7 @@ class GltfFile:
         return content
 
     def _read_buffer_file(self, uri: str) -> bytes:
-        """Return the bytes of a buffer file."""
-        target = named_file(self.path, uri, self._options, allow_moved=False)
+        target = find_named_file(self.path, uri, self._options, allow_moved=False)
         if target is None:
             raise MeshFileError(
                 f"takes data from {uri[:80]!r}, which does not exist. Copy this file to the "
@@ -223,33 +228,36 @@ class GltfFile:
         return read_input(target)
 
     def image(self, index: int, read: Callable[[Path | bytes, Allowance], V]) -> V:
-        """Return an image, decoded by `read`."""
+        """Read an image with the given function."""
         image = self.part("images", index)
         if "bufferView" in image:
             return read(bytes(self.view(image["bufferView"])), self.allowance)
         uri = image["uri"]
         if uri.startswith("data:"):
-            return read(_inline(uri), self.allowance)
+            return read(_decode_data_uri(uri), self.allowance)
         return read(image_file(self.path, uri, self._options, self.allowance), self.allowance)
 
 
-def _inline(uri: str) -> bytes:
-    """Return the content of a data URI."""
+def _decode_data_uri(uri: str) -> bytes:
+    """Decode a data URI."""
     kind, _, text = uri.partition(",")
     content = unquote_to_bytes(text)
     return base64.b64decode(content) if kind.endswith(";base64") else content
 
 
 def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the data of an extension of a part, or {}."""
+    """Return the data of an extension of a part, or an empty dictionary."""
     content: dict[str, Any] = part.get("extensions", {}).get(name, {})
     return content
 
 
 def natural(number: Any) -> int:
-    """Return a count or an index.
+    """Validate a count or an index.
 
-    Raises ValueError for a negative number or no integer.
+    Raises
+    ------
+    ValueError
+        If it is negative or not an integer.
     """
     if type(number) is not int or number < 0:
         raise ValueError(f"an index or a count must be a non-negative integer, but is {number!r}")

@@ -1,4 +1,4 @@
-"""Materials of glTF 2.0 files: base colors, and masks of where they are transparent."""
+"""Materials of glTF 2.0 files, with base colors and opacity masks."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..masks import (
     MaskNotes,
     Texture,
     Wrap,
+    cache_with_errors,
     read_colors,
     read_opacity,
-    remembered,
 )
 from .gltf_draco import DRACO
 from .gltf_file import GltfFile, extension, natural
@@ -29,13 +29,13 @@ from .polygons import check_corners
 from .scene_graph import Piece, ReadOptions
 
 _TRANSMISSION = "KHR_materials_transmission"
-_GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
-_CUT = ("MASK", "BLEND")  # modes of materials that are transparent somewhere
+_GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # used by older files
+_CUT = ("MASK", "BLEND")  # alpha modes with transparent areas
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
 class GltfMaterials:
-    """Masks, base colors and names of the materials of a file, with each texture made once."""
+    """Masks, base colors and names of the materials of a file, with each texture created once."""
 
     def __init__(self, file: GltfFile, options: ReadOptions) -> None:
         self._file = file
@@ -43,27 +43,29 @@ class GltfMaterials:
         self.options = options
         self.notes = MaskNotes()
         self._texture = cache(self._read_texture)
-        self._opacity = remembered(self._read_opacity)
-        self._mask = remembered(self._read_mask)
-        self._base = remembered(self._read_base)
-        self._tinted = remembered(self._read_tinted)
+        self._opacity = cache_with_errors(self._read_opacity)
+        self._mask = cache_with_errors(self._read_mask)
+        self._base = cache_with_errors(self._read_base)
+        self._tinted = cache_with_errors(self._read_tinted)
 
     @property
     def have_masks(self) -> bool:
-        """True if a material is transparent somewhere."""
+        """Whether any material has transparent areas."""
         return any(m.get("alphaMode") in _CUT for m in self._file.header.get("materials", ()))
 
     def with_material(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with mask, colors and material, for `mesh`, unpacked by Draco."""
+        """Return a piece with the mask, colors and material name of its primitive.
+
+        `mesh` is the decompressed mesh if the primitive is compressed with Draco.
+        """
         if self.options.materials and (number := primitive.get("material")) is not None:
             piece = piece._replace(material=self._material_name(number))
         if self.options.colors and len(piece.faces):
-            with self.notes.without_color(self._material_name(primitive.get("material"))):
+            with self.notes.record_color_error(self._material_name(primitive.get("material"))):
                 piece = piece._replace(colors=self._face_colors(primitive, piece.faces, mesh))
         return self._with_mask(piece, primitive, mesh)
 
     def _face_colors(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colors | None:
-        """Return the colors of a primitive's triangles, or None."""
         number = primitive.get("material")
         corners = None
         colors = None
@@ -75,7 +77,7 @@ class GltfMaterials:
             if light.shape[1] < 3:
                 raise MaskError("its COLOR_0 is not red, green and blue")
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
-            colors = Colors.of_corners(corners)
+            colors = Colors.from_vertex_colors(corners)
         if number is not None:
             base, info = self._base(natural(number))
             if isinstance(base, Texture):
@@ -85,9 +87,9 @@ class GltfMaterials:
         return colors and replace(colors, corners=corners)
 
     def _read_base(self, number: int) -> tuple[Texture | Bytes, dict[str, Any]]:
-        """Return the texture of a material's base color and its texture info.
+        """Return the base color texture of a material and its texture info.
 
-        The base color of a material without a texture is a plain color (1, 1, 3).
+        If the material has no texture, return its plain color with shape (1, 1, 3).
         """
         material = self._file.part("materials", number)
         info, factor = _base_of(material)
@@ -100,7 +102,10 @@ class GltfMaterials:
         return self._tinted((_image_of(texture), light, *self._wraps(texture))), info
 
     def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
-        """Return the texture of a tinted image, by keys (image, linear tint, wraps)."""
+        """Return the texture of a tinted image.
+
+        Keys are (image, linear tint, wrap along u, wrap along v).
+        """
         image, light, wrap_u, wrap_v = key
         colors = self._file.image(image, partial(read_colors, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
@@ -109,16 +114,15 @@ class GltfMaterials:
         return Texture(colors, (wrap_u, wrap_v), self._allowance)
 
     def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
-        """Return the continuation of a texture beyond its edges, along u and along v."""
+        """Return how a texture continues beyond its edges along u and along v."""
         sampler = self._file.part("samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap_u, wrap_v = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
         return wrap_u, wrap_v
 
     def _with_mask(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
-        """Return a piece with the mask of its material."""
         number = primitive.get("material")
         if number is not None and self.options.masks and len(piece.faces):
-            with self.notes.without_mask(self._material_name(number)):
+            with self.notes.record_mask_error(self._material_name(number)):
                 if mask := self._texture(number):
                     texture, info = mask
                     uv = self._coordinates(info, primitive, mesh)
@@ -126,7 +130,7 @@ class GltfMaterials:
         return piece
 
     def _material_name(self, number: Any) -> str:
-        """Return the name of a material, or "material 3" for a material without a name."""
+        """Return the name of a material, or a name such as "material 3" if it has none."""
         try:
             name = str(self._file.part("materials", number).get("name") or "")
         except (ValueError, KeyError, IndexError, TypeError, AttributeError):
@@ -134,7 +138,7 @@ class GltfMaterials:
         return name[:80] or f"material {str(number)[:20]}"
 
     def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
-        """Return the mask of a material and its texture info, or None for a solid material."""
+        """Return the mask of a material and its texture info, or None if the material is opaque."""
         material = self._file.part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in _CUT:
@@ -157,18 +161,23 @@ class GltfMaterials:
         return self._mask((image, min_alpha, *self._wraps(texture))), info
 
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
-        """Return the mask of an image, by keys (image, least alpha that stops light, wraps)."""
+        """Return the mask of an image.
+
+        Keys are (image, minimum alpha that blocks light, wrap along u, wrap along v).
+        """
         image, min_alpha, wrap_u, wrap_v = key
         opacity = self._opacity(image)
         assert opacity is not None
         return Texture(opacity >= min_alpha, (wrap_u, wrap_v), self._allowance)
 
     def _read_opacity(self, index: int) -> Bytes | None:
-        """Return the opacity of an image, or None for an opaque image."""
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Return the texture coordinates (v, 2) of a primitive for a texture info."""
+        """Return the texture coordinates of a primitive for a texture info.
+
+        The shape is (v, 2).
+        """
         transform = extension(info, "KHR_texture_transform")
         name = f"TEXCOORD_{transform.get('texCoord', info.get('texCoord', 0))}"
         if name not in primitive["attributes"]:
@@ -177,7 +186,8 @@ class GltfMaterials:
         if uv.shape[1] != 2:
             raise MaskError("its texture coordinates are not pairs")
         if transform:
-            # KHR_texture_transform scales, rotates anticlockwise as v grows down, then moves.
+            # KHR_texture_transform scales, rotates counterclockwise with v pointing down, and
+            # then translates.
             angle = float(transform.get("rotation", 0))
             s, c = sin_cos_of(angle)
             self._allowance.take(32 * len(uv))
@@ -186,7 +196,10 @@ class GltfMaterials:
         return uv
 
     def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
-        """Return an attribute (v, width) of the vertices of a primitive."""
+        """Return a vertex attribute of a primitive.
+
+        The shape is (v, width).
+        """
         accessor = primitive["attributes"][name]
         if mesh is None:
             return self._file.accessor(accessor)
@@ -197,7 +210,7 @@ class GltfMaterials:
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
-    """Return the texture info of a material's base color, or None, and the color's factors."""
+    """Return the texture info of the base color of a material, or None, and the color factors."""
     usual = material.get("pbrMetallicRoughness", {})
     glossy = extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
@@ -205,7 +218,7 @@ def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[
 
 
 def _image_of(texture: dict[str, Any]) -> int:
-    """Return the index of a texture's image in a format that can be read."""
+    """Return the index of the image of a texture, or raise MaskError for an unsupported format."""
     index = texture.get("source", extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")

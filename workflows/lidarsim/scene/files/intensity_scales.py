@@ -1,4 +1,7 @@
-"""Scales of intensities in cloud files: Leica's signed scale, and limits that scans state."""
+"""Conversion of intensities in point cloud files to a common scale.
+
+Scales are either Leica's signed scale or defined by the intensity limits in the file.
+"""
 
 from __future__ import annotations
 
@@ -9,39 +12,45 @@ import numpy as np
 
 from ...numerics.arrays import AnyArray
 
-LEICA_LOWEST = -2048  # Leica's scale ends at 2047
+LEICA_LOWEST = -2048
 _LEICA_HIGHEST = 2047
-_MIN_LEICA_SPAN = 256  # decibels, which are negative as well, span less
+_MIN_LEICA_SPAN = 256  # intensities in decibels are also negative, but their range is smaller
 _PLAIN_STEPS = {1.0, *(2.0**n for n in range(1, 32)), *(float(f"1e{n}") for n in range(1, 9))}
-_OTHER_SCALE = 16  # ratio of limits that measurements of the same scale do not reach
+_OTHER_SCALE = 16  # measured limits on the same scale differ by a smaller factor
 
 
 class Limits(NamedTuple):
-    """Lowest and highest intensity of a scan."""
+    """The lowest and highest intensity of a scan."""
 
     low: float
     high: float
 
     def is_plain(self) -> bool:
-        """Return True for the limits of a scale, such as 0 to 1, 100, 255 or 4096."""
+        """Return whether the limits are those of a typical scale, such as 0 to 1, 100 or 255."""
         steps = {self.high, self.high + 1}
         return self.low == 0 and not steps.isdisjoint(_PLAIN_STEPS)
 
     def apply(self, intensities: AnyArray) -> AnyArray:
-        """Return intensities (n,) as shares of the limits, at least 0."""
+        """Normalize intensities so that the limits become 0 and 1.
+
+        Negative results are clipped to 0.
+        """
         return np.maximum((intensities - self.low) / (self.high - self.low), 0.0)
 
 
-def scales_of(limits: Sequence[Limits]) -> Sequence[Limits] | None:
-    """Return the limits by which the intensities of scans are brought to the same scale.
+def common_limits(limits: Sequence[Limits]) -> Sequence[Limits] | None:
+    """Return the limits that bring the intensities of all scans to the same scale.
 
-    Many programs write the lowest and highest intensity that a scan happens to have as its limits,
-    although all scans have the same scale. Different limits are therefore different scales only if
-    they differ by a factor of 16, or if all of them are plain limits such as 0 to 255.
+    Many programs write the lowest and highest measured intensity of each scan as its limits,
+    although all scans have the same scale. Different limits are therefore only interpreted as
+    different scales if they differ by a factor of 16, or if all of them are plain limits, such as 0
+    to 255, or start at the lowest value of Leica's scale.
 
     Returns
     -------
-    None if the intensities have the same scale already, and it begins at 0.
+    Sequence[Limits] or None
+        The limits of each scan, or None if all intensities already have the same scale and start at
+        0.
     """
     if not limits:
         return None
@@ -56,10 +65,11 @@ def scales_of(limits: Sequence[Limits]) -> Sequence[Limits] | None:
 
 
 def from_zero(intensities: AnyArray) -> tuple[AnyArray, str]:
-    """Return intensities (n,) that begin at zero, and a clause on them if their scale is unknown.
+    """Shift negative intensities so that they start at zero.
 
-    Negative intensities that fit Leica's scale, -2048 to 2047, are shifted by 2048, others so that
-    the lowest becomes 0.
+    Negative intensities on Leica's scale (-2048 to 2047) are shifted by 2048. On other scales, the
+    lowest intensity becomes 0. In this case, the second value is a note for the user. Otherwise, it
+    is an empty string.
     """
     finite = intensities[np.isfinite(intensities)]
     low = float(finite.min(initial=0))

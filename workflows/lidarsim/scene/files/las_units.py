@@ -1,7 +1,8 @@
-"""Units of coordinates, by the coordinate system that a file states: WKT or GeoTIFF keys.
+"""Coordinate units according to the coordinate system of a file, which is WKT or GeoTIFF keys.
 
-OGC WKT 1 and 2 state each unit with its length. GeoTIFF keys name units, or a coordinate system,
-by EPSG codes; the units of a coordinate system are in PROJ's database, which rasterio has.
+OGC WKT 1 and 2 state the length of each unit. GeoTIFF keys refer to units or coordinate systems by
+EPSG codes. The units of a coordinate system are looked up in the PROJ database, which is part of
+rasterio.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from typing import NamedTuple
 from ...environment.extras import install_command
 from ...errors import CutShortError, LidarError
 from ...schema.vocabulary import UNITS_M
-from .coordinate_systems import UTM_EPSG, crs_of_code, has_registry
+from .coordinate_systems import UTM_EPSG, crs_from_code, has_registry
 
-# Records of LASF_Projection, by ASPRS LAS 1.4, and tags of TIFF.
+# Record numbers of LASF_Projection in ASPRS LAS 1.4, which are also TIFF tags
 GEO_KEYS = 34735
 GEO_DOUBLES = 34736
 GEO_TEXTS = 34737
 
-# GeoTIFF keys, by OGC GeoTIFF 1.1.
+# Keys defined by OGC GeoTIFF 1.1
 _MODEL_TYPE = 1024
 _GEODETIC_CRS = 2048
 PROJECTED_CRS = 3072
@@ -31,7 +32,7 @@ _LINEAR_UNIT = 3076
 _LINEAR_UNIT_SIZE = 3077
 _VERTICAL_CRS = 4096
 _VERTICAL_UNIT = 4099
-# models
+# Model types
 _GEOGRAPHIC = 2
 _GEOCENTRIC = 3
 USER_DEFINED = 32767
@@ -50,7 +51,8 @@ _EPSG_UNITS = {  # {EPSG code: (name, meters)}
     9094: ("Gold Coast foot", 0.3047997101815088),
     9096: ("yard", 0.9144),
 }
-# Names of methods by their numbers in GeoTIFF 1.0, of those that the registry of names knows.
+# Names of projection methods by their numbers in GeoTIFF 1.0, limited to those that
+# `projection_kind` recognizes.
 _METHODS = {
     1: "Transverse Mercator",
     3: "Oblique Mercator",
@@ -61,7 +63,7 @@ _METHODS = {
     16: "Oblique Stereographic",
     18: "Cassini",
 }
-_UNIT_NAMES = {  # names as files spell them, lower case, with spaces for "_" and "-"
+_UNIT_NAMES = {  # as spelled in files, but in lower case and with spaces instead of "_" and "-"
     **UNITS_M,
     **dict.fromkeys(("metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("millimetre", "millimeter", "millimetres", "millimeters"), 1e-3),
@@ -77,16 +79,19 @@ _UNIT_NAMES = {  # names as files spell them, lower case, with spaces for "_" an
     **dict.fromkeys(("yard", "yards"), 0.9144),
     **dict.fromkeys(("mile", "miles"), 1609.344),
 }
-_DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
-# Commands and functions that read a cloud have unit; compare has two clouds.
+_DATUMS = range(5001, 5300)  # GeoTIFF 1.0 uses datums, which have no unit, as vertical systems
+# All commands and functions that read clouds have a unit option, but compare reads two clouds.
 _OVERRIDE = (
     "Specify the unit with --unit, or with --unit-a and --unit-b for compare (unit=, unit_a= and "
     "unit_b= in Python)"
 )
 
 
-def advice_to_project(epsg: int | None) -> str:
-    """Return a sentence on how to transform a cloud to a system in meters: a code, or any."""
+def reprojection_advice(epsg: int | None) -> str:
+    """Return a sentence that explains how to transform a cloud to a system in meters.
+
+    `epsg` is the code of the suggested system, or None.
+    """
     code = epsg or "CODE"
     return (
         f"Use lidarpool scene points --epsg {code} (epsg= in Python), or project it first (pdal "
@@ -95,7 +100,7 @@ def advice_to_project(epsg: int | None) -> str:
 
 
 class CoordinateUnit(NamedTuple):
-    """A unit of length."""
+    """A length unit."""
 
     name: str
     meters: float
@@ -105,14 +110,17 @@ METRE = CoordinateUnit("metre", 1.0)
 
 
 def unit_by_name(name: str) -> float | None:
-    """Return the meters in a unit of length by its name, in any case, or None if it is unknown."""
+    """Return the length of a unit in meters by its name, or None if the unit is unknown.
+
+    The case of the name is ignored.
+    """
     words = re.sub(r"[\s_-]+", " ", name.replace(".", "")).strip().lower()
     return _UNIT_NAMES.get(words)
 
 
 @dataclass(frozen=True)
 class CoordinateUnits:
-    """Units of the coordinates of a file: of x and y, and of z."""
+    """Horizontal and vertical length units of the coordinates in a file."""
 
     horizontal: CoordinateUnit
     vertical: CoordinateUnit
@@ -120,7 +128,7 @@ class CoordinateUnits:
 
     @property
     def factors(self) -> tuple[float, float, float]:
-        """Meters in the units of x, y and z."""
+        """Lengths of the units of x, y and z in meters."""
         return self.horizontal.meters, self.horizontal.meters, self.vertical.meters
 
     @property
@@ -129,7 +137,7 @@ class CoordinateUnits:
         return self.factors == (1.0, 1.0, 1.0)
 
     def note(self) -> str:
-        """Return a clause on the conversion to meters, empty for meters."""
+        """Return a note about the conversion to meters, or an empty string if none is needed."""
         if self.metric:
             return ""
         if not self.vertical_stated:
@@ -165,20 +173,20 @@ _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
 _BOUND = {"BOUNDCRS"}
-WKT_KEYWORDS = _HORIZONTAL | _ANGULAR | _COMPOUND | _BOUND  # that a system begins with
+WKT_KEYWORDS = _HORIZONTAL | _ANGULAR | _COMPOUND | _BOUND  # possible keywords of the root node
 _LENGTH_UNITS = ("UNIT", "LENGTHUNIT")
 
 
 @dataclass
 class _Node:
-    """A keyword of WKT with its texts and numbers, and the nodes within."""
+    """A WKT node, which consists of a keyword, values and child nodes."""
 
     keyword: str
     values: list[str] = field(default_factory=list)
     nodes: list[_Node] = field(default_factory=list)
 
     def child(self, keywords: set[str]) -> _Node | None:
-        """Return the first child node with a keyword of a set, or None."""
+        """Return the first child node with one of the keywords, or None."""
         return next((node for node in self.nodes if node.keyword in keywords), None)
 
 
@@ -188,11 +196,11 @@ def wkt_units(text: str) -> CoordinateUnits:
     Raises
     ------
     LidarError
-        If coordinates are angles, or have a unit that cannot be known.
+        If coordinates are angles or geocentric, or if their unit cannot be determined.
     ValueError
-        If the text is no WKT.
+        If the text is not valid WKT.
     """
-    node, parts = _systems(text)
+    node, parts = _parse_systems(text)
     horizontal = next((part for part in parts if part.keyword in _HORIZONTAL), None)
     vertical = next((part for part in parts if part.keyword in _VERTICAL), None)
     name = node.values[0] if node.values else node.keyword
@@ -200,7 +208,7 @@ def wkt_units(text: str) -> CoordinateUnits:
         if angular := next((part for part in parts if part.keyword in _ANGULAR), None):
             kind = "geocentric" if _is_geocentric(angular) else "angles"
             raise LidarError(
-                f"its coordinates are {kind} ({name[:80]}). {advice_to_project(None)}."
+                f"its coordinates are {kind} ({name[:80]}). {reprojection_advice(None)}."
             )
         raise ValueError(
             f"its coordinate system begins with {node.keyword[:20]!r}, but the WKT of a projected "
@@ -216,8 +224,8 @@ def wkt_units(text: str) -> CoordinateUnits:
 
 
 def wkt_method(text: str) -> str:
-    """Return the name of the projection's method in WKT, empty without a projection."""
-    _, parts = _systems(text)
+    """Return the name of the projection method in WKT, or an empty string if there is none."""
+    _, parts = _parse_systems(text)
     for part in parts:
         if part.keyword in _HORIZONTAL:
             conversion = part.child({"CONVERSION"}) or part
@@ -228,7 +236,7 @@ def wkt_method(text: str) -> str:
 
 def wkt_code(text: str) -> int | None:
     """Return the EPSG code of the projected system in WKT, or None."""
-    _, parts = _systems(text)
+    _, parts = _parse_systems(text)
     for part in parts:
         code = part.child({"AUTHORITY", "ID"}) if part.keyword in _HORIZONTAL else None
         if code and len(code.values) > 1 and code.values[0].upper() == "EPSG":
@@ -236,30 +244,32 @@ def wkt_code(text: str) -> int | None:
     return None
 
 
-def _systems(text: str) -> tuple[_Node, list[_Node]]:
-    """Return the system in WKT, and its parts: horizontal and vertical, or the system alone."""
-    node = _without_transformation(_parsed(text))
+def _parse_systems(text: str) -> tuple[_Node, list[_Node]]:
+    """Return the coordinate system in WKT, and its components.
+
+    A system that is not compound is its only component.
+    """
+    node = _without_transformation(_parse_wkt(text))
     if node.keyword not in _COMPOUND:
         return node, [node]
     return node, [_without_transformation(part) for part in node.nodes]
 
 
 def _without_transformation(node: _Node) -> _Node:
-    """Return the system within a bound one: a system, and its transformation to another one."""
+    """Return the source system of a bound system, or the system itself if it is not bound."""
     source = node.child({"SOURCECRS"}) if node.keyword in _BOUND else None
     return source.nodes[0] if source and source.nodes else node
 
 
 def _is_geocentric(system: _Node) -> bool:
-    """Return True if a geodetic system has its origin in the middle of the Earth."""
     axes = system.child({"CS"})
     return system.keyword == "GEOCCS" or (
         axes is not None and any(node.keyword == "CARTESIAN" for node in axes.nodes)
     )
 
 
-def _parsed(text: str) -> _Node:
-    """Return the outermost node of a text in WKT."""
+def _parse_wkt(text: str) -> _Node:
+    """Parse WKT and return the root node."""
     root = _Node("")
     open_nodes = [root]
     for match in _TOKENS.finditer(text):
@@ -285,29 +295,25 @@ def _parsed(text: str) -> _Node:
 
 
 def _length_unit(system: _Node) -> CoordinateUnit | None:
-    """Return the unit of a system's first axis: of the system, or of the axis itself in WKT 2."""
+    """Return the unit of the first axis of a system, which WKT 2 can state for each axis."""
     for node in (system, *system.nodes):
         if node is system or node.keyword == "AXIS":
             unit = node.child({*_LENGTH_UNITS})
             if unit is not None:
-                return _unit_of(unit)
+                return _parse_unit(unit)
     return None
 
 
 def _third_unit(system: _Node) -> CoordinateUnit | None:
-    """Return the unit of the third axis of a projected system in three dimensions, if any."""
+    """Return the unit of the third axis of a three-dimensional projected system, or None."""
     axes = [node for node in system.nodes if node.keyword == "AXIS"]
     if len(axes) < 3:
         return None
     unit = axes[2].child({*_LENGTH_UNITS})
-    return _length_unit(system) if unit is None else _unit_of(unit)
+    return _length_unit(system) if unit is None else _parse_unit(unit)
 
 
-def _unit_of(node: _Node) -> CoordinateUnit:
-    """Return the unit of length of a node.
-
-    Raises LidarError without a length in meters.
-    """
+def _parse_unit(node: _Node) -> CoordinateUnit:
     name, *factors = node.values
     meters = float(factors[0]) if factors else 0.0
     if not 1e-6 <= meters <= 1e6:
@@ -319,7 +325,10 @@ def _unit_of(node: _Node) -> CoordinateUnit:
 
 
 def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
-    """Return the numbers of the GeoTIFF keys of a file, without keys of texts."""
+    """Return the numeric GeoTIFF keys of a file.
+
+    Keys with text values are omitted.
+    """
     data = records.get(GEO_KEYS, b"")
     if len(data) < 8:
         return {}
@@ -331,7 +340,7 @@ def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
 
 
 def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, float]]:
-    """Yield the GeoTIFF keys that have numbers, and the numbers."""
+    """Yield the numeric GeoTIFF keys and their values."""
     for number in range(count):
         key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
         if location == 0:
@@ -341,7 +350,13 @@ def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, 
 
 
 def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
-    """Return the units that GeoTIFF keys state, or None without a projection."""
+    """Return the units that GeoTIFF keys specify, or None if there is no projection.
+
+    Raises
+    ------
+    LidarError
+        If coordinates are angles or geocentric, or if their unit cannot be determined.
+    """
     model = keys.get(_MODEL_TYPE)
     projected = int(keys.get(PROJECTED_CRS, 0))
     if model in (_GEOGRAPHIC, _GEOCENTRIC) or (
@@ -349,7 +364,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
         kind = "geocentric" if model == _GEOCENTRIC else "angles"
-        raise LidarError(f"its coordinates are {kind} (EPSG:{code}). {advice_to_project(None)}.")
+        raise LidarError(f"its coordinates are {kind} (EPSG:{code}). {reprojection_advice(None)}.")
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
     if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
@@ -360,7 +375,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
         heights = system.vertical if system.vertical_stated else None
     if unit is None:
         if not projected:
-            return None  # keys that say nothing of a projection
+            return None  # the keys do not describe a projection
         raise LidarError(f"it uses a custom coordinate system without a unit. {_OVERRIDE}.")
     heights = height_unit_of_keys(keys) or heights
     if heights is None:
@@ -369,7 +384,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
 
 
 def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
-    """Return the unit of heights that GeoTIFF keys state, or None."""
+    """Return the height unit that GeoTIFF keys specify, or None."""
     vertical = int(keys.get(_VERTICAL_CRS, 0))
     if _VERTICAL_UNIT in keys:
         return _unit_of_code(keys[_VERTICAL_UNIT])
@@ -377,12 +392,15 @@ def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
 
 
 def method_of_keys(keys: Mapping[int, float]) -> str:
-    """Return the name of the projection's method by GeoTIFF keys, empty if it is unknown."""
+    """Return the name of the projection method in GeoTIFF keys.
+
+    The name is an empty string if the method is unknown.
+    """
     return _METHODS.get(int(keys.get(_PROJECTION, 0)), "")
 
 
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
-    """Return the unit of an EPSG code, or None without a code, or for a user-defined unit."""
+    """Return the unit with an EPSG code, or None if it is missing or user-defined."""
     if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:
@@ -391,28 +409,26 @@ def _unit_of_code(code: float | None) -> CoordinateUnit | None:
 
 
 def units_of_epsg(code: int) -> CoordinateUnits:
-    """Return the units of a projected or compound system of the EPSG registry."""
+    """Return the units of a projected or compound system in the EPSG registry."""
     if any(code in codes for codes in UTM_EPSG):
         return CoordinateUnits(METRE, METRE, vertical_stated=False)
     return wkt_units(_wkt_of_epsg(code))
 
 
 def _vertical_unit_of_epsg(code: int) -> CoordinateUnit | None:
-    """Return the unit of a vertical system of the EPSG registry."""
     if code in _DATUMS:
         return None
-    node = _parsed(_wkt_of_epsg(code))
+    node = _parse_wkt(_wkt_of_epsg(code))
     return _length_unit(node) if node.keyword in _VERTICAL else None
 
 
 def _wkt_of_epsg(code: int) -> str:
-    """Return a system of the EPSG registry as WKT."""
     if not has_registry():
         raise LidarError(
             f"its coordinate system EPSG:{code} has an unknown unit. {_OVERRIDE}. To look up the "
             f"unit instead, run {install_command('lidarpool[geo]')}."
         )
-    crs = crs_of_code(code)
+    crs = crs_from_code(code)
     if crs is None:
         raise LidarError(f"its coordinate system EPSG:{code} is unknown. {_OVERRIDE}.")
     return str(crs.to_wkt(version="WKT2_2019"))

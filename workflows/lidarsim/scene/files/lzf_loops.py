@@ -1,4 +1,4 @@
-"""Unpacking of LZF, by the format of Marc Lehmann's LibLZF."""
+"""LZF decompression, compatible with Marc Lehmann's LibLZF."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,11 +9,12 @@ from raybeam.compiled import compiled
 
 @compiled()
 def unpack_lzf(packed, unpacked):
-    """Unpack bytes into `unpacked`, and return the number of bytes written, -1 if damaged.
+    """Decompress data, and return the number of bytes written, or -1 if the data is corrupt.
 
-    A byte below 32 announces as many literal bytes, less one. Another byte begins a copy of earlier
-    bytes: its upper three bits are the length, with a further byte if all are set; the lower five
-    bits and the next byte are the distance, less one.
+    A control byte below 32 is the number of literal bytes that follow, minus one. Any other control
+    byte starts a copy of earlier output. Its upper three bits are the length minus two, to which an
+    additional byte is added if all three bits are set. Its lower five bits and the next byte are
+    the distance minus one.
     """
     read = 0
     written = 0
@@ -39,7 +40,7 @@ def unpack_lzf(packed, unpacked):
             length += 2
             if start < 0 or written + length > unpacked.size:
                 return -1
-            for k in range(length):  # the copy may overlap what it writes
+            for k in range(length):  # source and destination of the copy can overlap
                 unpacked[written + k] = unpacked[start + k]
         written += length
     return written

@@ -1,9 +1,9 @@
-"""Formats of mesh files: a row for each format, which is found by the ending of a file.
+"""Registry of mesh file formats, which are selected by file extension.
 
-A row names its reader, and the reader's module is imported when the first file of the format is
-read. Rows of further packages are found by the name of their table (`_TABLES`), so that nothing
-here imports these packages. Endings that no table has are looked up among plug-ins of the group
-`GROUP`, whose names are endings.
+The module of a reader is imported when the first file in its format is read. Formats of other
+packages are found through the tables in `_TABLES`, so that this module does not import these
+packages. Other extensions are looked up among the plug-ins in the entry point group `GROUP`, whose
+names are extensions.
 """
 
 from __future__ import annotations
@@ -29,39 +29,40 @@ GROUP = "lidarsim.meshes"
 
 _SHARED = tuple(entry.name for entry in fields(MeshOptions))
 
-# Reader of the content of a file, with its path and options. It raises `MeshFileError` for
-# content that it does not support, and any other error for a broken file.
+# Function that reads a file from its content, path and options. It raises `MeshFileError` if it
+# does not support the content, and any other error if the file is invalid.
 MeshReader = Callable[[bytes, Path, ReadOptions], Content]
 
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A format of mesh files: how its files are recognized and read.
+    """A mesh file format, with the reader and the options for its files.
 
     Parameters
     ----------
     endings
-        Endings of its files, with a dot and in lower case.
+        File extensions in lower case, including the dot.
     read
-        The reader, or its name, "module:function"; None for a format that is not read.
+        The reader, or its name as "module:function", or None if the format cannot be read.
     advice
-        Advice on files of a format that is not read, as a clause; empty if the format is read.
+        Advice for users if the format cannot be read, as a clause. Otherwise, an empty string.
     animated
-        Whether the reader can bake an animation, `ReadOptions.animation`.
+        Whether the reader can bake an animation (`ReadOptions.animation`).
     unitless
-        Whether files state no unit, nor does the format.
+        Whether neither the file nor the format specifies a unit.
     signatures
-        Bytes at the start of files. The error of a file with such a start and another ending
-        advises to use one of these endings.
+        Bytes at the start of files. If a file has the signature but a different extension, the
+        error message suggests one of these extensions.
     from_path
-        Whether the reader opens the path itself: it gets the first bytes of the file only.
+        Whether the reader opens the path itself. In this case, only the first bytes of the file are
+        passed to it.
     options
-        Dataclass of the options that the format alone has, or its name, "module:Class"; None for
-        a format without such options. The reader gets an instance, `ReadOptions.own`. Options
-        have defaults; None means that an option is not given. Scenarios have the options that are
-        described by `about`; others are arguments in Python only.
+        Dataclass with format-specific options, or its name as "module:Class", or None if there are
+        no such options. An instance is passed to the reader as `ReadOptions.own`. All options
+        require defaults, and None means that an option is not set. Options that are annotated with
+        `about` are available in scenarios. Other options are available only in Python.
     plugin
-        The plug-in that provides the row; filled in when the plug-in is loaded.
+        The plug-in that provides the format. It is set when the plug-in is loaded.
     """
 
     endings: tuple[str, ...]
@@ -76,42 +77,51 @@ class MeshFormat:
 
     @property
     def reader(self) -> MeshReader:
-        """Function that reads a file, imported if given by its name.
+        """Function that reads a file, which is imported if it is specified by name.
 
-        LidarError if the reader of a plug-in cannot be imported.
+        Raises
+        ------
+        LidarError
+            If the reader of a plug-in cannot be imported.
         """
         assert self.read is not None, "of a format that is read"
         if not isinstance(self.read, str):
             return self.read
-        reader: MeshReader = self._named(self.read, Callable)
+        reader: MeshReader = self._import_object(self.read, Callable)
         return reader
 
     @property
     def own_options(self) -> type | None:
-        """Dataclass of the options of the format, imported if given by its name.
+        """Dataclass with format-specific options, which is imported if it is specified by name.
 
-        LidarError if the dataclass of a plug-in cannot be imported or used.
+        Raises
+        ------
+        LidarError
+            If the dataclass of a plug-in cannot be imported or used.
         """
         options = self.options
         if isinstance(options, str):
-            options = self._named(options, type)
-        if options is not None and self.plugin is not None and (flaw := _flaw(options)):
+            options = self._import_object(options, type)
+        if options is not None and self.plugin is not None and (flaw := _options_problem(options)):
             raise LidarError(
                 f"{self.plugin} has options that {flaw}. Install a different version of "
                 f"{self.plugin.distribution}."
             )
         return options
 
-    def _named(self, name: str, kind: Any) -> Any:
-        """Return an object by its name, "module:object", for a plug-in of a kind."""
+    def _import_object(self, name: str, kind: Any) -> Any:
+        """Import an object by its name, "module:object".
+
+        If the format belongs to a plug-in, the type of the object is checked.
+        """
         if self.plugin is not None:
             return replace(self.plugin, value=name).load(kind)
         module, _, attribute = name.partition(":")
         return getattr(import_module(module), attribute)
 
 
-def _flaw(options: type) -> str:
-    """Return why a class cannot be the options of a format, as a clause, empty if it can."""
+def _options_problem(options: type) -> str:
+    """Return why a class cannot define format-specific options, or an empty string if it can."""
     if not is_dataclass(options):
         return "are not a dataclass"
     for entry in fields(options):
@@ -125,7 +135,7 @@ def _flaw(options: type) -> str:
 _GLTF = "lidarsim.scene.files.gltf:read_gltf"
 _POLYGONS = "lidarsim.scene.files.polygon_files"
 
-# The modules of the readers say why no library is used.
+# The modules of the readers explain why they do not use a library.
 _READ = (
     MeshFormat((".glb",), _GLTF, animated=True, signatures=(b"glTF",)),
     MeshFormat((".gltf",), _GLTF, animated=True),
@@ -135,7 +145,7 @@ _READ = (
     MeshFormat((".off",), f"{_POLYGONS}:read_off", unitless=True, signatures=(b"OFF",)),
 )
 
-# Tables of further packages, each a tuple `MESH_FORMATS`. A package need not be installed.
+# Modules of other packages that define a tuple `MESH_FORMATS`. The packages are optional.
 _TABLES = ("lidarscenes.files.formats",)
 
 _POINTS = "convert it to a mesh with lidarpool scene points"
@@ -175,77 +185,78 @@ _NOT_READ = (
 
 
 def known_formats() -> Iterator[MeshFormat]:
-    """Yield the formats of the tables: formats that are read, then formats with advice only."""
+    """Yield all formats in the tables, with those that cannot be read last."""
     yield from _formats_read()
     yield from _NOT_READ
 
 
 def _formats_read() -> Iterator[MeshFormat]:
-    """Yield the formats of this package and of the packages of `_TABLES`."""
+    """Yield the formats of this package and of the packages in `_TABLES`."""
     yield from _READ
     for name in _TABLES:
         yield from _table(name) or ()
 
 
 def _table(name: str) -> tuple[MeshFormat, ...] | None:
-    """Return the formats of a further package, or None if the package is not installed."""
+    """Return the formats of another package, or None if the package is not installed."""
     try:
         formats: tuple[MeshFormat, ...] = import_module(name).MESH_FORMATS
     except ModuleNotFoundError as error:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-            raise  # the package is installed, and another one is missing
+            raise  # the package is installed, but one of its dependencies is missing
         return None
     return formats
 
 
 def missing_packages() -> list[str]:
-    """Return the names of packages that would read further formats and are not installed."""
+    """Return the packages that would provide additional formats but are not installed."""
     return [name.partition(".")[0] for name in _TABLES if _table(name) is None]
 
 
 def format_of(path: str | Path) -> MeshFormat | None:
-    """Return the format of a file by its ending, also a format with advice only, or None.
+    """Return the format of a file according to its extension, or None if it is unknown.
+
+    The format can be one that cannot be read and only has advice.
 
     Raises
     ------
     LidarError
-        If two plug-ins have the ending, or the plug-in cannot be used.
+        If several plug-ins provide the extension, or if the plug-in cannot be used.
     """
     ending = Path(path).suffix.lower()
-    row = _row(ending, _formats_read())
+    row = _first_with_ending(ending, _formats_read())
     if row is not None:
         return row
     plugin = _plugin_of_ending(ending)
-    return _row(ending, iter(_NOT_READ)) if plugin is None else _row_of_plugin(plugin)
+    return _first_with_ending(ending, iter(_NOT_READ)) if plugin is None else _row_of_plugin(plugin)
 
 
-def _row(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
-    """Return the first format with an ending, or None."""
+def _first_with_ending(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | None:
     return next((row for row in rows if ending in row.endings), None)
 
 
 def plugin_of(path: str | Path) -> Plugin | None:
-    """Return the plug-in that reads files with the ending of a path, or None."""
+    """Return the plug-in that reads files with the extension of a path, or None."""
     ending = Path(path).suffix.lower()
-    return None if _row(ending, _formats_read()) else _plugin_of_ending(ending)
+    return None if _first_with_ending(ending, _formats_read()) else _plugin_of_ending(ending)
 
 
 def _plugin_of_ending(ending: str) -> Plugin | None:
-    """Return the plug-in of an ending, or None."""
     return _installed_plugin(ending, tuple(sys.path)) if ending else None
 
 
 @cache
 def _installed_plugin(ending: str, folders: tuple[str, ...]) -> Plugin | None:
-    """Return the plug-in of an ending among the distributions in `folders`, which is `sys.path`."""
+    """Return the plug-in for an extension.
+
+    `folders` is `sys.path`, which is part of the cache key because it determines the installed
+    distributions.
+    """
     return find_plugin(GROUP, ending)
 
 
 def _row_of_plugin(plugin: Plugin) -> MeshFormat:
-    """Return the format of a plug-in.
-
-    Raises LidarError for a plug-in that cannot be used.
-    """
+    """Load the format of a plug-in, or raise LidarError if the plug-in cannot be used."""
     row = plugin.load(MeshFormat)
     if row.read is None:
         raise plugin.lacks("read")
@@ -258,34 +269,35 @@ def _row_of_plugin(plugin: Plugin) -> MeshFormat:
 
 
 def plugin_endings() -> tuple[str, ...]:
-    """Return the endings that plug-ins read."""
+    """Return the file extensions for which there are plug-ins."""
     return tuple(plugins_of(GROUP))
 
 
-def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
-    """Return the options for reading a file: the shared options, and the options of its format.
+def split_options(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
+    """Validate and split options into shared and format-specific options.
 
     Parameters
     ----------
     row
         The format of the file.
     path
-        The file, for the error.
+        The file, which is named in error messages.
     given
-        {name of an option: value}; None for an option that is left out.
+        Option values by name. None means that an option is not set.
 
     Returns
     -------
-    The shared options, and an instance of the dataclass of the format, or None if the format has
-    no further options.
+    tuple[MeshOptions, Any]
+        The shared options, and an instance of the options dataclass of the format. The latter is
+        None if the format has no specific options.
 
     Raises
     ------
     LidarError
-        If the format lacks an option, with the formats that have it, or a value is refused.
+        If the format does not support an option, or if a value is invalid.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    if problem := lacking(row, values):
+    if problem := unsupported_options(row, values):
         raise LidarError(f"{path} {problem}")
     own_values = {name: value for name, value in values.items() if name not in _SHARED}
     shared_values = {name: value for name, value in values.items() if name in _SHARED}
@@ -299,16 +311,17 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
     return shared, own
 
 
-def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
-    """Return a clause on options that a file does not have by its format, empty if it has all.
+def unsupported_options(row: MeshFormat | None, options: Iterable[str]) -> str:
+    """Return an error message about unsupported options, or an empty string.
 
-    The clause follows the name of the file, and names the formats that have the options.
+    The message is a clause that follows the name of the file. It lists the formats that support the
+    options.
     """
     names = option_names(row)
     lacks = [name for name in options if name not in names]
     if not lacks:
         return ""
-    groups: dict[str, list[str]] = {}  # {endings of formats that have them: options}
+    groups: dict[str, list[str]] = {}  # {extensions of formats with these options: options}
     for name in lacks:
         groups.setdefault(" ".join(_endings_with(name)), []).append(name)
     parts = []
@@ -320,7 +333,10 @@ def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
 
 
 def option_names(row: MeshFormat | None) -> tuple[str, ...]:
-    """Return the names of all options of a format, shared and own, or the shared ones for None."""
+    """Return the names of all options that a format supports.
+
+    Without a format, only the shared options are returned.
+    """
     if row is None:
         return _SHARED
     shared = _SHARED if row.animated else tuple(name for name in _SHARED if name != "animation")
@@ -329,7 +345,7 @@ def option_names(row: MeshFormat | None) -> tuple[str, ...]:
 
 
 def _endings_with(option: str) -> list[str]:
-    """Return the endings of the formats, plug-ins included, that have an option."""
+    """Return the extensions of all formats that support an option, including plug-ins."""
     return [
         ending
         for row in formats_with_plugins()
@@ -339,7 +355,7 @@ def _endings_with(option: str) -> list[str]:
 
 
 def formats_with_plugins() -> Iterator[MeshFormat]:
-    """Yield the formats that are read, with the formats of plug-ins that can be used."""
+    """Yield all formats that can be read, including those of usable plug-ins."""
     yield from _formats_read()
     for plugins in plugins_of(GROUP).values():
         for plugin in plugins:
@@ -350,7 +366,7 @@ def formats_with_plugins() -> Iterator[MeshFormat]:
 
 
 def advice_on(path: str | Path) -> str:
-    """Return the advice on a file of a format that is not read, empty for formats that are."""
+    """Return the advice for a format that cannot be read, or an empty string for other formats."""
     row = format_of(path)
     return "" if row is None else row.advice
 
@@ -358,7 +374,9 @@ def advice_on(path: str | Path) -> str:
 def endings(
     condition: Callable[[MeshFormat], bool] = lambda row: not row.advice,
 ) -> tuple[str, ...]:
-    """Return the endings of the known formats that fulfill a condition, by default formats read.
+    """Return the extensions of known formats that satisfy a condition.
+
+    By default, these are the formats that can be read.
 
     Examples
     --------
@@ -369,5 +387,5 @@ def endings(
 
 
 def endings_for(data: bytes) -> tuple[str, ...]:
-    """Return the endings of the known formats whose files have the same start as `data`."""
+    """Return the extensions of known formats whose signature matches the start of `data`."""
     return endings(lambda row: data.startswith(row.signatures))

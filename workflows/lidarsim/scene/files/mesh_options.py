@@ -1,6 +1,6 @@
-"""Options for reading mesh files that all formats share.
+"""Options that readers of all mesh file formats share.
 
-Further options belong to formats: `MeshFormat.options` names the dataclass of a reader.
+Options for specific formats are defined by the dataclasses in `MeshFormat.options`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ...schema.declared import about
 from ..transform import Transform
 
 LengthUnit = Annotated[
-    Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # of UNITS_M
+    Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # as in UNITS_M
     about(
         "length unit of the file, or of the heights in a raster (default: from the file, "
         "otherwise meters)"
@@ -38,23 +38,23 @@ Opacity = Annotated[
 class MeshOptions:
     """Options for reading a mesh file of any format.
 
-    `lidarsim.scene.scene.Scene.load` describes them.
+    `lidarsim.scene.scene.Scene.load` describes the options.
     """
 
     unit: LengthUnit = None
     up_axis: UpAxis = None
-    transform: Transform | None = None  # placement in the world, after unit and up axis
+    transform: Transform | None = None  # applied after the unit and the up axis
     opacity: Opacity = "mask"
     colors: bool = False  # whether base colors are read
-    materials: bool = False  # whether faces keep the names of their materials
-    # Folders whose files may be read, besides the folder of the file.
+    materials: bool = False  # whether the material names of faces are read
+    # Folders that can contain additional files, besides the folder of the mesh file.
     assets: str | Path | Sequence[str | Path] | None = None
-    # Name or number of the animation to play by the meshes; "" for the first, None for none.
+    # Name or number of the animation to bake into the meshes. "" selects the first animation.
     animation: str | None = None
 
     @property
     def asset_folders(self) -> tuple[Path, ...]:
-        """The folders of `assets`."""
+        """The folders in `assets`."""
         one_folder = isinstance(self.assets, (str, Path))
         folders = [self.assets] if one_folder else self.assets or ()
         return tuple(map(Path, folders))  # type: ignore[arg-type]

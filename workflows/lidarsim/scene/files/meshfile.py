@@ -1,4 +1,7 @@
-"""Reading of scene files, in the formats of `mesh_formats`, as named meshes in meters, Z-up."""
+"""Reader of scene files, which returns named meshes in meters with z pointing up.
+
+The supported formats are listed in `mesh_formats`.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +39,8 @@ from .mesh_formats import (
     endings_for,
     format_of,
     missing_packages,
-    options_of,
     plugin_endings,
+    split_options,
 )
 from .scene_graph import (
     GENERATOR,
@@ -50,37 +53,39 @@ from .scene_graph import (
 )
 from .text_cloud import is_text_raster
 
-# Comment at the start of files written by lidarpool in formats without a generator.
+# Comment at the start of files written by lidarpool in formats that do not state a generator.
 FORMAT_COMMENT = "lidarpool: meters, Z-up"
 
-_MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
-_ZIP = b"PK\x03\x04"  # first bytes of an archive
-_ZIP_END = b"PK\x05\x06"  # before the end of an archive
-_HEAD_BYTES = 200  # bytes of a file that contain such a comment
+_MAX_UNEVENNESS = 1e-6  # maximum difference between the squared scale factors of the axes
+_ZIP = b"PK\x03\x04"  # signature at the start of an archive
+_ZIP_END = b"PK\x05\x06"  # signature of the end of an archive
+_HEAD_BYTES = 200  # bytes at the start of a file that are searched for the comment
 
 _log = logging.getLogger(__name__)
 
 
 def warn(note: str) -> None:
-    """Log a note in the words of Python."""
+    """Log a note as a warning, with option names as in Python."""
     _log.warning(as_python(note))
 
 
 class Objects(NamedTuple):
-    """Objects of a mesh file, in world coordinates."""
+    """Objects of a mesh file in world coordinates."""
 
     static: tuple[SceneMesh | SceneInstance, ...]
-    actors: tuple[Actor, ...] = ()  # each along a `Track`
+    actors: tuple[Actor, ...] = ()  # whose trajectories are of class `Track`
     summary: str = ""  # objects, triangles, unit, axes and colors
-    raster: Raster | None = None  # description, if the file is a raster
-    classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
-    is_landscape: bool = False  # whether the file is of land, never of a single object
+    raster: Raster | None = None  # metadata if the file is a raster
+    classes: Mapping[
+        int, ObjectClass
+    ] = {}  # {ASPRS LAS class number: class}, if objects have types
+    is_landscape: bool = False  # whether the file represents terrain rather than an object
     epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
 
     def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return the static objects, and the actors as static objects at their first pose.
+        """Return all objects as static objects, with actors at their first pose.
 
-        `tell` is called with a line on the actors, if there are actors.
+        If there are actors, `tell` is called with a message about them.
         """
         if self.actors:
             names = ", ".join(actor.name for actor in self.actors[:3])
@@ -98,38 +103,41 @@ def load_objects(
 ) -> Objects:
     """Read all objects of a mesh file.
 
-    Every placed mesh of a scene graph is an object, named by its node; large meshes that are placed
-    several times are instances. Files without names give an object named by the file. Objects that
-    their nodes scale to zero, and instances of meshes without an area, are left out.
+    Each placed mesh of a scene graph becomes an object that is named after its node. Large meshes
+    that are placed several times become instances. In formats without names, the object is named
+    after the file. Objects that their nodes scale to zero, and instances of meshes with zero area,
+    are skipped.
 
     Parameters
     ----------
     path
-        The file, with an ending of `mesh_formats`, in upper or lower case.
+        Path of the file. Its extension must be one of those in `mesh_formats`, in upper or lower
+        case.
     tell
-        Called with a line on objects left out, on images that cannot be read, on materials that
-        may be glass, or on a reference system; by default this module's logger warns.
+        Called with messages about skipped objects, unreadable images, materials that may be glass,
+        and reference systems. By default, messages are logged as warnings.
     axes
-        Called with a line on axes that a file did not state, or that were rotated; by default this
-        module's logger gets the line, as a warning if the scene seems to lie on its side.
+        Called with a message if the file does not state its axes or was rotated. By default, the
+        message is logged, as a warning if the scene seems to lie on its side.
     **options
-        Options that all formats share, the fields of `MeshOptions`, and options that the format of
-        the file alone has (`MeshFormat.options`). Animated meshes have no masks.
+        Options for all formats, which are the fields of `MeshOptions`, and options for the format
+        of the file (`MeshFormat.options`). Animated meshes have no masks.
 
     Returns
     -------
-    Static objects and, of .usd, actors, in world coordinates. All arithmetic is in double
-    precision; .glb, .gltf and binary .stl store single precision.
+    Objects
+        Static objects and, for .usd files, actors in world coordinates. Computations are in double
+        precision, but .glb, .gltf and binary .stl files store single precision.
 
     Raises
     ------
     LidarError
-        If the file cannot be read completely, or has no triangles.
+        If the file cannot be read completely, or contains no triangles.
     """
     path = Path(path)
     row = _format_to_read(path)
     data = _bytes_of(path, _HEAD_BYTES if row.from_path else None)
-    shared, own = options_of(row, path, options)
+    shared, own = split_options(row, path, options)
     wanted = ReadOptions(
         masks=shared.opacity == "mask" and shared.animation is None,
         colors=shared.colors,
@@ -140,7 +148,7 @@ def load_objects(
         materials=shared.materials,
         own=own,
     )
-    # Files may have infinite numbers and NaN, which are refused where they matter.
+    # Files can contain infinite numbers and NaN, which are rejected where they matter.
     with np.errstate(all="ignore"):
         content = _read(path, row, data, wanted)
         # The reader of rasters converts the unit itself.
@@ -148,8 +156,8 @@ def load_objects(
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         axis = shared.up_axis or content.up_axis or "z"
         upright = Transform(UP_AXES[axis] * unit_m, np.zeros(3))
-        objects = _in_world(path, content, upright, shared.transform)
-    _tell_notes(path, content, tell, unit_given=unit is not None)
+        objects = _place_in_world(path, content, upright, shared.transform)
+    _report_notes(path, content, tell, unit_given=unit is not None)
     meshes = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
         raise LidarError(f"{path} contains only triangles without an area.")
@@ -158,7 +166,7 @@ def load_objects(
         and content.generator != GENERATOR
         and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
     ):
-        _tell_axes(path, content, meshes, axes)
+        _report_axes(path, content, meshes, axes)
     epsg = content.epsg or _stated_epsg(data[:_HEAD_BYTES])
     if content.raster is not None:
         epsg = content.raster.epsg
@@ -174,14 +182,14 @@ def load_objects(
     return objects._replace(summary=_summary(meshes, unit_m, axis, wanted))
 
 
-def _in_world(
+def _place_in_world(
     path: Path, content: Content, upright: Transform, transform: Transform | None
 ) -> Objects:
-    """Place the objects of a file in the world.
+    """Transform the objects of a file to world coordinates.
 
-    `upright` converts the file's unit and axes to meters and Z-up, before `transform`. Objects that
-    are farther away than anything on Earth are left out, which `content.notes` say; LidarError if
-    all are.
+    `upright` converts the unit and the axes of the file to meters and z-up, and is applied before
+    `transform`. Objects that are farther from the origin than any point on Earth are skipped, which
+    is recorded in `content.notes`. Raise LidarError if there are no other objects.
     """
     transforms = [upright] if transform is None else [upright, transform]
     placement = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
@@ -190,7 +198,7 @@ def _in_world(
     reaches_m: dict[str, float] = {}  # {name of a remote object: meters from the origin}
     with prefixed(path):
         for mesh in content.meshes:
-            item, reach_m = _placed_object(mesh, path.stem, transforms)
+            item, reach_m = _place_object(mesh, path.stem, transforms)
             if item is None:
                 reaches_m[printable(mesh.name) or printable(path.stem)] = reach_m
             else:
@@ -216,10 +224,10 @@ def _in_world(
     return Objects(tuple(static), tuple(actors))
 
 
-def _tell_notes(
+def _report_notes(
     path: Path, content: Content, tell: Callable[[str], None], *, unit_given: bool
 ) -> None:
-    """Call `tell` with a line on objects that were left out, and with the notes of the reader."""
+    """Call `tell` with messages about skipped objects and with the notes of the reader."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} has objects without an area, which were skipped: {names}.")
@@ -232,7 +240,10 @@ def _tell_notes(
 def load_meshes(
     path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
-    """Read all objects of a mesh file as static objects, with `options` as in `load_objects`."""
+    """Read all objects of a mesh file as static objects.
+
+    `options` are described in `load_objects`.
+    """
     objects = load_objects(path, tell=tell, **options)
     return objects.at_start(lambda line: tell(f"{path} moves {line}"))
 
@@ -240,7 +251,7 @@ def load_meshes(
 def _summary(
     meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, options: ReadOptions
 ) -> str:
-    """Return a summary of a file: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
+    """Return a summary of a file, such as "4 objects, 38 triangles, in m, Y-up, 1 texture"."""
     meshes_once = [item.mesh if isinstance(item, SceneInstance) else item for item in meshes]
     shared = [mesh for item, mesh in zip(meshes, meshes_once, strict=True) if item is not mesh]
     words = [plural(len(meshes), "object")]
@@ -268,29 +279,32 @@ def _summary(
 
 
 def written_by_lidarpool(path: Path) -> bool:
-    """Return True if lidarpool wrote a file of a format without a unit, which is in meters then."""
+    """Return whether lidarpool wrote the file, which is in meters then.
+
+    The format of the file must not state a unit itself.
+    """
     with open_input(path) as file:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
 
 
 def _stated_epsg(head: bytes) -> int | None:
-    """Return the EPSG code in the comments at the start of a file that lidarpool wrote, or None."""
+    """Return the EPSG code in the header comments of a file written by lidarpool, or None."""
     match = re.search(re.escape(FORMAT_COMMENT.encode()) + rb"\n\S+ crs: EPSG:(\d+)", head)
     return int(match[1]) if match else None
 
 
-def _tell_axes(
+def _report_axes(
     path: Path,
     content: Content,
     meshes: Sequence[SceneMesh | SceneInstance],
     axes: Callable[[str], None] | None,
 ) -> None:
-    """Call `axes` with a line on axes that a file does not state, or that were rotated."""
-    if content.turned and content.up_axis == "y":
-        doubt = _seems_to_lie(content, meshes)
+    """Call `axes` with a message if a file does not state its axes or was rotated."""
+    if content.rotation_note and content.up_axis == "y":
+        doubt = _doubt_about_rotation(content, meshes)
         other_axis = "z"
-        statement = f"was rotated from Y-up to Z-up, {content.turned}{doubt}"
-    elif path.suffix.lower() == ".obj":  # without axes, and Y-up as often as not
+        statement = f"was rotated from Y-up to Z-up, {content.rotation_note}{doubt}"
+    elif path.suffix.lower() == ".obj":  # the format does not define axes, and Y-up is common
         statement = "does not state its axes and is assumed to be Z-up"
         doubt = ""
         other_axis = "y"
@@ -308,8 +322,8 @@ def _tell_axes(
         _log.info(as_python(note))
 
 
-def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
-    """Return the reason why a file rotated from Y-up seems to have been Z-up, or empty."""
+def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
+    """Return why a file that was rotated from Y-up may have been Z-up, or an empty string."""
     if "trimesh" in content.generator:
         return ", but was written by trimesh, which does not convert axes"
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
@@ -320,10 +334,7 @@ def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance])
 
 
 def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
-    """Read a file of a format with at least one object.
-
-    Raises LidarError for all errors.
-    """
+    """Read a file, and convert all errors to LidarError."""
     try:
         with prefixed(path):
             return _checked_content(row, path, data, options)
@@ -336,16 +347,16 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
     except Exception as error:
         if row.plugin is not None and isinstance(error, ImportError):
             raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
-        # Readers raise errors of any class: ValueError, IndexError, KeyError, BadZipFile,
-        # ParseError, struct.error, …
-        failure = _end_missing(error, data) or error
+        # Readers raise errors of many classes, such as ValueError, IndexError, KeyError,
+        # BadZipFile, ParseError and struct.error.
+        failure = _truncation_error(error, data) or error
         raise LidarError(
             f"{unreadable(path, failure, _advice(failure))}{_other_format(path, data)}"
         ) from error
 
 
-def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
-    """Return an error of a file that ends too early, if a library's error tells that, else None."""
+def _truncation_error(error: Exception, data: bytes) -> CutShortError | None:
+    """Return a CutShortError if the error of a library means that the file is truncated."""
     if isinstance(error, json.JSONDecodeError):
         if error.msg.startswith("Unterminated") or error.pos >= len(error.doc.rstrip()):
             return CutShortError(f"its JSON ends in line {error.lineno}, column {error.colno}")
@@ -358,14 +369,13 @@ def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
 
 
 def _advice(error: Exception) -> str:
-    """Return the advice on a file that a reader refused."""
     return f"{'' if isinstance(error, CutShortError) else 'correct it, or '}export it again"
 
 
 def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOptions) -> Content:
-    """Read the content of a file.
+    """Read the content of a file, which must contain at least one object.
 
-    Raises MeshFileError for a foreign file, or without objects.
+    Raise MeshFileError if there are no objects, or if the file is compressed or a web page.
     """
     for beginning, problem in _FOREIGN.items():
         if re.match(beginning, data):
@@ -386,10 +396,7 @@ def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOpti
 
 
 def _format_to_read(path: Path) -> MeshFormat:
-    """Return the format of a file.
-
-    Raises LidarError if no format that is read has its ending.
-    """
+    """Return the format of a file, or raise LidarError if the format cannot be read."""
     row = format_of(path)
     if row is not None and not row.advice:
         return row
@@ -407,13 +414,13 @@ def _format_to_read(path: Path) -> MeshFormat:
 
 
 def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
-    """Return the content of a file, or at most `max_bytes` of its start."""
+    """Return the content of a file, or at most its first `max_bytes` bytes."""
     try:
         with prefixed(path):
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MissingFileError(not_found(path, endings())) from error
-    except (OSError, ValueError) as error:  # a NUL in the name
+    except (OSError, ValueError) as error:  # names that contain NUL raise ValueError
         reason = getattr(error, "strerror", None) or error
         raise LidarError(f"{path} cannot be read: {reason}.") from error
     if not data:
@@ -421,7 +428,7 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
     return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
 
 
-# {expression for the start of a file that is no mesh: advice}
+# {pattern of the start of a file that is not a mesh: advice}
 _FOREIGN = {
     rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is compressed. Decompress it first",
     rb"(?i)\s*(<!doctype html|<html)": "is a web page. Download the file itself",
@@ -429,7 +436,7 @@ _FOREIGN = {
 
 
 def _other_format(path: Path, data: bytes) -> str:
-    """Return a sentence on the format that a refused file starts like, or empty."""
+    """Return a hint about the probable format of a rejected file, or an empty string."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It appears to be encoded in UTF-16. Save it as UTF-8."
     if path.suffix.lower() in SCAN_READERS and not is_text_raster(path):
@@ -440,33 +447,38 @@ def _other_format(path: Path, data: bytes) -> str:
     return ""
 
 
-def _placed_object(
+def _place_object(
     item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
 ) -> tuple[SceneMesh | SceneInstance | None, float]:
-    """Return an object in the world, and how far it reaches from the origin, meters.
+    """Return an object in world coordinates, and its maximum coordinate in meters.
 
-    The name of the object is safe for terminals and files. None if the object is too far away.
+    The object is None if it is too far from the origin. Its name is safe to print and to use in
+    files.
     """
     name = printable(item.name) or printable(stem)
     for transform in transforms:
-        if name != item.name or not _keeps_places(transform):
+        if name != item.name or not _is_identity(transform):
             item = item.moved(name, transform.linear, transform.offset)
     reach_m = float(np.abs(_corners(item)).max())
     return (item if reach_m <= MAX_COORDINATE_M else None), reach_m
 
 
-def _keeps_places(transform: Transform) -> bool:
-    """Return True if a transform moves nothing: files of many objects are read sooner."""
+def _is_identity(transform: Transform) -> bool:
+    """Return whether a transform is the identity.
+
+    Skipping identity transforms makes files with many objects faster to read.
+    """
     return np.array_equal(transform.linear, np.eye(3)) and not transform.offset.any()
 
 
 def _actor_of_part(
     part: RigidPart, stem: str, upright: Transform, placement: Transform
 ) -> tuple[Actor | None, float]:
-    """Return a moving part as an actor, with its frame rotated as the axes of the file are.
+    """Convert a moving part to an actor, and return its maximum coordinate in meters.
 
-    The mesh of the actor has all scales, since a trajectory only rotates and moves. None if the
-    actor moves too far away. The number is how far, meters from the origin.
+    The frame of the actor is rotated like the axes of the file. All scales are applied to the mesh,
+    since trajectories only rotate and translate. The actor is None if it is too far from the
+    origin.
     """
     name = printable(part.name) or printable(stem)
     unit_m, scale = (cbrt(determinant(transform.linear)) for transform in (upright, placement))
@@ -488,14 +500,13 @@ def _actor_of_part(
 
 
 def _mesh_at_start(actor: Actor) -> SceneMesh:
-    """Return the mesh of an actor at its first pose."""
     positions, rotations = actor.trajectory.poses(0, np.zeros(1))
     rotation = np.eye(3) if rotations is None else rotations[0]
     return actor.mesh.moved(actor.name, rotation, positions[0])
 
 
 def _corners(item: SceneMesh | SceneInstance) -> Floats:
-    """Return points (k, 3) in the world whose bounds contain an object."""
+    """Return points in world coordinates whose bounding box contains an object."""
     if isinstance(item, SceneMesh):
         return (item.animation or item).bounds
     box = np.array(list(product(*item.mesh.bounds.T)))

@@ -1,4 +1,4 @@
-"""Materials of Wavefront files: colors, and images that make them transparent in places."""
+"""Materials of Wavefront files, which define colors and opacity masks."""
 
 from __future__ import annotations
 
@@ -16,31 +16,39 @@ from ...io.input_files import InputFileError, read_input
 from ...numerics.arrays import Bytes, Floats, Ints
 from ...words import as_text
 from ..colors import Colors, as_bytes
-from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colors, read_opacity, remembered
+from ..masks import (
+    HALF_OPACITY,
+    MaskNotes,
+    Texture,
+    Wrap,
+    cache_with_errors,
+    read_colors,
+    read_opacity,
+)
 from ..scene_mesh import Cutout
-from .companions import image_file, named_file
+from .companions import find_named_file, image_file
 from .scene_graph import SMALLER, MeshFileError, ReadOptions
 
-# Options of images, and the words that follow each; -o, -s and -t have one to three numbers.
+# Image options and their arguments. The options -o, -s and -t have one to three numbers.
 _OPTION = re.compile(
     rb"\s*(-[ost])(?=\s)((?:\s+[-+.\de]+(?=\s)){0,3})|\s*(-mm)((?:\s+\S+){2})"
     rb"|\s*(-(?:blendu|blendv|boost|texres|clamp|bm|imfchan|type|cc))(\s+\S+)",
     re.IGNORECASE,
 )
 _WITHOUT_ALPHA = (".jpg", ".jpeg")
-_MAX_BYTES = 1 << 26  # limit for a file of materials
+_MAX_BYTES = 1 << 26  # maximum size of a material file
 
 
 @dataclass
 class _Image:
-    """An image of a material, with the options of its line."""
+    """An image of a material, with the options in its statement."""
 
     name: str
     options: dict[bytes, list[bytes]] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, words: bytes) -> _Image:
-        """Parse the words of a line after the keyword."""
+        """Parse the arguments of a statement, without its keyword."""
         options: dict[bytes, list[bytes]] = {}
         offset = 0
         while match := _OPTION.match(words, offset):
@@ -51,12 +59,15 @@ class _Image:
 
     @property
     def wrap(self) -> Wrap:
-        """Continuation of the image beyond its edges."""
+        """How the image continues beyond its edges."""
         clamped = [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
         return "clamp" if clamped else "repeat"
 
     def coordinates(self, vt: Floats) -> Floats:
-        """Return coordinates (c, 2) on the image, v downwards, from the file's `vt` (c, 2)."""
+        """Convert the texture coordinates in the file to image coordinates, with v pointing down.
+
+        Both arrays have shape (c, 2).
+        """
         scale_u, scale_v = self._numbers(b"-s", 1)
         offset_u, offset_v = self._numbers(b"-o", 0)
         u = vt[:, 0] * scale_u + offset_u
@@ -64,26 +75,26 @@ class _Image:
         return np.column_stack([u, v])
 
     def _numbers(self, option: bytes, default: float) -> list[float]:
-        """Return two numbers of an option, with a default for missing numbers."""
+        """Return two values of an option, with a default for missing values."""
         numbers = [float(word) for word in self.options.get(option, [])]
         return (numbers + [default] * 2)[:2]
 
 
 @dataclass
 class _Entry:
-    """Images and color of a material in a file."""
+    """Images and color of a material."""
 
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
     color: Bytes | None = None  # uint8 (1, 1, 3)
 
 
 class MtlMaterials:
-    """Masks and colors of the materials of a .obj file, each read once.
+    """Masks and colors of the materials of a .obj file, each of which is read once.
 
-    The materials are in files named by the lines `libraries`. Masks are the images `map_d`, or else
-    the alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, are ignored: some programs
-    mistake `d` for `Tr`. Colors are the images `map_Kd`, or else `Kd`; with an image, `Kd` is
-    ignored, since some programs write black there.
+    The material files are named by the `libraries` statements. Masks are `map_d` images, or the
+    alpha channels of `map_Kd` images if there are none. Constant opacities (`d` and `Tr`) are
+    ignored because some programs confuse the two. Colors are `map_Kd` images, or `Kd` if there are
+    none. `Kd` is ignored if there is an image because some programs set it to black then.
     """
 
     def __init__(
@@ -93,16 +104,16 @@ class MtlMaterials:
         self._mesh = mesh
         self._options = options
         self._allowance = Allowance(size, SMALLER)
-        self._opacity = remembered(self._read_opacity)
-        self._mask = remembered(self._read_mask)
-        self._image = remembered(self._read_image)
+        self._opacity = cache_with_errors(self._read_opacity)
+        self._mask = cache_with_errors(self._read_mask)
+        self._image = cache_with_errors(self._read_image)
         self._entries: dict[bytes, _Entry] = {}
         for data in self._files(libraries):
             self._entries |= _read_mtl(data)
 
     @property
     def has_masks(self) -> bool:
-        """True if a material may have a mask, which needs texture coordinates."""
+        """Whether any material can have a mask, which requires texture coordinates."""
         return self._options.masks and any(
             key == b"map_d" or not image.name.lower().endswith(_WITHOUT_ALPHA)
             for entry in self._entries.values()
@@ -110,13 +121,14 @@ class MtlMaterials:
         )
 
     def cutout(self, name: bytes, vt: Floats, corners: Ints) -> Cutout | None:
-        """Return the mask of a material for triangles, or None.
+        """Return the mask of a material for triangles, or None if there is no mask.
 
-        `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of `vt`.
+        `vt` contains texture coordinates of shape (c, 2), and `corners` contains indices into `vt`
+        of shape (k, 3).
         """
         if not self._options.masks or name not in self._entries:
             return None
-        with self.notes.without_mask(as_text(name)):
+        with self.notes.record_mask_error(as_text(name)):
             images = self._entries[name].images
             if texture := self._texture(as_text(name), images):
                 image = images.get(b"map_d") or images[b"map_kd"]
@@ -124,33 +136,46 @@ class MtlMaterials:
         return None
 
     def colors(self, name: bytes, vt: Floats, corners: Ints, tints: Bytes | None) -> Colors | None:
-        """Return the colors of triangles, or None.
+        """Return the colors of triangles, or None if there are no colors.
 
-        Colors are of the material's image, else of the corners, `tints` (k, 3, 3), else the plain
-        color of the material. `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of
-        `vt`.
+        The colors come from the image of the material, otherwise from the vertex colors `tints`,
+        otherwise from the plain color of the material.
+
+        Parameters
+        ----------
+        name
+            Name of the material.
+        vt
+            Texture coordinates. Shape (c, 2).
+        corners
+            Index into `vt` for each corner. Shape (k, 3).
+        tints
+            Vertex colors, or None. Shape (k, 3, 3).
         """
         entry = self._entries.get(name, _Entry())
         if not self._options.colors:
             return None
         colors = None
         if (image := entry.images.get(b"map_kd")) is not None:
-            with self.notes.without_color(as_text(name)):
+            with self.notes.record_color_error(as_text(name)):
                 texture = self._image((image.name, image.wrap))
                 colors = texture.colors(image.coordinates(vt), corners)
         elif tints is not None:
-            colors = Colors.of_corners(tints)
+            colors = Colors.from_vertex_colors(tints)
         elif entry.color is not None:
             colors = Colors.plain(entry.color, len(corners))
         return colors
 
     def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
-        """Yield the contents of the files that lines name: a file, or several between spaces."""
+        """Yield the contents of the material files.
+
+        A statement names a single file, or several files that are separated by spaces.
+        """
         read: set[Path | None] = set()
         for names in map(as_text, libraries):
             for name in [names] if self._file(names) else names.split():
                 try:
-                    path = named_file(self._mesh, name, self._options)
+                    path = find_named_file(self._mesh, name, self._options)
                 except MeshFileError:
                     reason = "outside the folder of the mesh; set assets to the folder of this file"
                     self.notes.missing_files.append(f"{name} ({reason})")
@@ -165,29 +190,25 @@ class MtlMaterials:
                         self.notes.missing_files.append(name)
 
     def _content(self, path: Path | None) -> bytes:
-        """Return the content of a file of materials.
-
-        Raises OSError for a missing or large file.
-        """
+        """Read a material file, or raise OSError if it is missing or too large."""
         if path is None or path.stat().st_size > _MAX_BYTES:
             raise FileNotFoundError
         return read_input(path)
 
     def _file(self, name: str) -> Path | None:
-        """Return the path of a file of materials, or None."""
         with suppress(MeshFileError):
-            return named_file(self._mesh, name, self._options)
+            return find_named_file(self._mesh, name, self._options)
         return None
 
     def _texture(self, name: str, images: dict[bytes, _Image]) -> Texture | None:
-        """Return the mask of a material, or None for a solid material."""
+        """Return the mask of a material, or None if the material is opaque."""
         color = images.get(b"map_kd")
         image = images.get(b"map_d", color)
         if image is None:
             return None
         if image is color and image.name.lower().endswith(_WITHOUT_ALPHA):
             return None
-        # Some programs name the same image twice: then its brightness belongs to its color.
+        # Some programs use the same image for color and opacity, so its brightness is not opacity.
         gray = image is not color and not (color and color.name == image.name)
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
         texture = self._mask((image.name, gray, base, gain, image.wrap))
@@ -198,7 +219,10 @@ class MtlMaterials:
     def _read_mask(
         self, key: tuple[str, bool, float, float, Wrap]
     ) -> Texture | Literal["solid", "glass"]:
-        """Return the mask of an image, or the kind of a material without a mask."""
+        """Return the mask for a key, or the kind of material if no mask is required.
+
+        Keys are (name, whether brightness is opacity, base, gain, wrap).
+        """
         name, gray, base, gain, wrap = key
         opacity = self._opacity((name, gray))
         if opacity is None:
@@ -209,13 +233,19 @@ class MtlMaterials:
         return Texture(mask, (wrap, wrap), self._allowance)
 
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
-        """Return the opacity of an image, or None, by keys (name, whether brightness counts)."""
+        """Return the opacity of an image, or None if it is opaque.
+
+        Keys are (name, whether brightness is opacity).
+        """
         name, gray = key
         file = image_file(self._mesh, name, self._options, self._allowance)
         return read_opacity(file, self._allowance, gray=gray)
 
     def _read_image(self, key: tuple[str, Wrap]) -> Texture:
-        """Return the texture of an image of colors, by keys (name, continuation)."""
+        """Return the texture of a color image.
+
+        Keys are (name, wrap).
+        """
         name, wrap = key
         file = image_file(self._mesh, name, self._options, self._allowance)
         image = read_colors(file, self._allowance, self.notes)
@@ -223,10 +253,10 @@ class MtlMaterials:
 
 
 def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
-    """Return the materials of a file: {name: entry}."""
+    """Parse the materials in a file by name."""
     entries: dict[bytes, _Entry] = {}
     entry = _Entry()
-    text = data.removeprefix(b"\xef\xbb\xbf")  # the mark of some editors on Windows
+    text = data.removeprefix(b"\xef\xbb\xbf")  # byte order mark of editors on Windows
     for line in text.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
         key, _, value = line.strip().partition(b" ")
         if key == b"newmtl":
@@ -234,6 +264,6 @@ def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
         elif key.lower() in (b"map_d", b"map_kd") and value.strip():
             entry.images[key.lower()] = _Image.parse(value)
         elif key == b"Kd":
-            with suppress(ValueError):  # spectra, which programs do not write
+            with suppress(ValueError):  # the format also allows spectra, but programs use RGB
                 entry.color = as_bytes([*map(float, value.split()[:3])]).reshape(1, 1, 3)
     return entries

@@ -1,8 +1,8 @@
-"""Withheld points and noise, which LAS files mark as points that should not be used.
+"""Detection of withheld points and noise points, which LAS files mark as unusable.
 
-In ASPRS LAS 1.4 R15, withheld points should not be included in processing, as if they were deleted.
-Class 7 is low noise, and class 18 is high noise, but only in point formats 6 to 10. Programs that
-convert LAS files keep these columns under different names.
+According to ASPRS LAS 1.4 R15, withheld points should not be included in processing, as if they
+were deleted. Class 7 is low noise, and class 18 is high noise, but only in point formats 6 to 10.
+Programs that convert LAS files keep these columns under different names.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from ...numerics.arrays import AnyArray, Bools
 from ...words import plural
 
 NOISE_CLASSES = (7, 18)
-LEGACY_NOISE_CLASSES = (7,)  # classes of point formats 0 to 5
+LEGACY_NOISE_CLASSES = (7,)  # in point formats 0 to 5
 _CLASS_COLUMN = "classification"
 _WITHHELD_COLUMNS = ("withheld", "withheldflag", "classifwithheldflag")
 
 
 class OmittedPoints(NamedTuple):
-    """Numbers of points that are omitted."""
+    """Numbers of omitted points by reason."""
 
     withheld: int = 0
     noise: int = 0
 
     def note(self) -> str:
-        """Return a sentence that states the numbers, or an empty string if they are zero."""
+        """Return a note that states the numbers, or an empty string if they are zero."""
         kinds = []
         if self.withheld:
             kinds.append(f"{plural(self.withheld, 'withheld point')}")
@@ -46,7 +46,7 @@ class OmittedPoints(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _marking_columns(names: tuple[str, ...]) -> tuple[str | None, str | None]:
-    """Return the names of the columns of classes and of withheld points, or None for each."""
+    """Return the names of the classification column and the withheld column, if present."""
     letters = {name: re.sub("[^a-z]", "", name.lower().removeprefix("scalar_")) for name in names}
     classes = (name for name in names if letters[name] == _CLASS_COLUMN)
     withheld = (name for name in names if letters[name] in _WITHHELD_COLUMNS)
@@ -56,16 +56,18 @@ def _marking_columns(names: tuple[str, ...]) -> tuple[str | None, str | None]:
 def usable_points(
     columns: Mapping[str, AnyArray], noise_classes: Collection[int] = NOISE_CLASSES
 ) -> tuple[Bools | None, OmittedPoints]:
-    """Return a mask of the points that are neither withheld nor noise, and the omitted points.
+    """Return a mask of the usable points, and the numbers of omitted points.
 
-    The mask has the shape (n,). It is None if all points are usable.
+    Withheld points and noise points are not usable. The mask has shape (n,), or is None if all
+    points are usable.
 
     Parameters
     ----------
     columns
-        Columns of a file, (n,) each, as LAS or a program that converts LAS names them.
+        Columns of a file, named as in LAS or by a program that converts LAS files. Each has shape
+        (n,).
     noise_classes
-        Classes of noise: `NOISE_CLASSES`, or `LEGACY_NOISE_CLASSES`.
+        Noise classes, which are `NOISE_CLASSES` or `LEGACY_NOISE_CLASSES`.
     """
     class_column, withheld_column = _marking_columns(tuple(columns))
     noise: Bools | None = None

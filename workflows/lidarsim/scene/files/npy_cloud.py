@@ -1,4 +1,7 @@
-"""Clouds in arrays of NumPy (.npy): rows of numbers, or records with the fields x, y and z."""
+"""Reader of point clouds in NumPy arrays (.npy).
+
+An array contains either rows of numbers or records with the fields x, y and z.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,16 @@ _EXPECTED = (
 
 
 def read_npy_cloud(path: Path) -> list[Sweep]:
-    """Read the points of an array: x, y and z are its first three columns, or fields.
+    """Read the points of a NumPy array.
 
-    Columns after z are `column_4`, …. The rows of a range image (rows, columns, 3 or more) are
-    points, too.
+    The first three columns, or the fields of these names, are x, y and z. The other columns are
+    named `column_4`, `column_5` and so on. Range images of shape (rows, columns, 3 or more) are
+    flattened.
 
     Raises
     ------
     ValueError
-        If the array is not of a cloud, or the file is shorter than the array.
+        If the array is not a point cloud, or if the size of the file does not match the array.
     LidarError
         If the file is larger than the memory.
     OSError
@@ -47,15 +51,16 @@ def read_npy_cloud(path: Path) -> list[Sweep]:
         columns = dict(zip(names, rows.T, strict=True))
     else:
         raise ValueError(f"its array has the shape {array.shape}. {_EXPECTED}")
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN of any kind, and long doubles
+    # Signaling NaN are invalid operations, and long doubles can overflow.
+    with np.errstate(invalid="ignore", over="ignore"):
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [Sweep(positions, columns)]
 
 
 def _fields(records: AnyArray) -> dict[str, AnyArray]:
-    """Return the fields of records (n,).
+    """Return the fields of records as columns.
 
-    Raises ValueError without x, y and z.
+    Fields that are arrays are split into one column per element.
     """
     columns: dict[str, AnyArray] = {}
     for name in records.dtype.names or ():
@@ -72,10 +77,7 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
 
 
 def _read_array(file: BinaryIO, size: int) -> AnyArray:
-    """Return the array of numbers in a file of a size in bytes.
-
-    Raises ValueError for other files.
-    """
+    """Read the array in a file whose size in bytes is `size`."""
     shape, is_fortran, kind = _read_header(file)
     if not _holds_numbers(kind):
         raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}. {_EXPECTED}")
@@ -92,10 +94,7 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape of the array in a file, whether its order is Fortran's, and its type.
-
-    Raises ValueError if the header is broken.
-    """
+    """Return the shape of the array in a file, whether it is in Fortran order, and its type."""
     layout: Any = np.lib.format
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
     start = file.read(len(layout.MAGIC_PREFIX))
@@ -108,7 +107,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         )
     try:
         shape, is_fortran, kind = readers[version](file)
-    except Exception as error:  # NumPy parses the header as Python, with errors of any class
+    except Exception as error:  # NumPy evaluates the header as Python, which can raise any error
         if "EOF: reading" in str(error):
             raise CutShortError("its header is truncated") from error
         raise ValueError("its header does not describe an array") from error
@@ -116,7 +115,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 def _holds_numbers(kind: np.dtype[Any]) -> bool:
-    """Return True if an array of a type has real numbers alone."""
+    """Return whether a type consists only of real numbers."""
     if kind.names is not None:
         return all(_holds_numbers(kind[name]) for name in kind.names)
     return kind.base.kind in "biuf"

@@ -1,8 +1,9 @@
-"""Point Cloud Data (.pcd) of PCL, all encodings, by its documentation and `pcd_io.cpp` of PCL 1.14.
+"""Reader and writer of PCL's Point Cloud Data (.pcd) files in all encodings.
 
-Open3D writes beyond its memory where two fields have the same name, as PCL's padding has, and
-leaves out VIEWPOINT. pypcd4 does not know the old keyword COLUMNS, and unpacks fields of several
-numbers in another order than PCL.
+The implementation follows the documentation and `pcd_io.cpp` of PCL 1.14. Open3D is not used
+because it ignores VIEWPOINT and writes out of bounds if two fields have the same name, as in PCL's
+padding. pypcd4 is not used because it does not support the old keyword COLUMNS and unpacks fields
+with several numbers in a different order than PCL.
 """
 
 from __future__ import annotations
@@ -33,60 +34,61 @@ _KEYWORDS = (
     "VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
 )  # fmt: skip
 _DATA = re.compile(rb"^DATA[ \t]+([^\r\n]*?)[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
-_STARTS = (b"# .PCD", b"VERSION", b"FIELDS", b"COLUMNS")  # starts of lines of a header
-_PADDING = "_"  # name of the fields that fill the rows of PCL
+_STARTS = (b"# .PCD", b"VERSION", b"FIELDS", b"COLUMNS")  # prefixes of header lines
+_PADDING = "_"  # name of padding fields in PCL
 _KINDS = {
     ("F", 4): "<f4", ("F", 8): "<f8",
     ("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
     ("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
 }  # fmt: skip
-_LETTERS = {"f": "F", "i": "I", "u": "U"}  # {kind of NumPy: TYPE}
+_LETTERS = {"f": "F", "i": "I", "u": "U"}  # {NumPy kind: TYPE}
 _HEADER_MAX_BYTES = 1 << 20
-_MAX_NUMBERS = 10_000  # numbers of a point; descriptors of PCL have up to 1,980
-_MAX_QUATERNION_ERROR = 0.01  # error of the length of VIEWPOINT's quaternion
+_MAX_NUMBERS = 10_000  # maximum numbers per point; descriptors of PCL have up to 1,980
+_MAX_QUATERNION_ERROR = 0.01  # maximum deviation of the norm of the quaternion from 1
 _SMALLER = "write it uncompressed"
-_RESOLVED = (*"xyz", "rgb", "rgba", *COLORS)  # names that are resolved here
+_RESOLVED = (*"xyz", "rgb", "rgba", *COLORS)  # column names that this module uses
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class _Field:
-    """A field of the header."""
+    """A field declared in the header."""
 
     name: str
-    kind: str  # type of NumPy: «<f4»
-    count: int  # numbers of a point
+    kind: str  # NumPy type, such as "<f4"
+    count: int  # numbers per point
 
     @property
     def size(self) -> int:
-        """Bytes of a point."""
+        """Size in bytes per point."""
         return np.dtype(self.kind).itemsize * self.count
 
 
 class _Header(NamedTuple):
-    """Header of a file."""
+    """The header of a .pcd file."""
 
     fields: list[_Field]
     points: int
     encoding: str
-    viewpoint: tuple[float, ...]  # x, y, z, and the quaternion w, x, y, z
-    lines: int  # up to DATA
+    viewpoint: tuple[float, ...]  # position x, y, z and quaternion w, x, y, z
+    lines: int  # number of lines, including DATA
 
 
 def read_pcd(path: Path) -> list[Sweep]:
     """Read the points of a .pcd file, with its VIEWPOINT as their pose.
 
-    Fields of several numbers become the columns `name_0`, `name_1`, …; the bits of `rgb` and `rgba`
-    become red, green and blue, and alpha unless it is the same throughout. Padding (`_`) is left
-    out. The scanner is where VIEWPOINT says, unless that is the default.
+    Fields with several numbers become the columns `name_0`, `name_1` and so on. The packed colors
+    `rgb` and `rgba` become red, green, blue, and alpha unless it is constant. Padding fields (`_`)
+    are skipped. The position of the scanner is that of VIEWPOINT, unless VIEWPOINT has its default
+    value.
 
     Raises
     ------
     ValueError
-        If the header is broken, or announces other numbers than the file holds; the message names
-        the line.
+        If the header is invalid or does not match the content. The message contains the line
+        number.
     LidarError
-        If the points would take far more memory than the file has bytes.
+        If the points would require much more memory than the size of the file.
     OSError
         If the file cannot be read.
     """
@@ -111,11 +113,11 @@ def read_pcd(path: Path) -> list[Sweep]:
             f"its FIELDS are {printable(names)}, but it has no {', '.join(missing)}. The fields "
             "x, y and z are required, with one number each"
         )
-    with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
+    with np.errstate(invalid="ignore"):  # converting signaling NaN is an invalid operation
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
-    return [Sweep(positions, unpacked_colors(columns), pose=pose, scanner=scanner)]
+    return [Sweep(positions, split_rgb(columns), pose=pose, scanner=scanner)]
 
 
 def pcd_bytes(
@@ -124,14 +126,14 @@ def pcd_bytes(
     quaternion: Sequence[float],
     comment: str,
 ) -> bytes:
-    """Return a binary .pcd file.
+    """Return the content of a binary .pcd file.
 
     Parameters
     ----------
     fields
-        Names and arrays (n,) of numbers.
+        Names and values of the fields. Each array has shape (n,).
     position, quaternion
-        VIEWPOINT: meters, and w, x, y, z.
+        VIEWPOINT, as a position in meters and a quaternion in the order w, x, y, z.
     comment
         First line of the file.
     """
@@ -161,17 +163,14 @@ def pcd_bytes(
 
 
 def _parse_header(data: bytes, encoding: str) -> _Header:
-    """Return the header in `data`, up to DATA.
-
-    Raises ValueError, with the line that is broken.
-    """
-    entries: dict[str, tuple[int, list[str]]] = {}  # {keyword: (number of the line, words)}
+    """Parse the header before the DATA line."""
+    entries: dict[str, tuple[int, list[str]]] = {}  # {keyword: (line number, words)}
     lines = data.decode("latin-1").splitlines()
     for number, line in enumerate(lines, 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        # COLUMNS is the keyword of files before version 0.5.
+        # Before version 0.5 of the format, the keyword was COLUMNS.
         keyword = {"COLUMNS": "FIELDS"}.get(words[0].upper(), words[0].upper())
         if keyword not in _KEYWORDS:
             raise ValueError(
@@ -197,14 +196,11 @@ _Entries = Mapping[str, tuple[int, list[str]]]
 
 
 def _fields(entries: _Entries) -> list[_Field]:
-    """Return the fields of a header.
-
-    Raises ValueError if they are broken.
-    """
+    """Return the fields of a header, or raise ValueError if they are invalid or inconsistent."""
     if not entries.get("FIELDS", (0, []))[1]:
         raise ValueError("its header has no FIELDS")
     names = entries["FIELDS"][1]
-    # Files before version 0.5 have float32 and no further lines.
+    # Before version 0.5 of the format, all fields were float32, and these lines did not exist.
     sizes = _whole_numbers(entries, "SIZE", [4] * len(names))
     letters = [word.upper() for word in entries.get("TYPE", (0, ["F"] * len(names)))[1]]
     counts = _whole_numbers(entries, "COUNT", [1] * len(names))
@@ -231,9 +227,9 @@ def _fields(entries: _Entries) -> list[_Field]:
 
 
 def _count_of_points(entries: _Entries) -> int:
-    """Return POINTS, or WIDTH x HEIGHT without it.
+    """Return POINTS, or WIDTH x HEIGHT if it is missing.
 
-    Raises ValueError if they contradict each other.
+    Raise ValueError if the numbers are inconsistent.
     """
     (points,) = _whole_numbers(entries, "POINTS", [-1], 1)
     (width,) = _whole_numbers(entries, "WIDTH", [-1], 1)
@@ -250,10 +246,7 @@ def _count_of_points(entries: _Entries) -> int:
 def _whole_numbers(
     entries: _Entries, keyword: str, default: list[int], count: int | None = None
 ) -> list[int]:
-    """Return the whole numbers of a line of a header.
-
-    Raises ValueError if there are others.
-    """
+    """Return the nonnegative integers in a header line, or `default` if the line is missing."""
     if keyword not in entries:
         return default
     number, words = entries[keyword]
@@ -266,9 +259,10 @@ def _whole_numbers(
 
 
 def _viewpoint(entries: _Entries) -> tuple[float, ...]:
-    """Return x, y, z, w, x, y, z of a header with a quaternion of length 1.
+    """Return the position and the normalized quaternion in the order w, x, y, z.
 
-    Zeros throughout are the default: programs that do not know VIEWPOINT write them.
+    If all numbers are zero, return the default, because programs that do not support VIEWPOINT
+    write zeros.
     """
     if "VIEWPOINT" not in entries:
         return _NO_VIEWPOINT
@@ -289,7 +283,6 @@ def _viewpoint(entries: _Entries) -> tuple[float, ...]:
 
 
 def _pose(viewpoint: Sequence[float]) -> Floats:
-    """Return the matrix (4, 4) of a viewpoint."""
     *position, w, x, y, z = viewpoint
     return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(position))
 
@@ -298,7 +291,7 @@ def _pose(viewpoint: Sequence[float]) -> Floats:
 
 
 def _read_binary(header: _Header, body: memoryview) -> list[AnyArray]:
-    """Return an array (n, count) for each field of rows."""
+    """Return an array of shape (n, count) for each field of binary rows."""
     row_size = sum(field.size for field in header.fields)
     _check_length(header, row_size, len(body))
     size = row_size * header.points
@@ -311,7 +304,7 @@ def _read_binary(header: _Header, body: memoryview) -> list[AnyArray]:
 
 
 def _row_type(fields: Sequence[_Field], row_size: int) -> np.dtype[Any]:
-    """Return the type of a row, whose fields are named by their numbers."""
+    """Return the type of a row, whose fields are named by their indices."""
     offsets = list(accumulate((field.size for field in fields), initial=0))[:-1]
     return np.dtype(
         {
@@ -324,10 +317,7 @@ def _row_type(fields: Sequence[_Field], row_size: int) -> np.dtype[Any]:
 
 
 def _check_length(header: _Header, row_size: int, size: int) -> None:
-    """Check that all announced points are in a file.
-
-    Raises ValueError if not.
-    """
+    """Raise CutShortError if a file contains fewer points than declared."""
     if header.points * row_size > size:
         raise CutShortError(
             f"{header.points:,} points of {row_size} bytes are declared, but only "
@@ -336,9 +326,9 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
 
 
 def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[AnyArray]:
-    """Return an array (n, count) for each field of a body whose fields follow each other.
+    """Return an array of shape (n, count) for each field of a compressed body.
 
-    PCL leaves padding out of what it packs, other programs do not.
+    The fields are stored one after the other. PCL does not store padding, but other programs do.
     """
     if len(body) < 8:
         raise CutShortError("the sizes of its compressed points are missing")
@@ -358,7 +348,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
             "are present"
         )
     Allowance(file_size, _SMALLER).take(size)
-    content = _unpacked(body[8 : 8 + packed_size], size)
+    content = _decompress(body[8 : 8 + packed_size], size)
     arrays = []
     start = 0
     for field in stored:
@@ -375,12 +365,9 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
     ]
 
 
-def _unpacked(packed: memoryview, size: int) -> Bytes:
-    """Return bytes that LZF packed.
-
-    Raises ValueError if they are damaged.
-    """
-    from .lzf_loops import unpack_lzf  # numba takes a while to load
+def _decompress(packed: memoryview, size: int) -> Bytes:
+    """Decompress LZF data, or raise ValueError if it is corrupt."""
+    from .lzf_loops import unpack_lzf  # importing numba is slow
 
     content = np.zeros(size, np.uint8)
     if size and unpack_lzf(np.frombuffer(bytearray(packed), np.uint8), content) != size:
@@ -391,9 +378,10 @@ def _unpacked(packed: memoryview, size: int) -> Bytes:
 
 
 def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
-    """Return an array (n, count) for each field of lines.
+    """Return an array of shape (n, count) for each field of text lines.
 
-    Real numbers are read in double precision, whatever their SIZE: programs write more digits.
+    Floating-point fields are read in double precision regardless of their SIZE, since programs
+    write more digits.
     """
     names = [name for field in header.fields for name in _column_names(field)]
     lines = bytes(body).rstrip().count(b"\n") + 1
@@ -411,16 +399,16 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
         numbers: AnyArray = values[:, start : start + field.count]
         if field.name != _PADDING and field.kind[1] != "f":
             exact = _exact_integers(field, body, range(start, start + field.count))
-            numbers = _as_type(numbers, field) if exact is None else exact
+            numbers = _as_integers(numbers, field) if exact is None else exact
         arrays.append(numbers)
         start += field.count
     return arrays
 
 
 def _exact_integers(field: _Field, body: memoryview, cells: Sequence[int]) -> AnyArray | None:
-    """Return cells of text as the integers of a field of 64 bits, which double precision rounds.
+    """Parse the cells of a 64-bit integer field without rounding them to double precision.
 
-    None for another field, or if a cell is not written as an integer.
+    The result is None for other fields, or if a cell is not an integer.
     """
     if field.kind[2] != "8":
         return None
@@ -430,17 +418,15 @@ def _exact_integers(field: _Field, body: memoryview, cells: Sequence[int]) -> An
         return None
 
 
-def _as_type(values: Floats, field: _Field) -> AnyArray:
-    """Return real numbers as the whole numbers of a field.
+def _as_integers(values: Floats, field: _Field) -> AnyArray:
+    """Convert floating-point numbers to the integer type of a field.
 
-    Raises ValueError if they are others.
-
-    NaN becomes 0, as in PCL.
+    NaN becomes 0, as in PCL. Raise ValueError if other numbers are not representable.
     """
     numbers = np.nan_to_num(values)
     limits = np.iinfo(field.kind)
     lowest = float(limits.min)
-    stop = float(limits.max) + (field.kind[2] != "8")  # limits of 64 bits are rounded up as floats
+    stop = float(limits.max) + (field.kind[2] != "8")  # float() rounds 64-bit limits up
     if not ((numbers % 1 == 0) & (numbers >= lowest) & (numbers < stop)).all():
         raise ValueError(
             f"its field {printable(field.name)[:40]!r} must contain whole numbers from "
@@ -453,14 +439,13 @@ def _as_type(values: Floats, field: _Field) -> AnyArray:
 
 
 def _column_names(field: _Field) -> list[str]:
-    """Return the names of the columns of a field."""
     if field.count == 1:
         return [field.name]
     return [f"{field.name}_{index}" for index in range(field.count)]
 
 
 def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict[str, AnyArray]:
-    """Return the columns of all fields but padding."""
+    """Return the columns of all fields except padding."""
     columns = [
         (name, array[:, index])
         for field, array in zip(fields, arrays, strict=True)
@@ -474,12 +459,15 @@ def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict
     }
 
 
-def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return columns with red, green and blue in place of the packed column `rgb` or `rgba`."""
+def split_rgb(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
+    """Replace the packed column `rgb` or `rgba` by red, green and blue.
+
+    A column `alpha` is added unless alpha is constant.
+    """
     for name in ("rgb", "rgba"):
         if name not in columns or not columns.keys().isdisjoint(COLORS):
             continue
-        bits = _bits(columns.pop(name))
+        bits = _packed_colors(columns.pop(name))
         for shift, color in zip((16, 8, 0), COLORS, strict=True):
             columns[color] = (bits >> shift & 255).astype(np.uint8)
         alpha = (bits >> 24).astype(np.uint8)
@@ -488,11 +476,13 @@ def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
     return columns
 
 
-def _bits(values: AnyArray) -> AnyArray:
-    """Return packed colors 0xAARRGGBB (n,): whole numbers, or the bits of real numbers.
+def _packed_colors(values: AnyArray) -> AnyArray:
+    """Return packed colors as integers 0xAARRGGBB.
 
-    The first versions of PCL wrote the whole number of a color as a real number, 4.2108e+06 for a
-    gray. Bits of a color without alpha are far smaller than 1.
+    Colors are stored as integers, or as the bits of floating-point numbers. The first versions of
+    PCL instead converted the integer to a floating-point number, such as 4.2108e+06 for a gray. The
+    two can be distinguished because the bits of a color without alpha are a floating-point number
+    far below 1.
     """
     if values.dtype.kind in "iu":
         return values.astype(np.uint32)

@@ -1,9 +1,9 @@
-"""Files of vertices and polygons: .obj, .off, .ply and .stl, with all their digits.
+"""Readers of .obj, .off, .ply and .stl files, which contain vertices and polygons.
 
-trimesh reads all four, but fills non-convex polygons beyond their outline, drops what it does not
-understand, and refuses negative indices in .obj files of several objects and binary .ply files with
-triangles and quadrangles. assimp and Open3D keep single precision. plyfile trusts the counts of
-headers, and its license would apply to a program that uses it.
+trimesh is not used because it fills nonconvex polygons beyond their outline, ignores unknown
+content, and rejects negative indices in .obj files with several objects and binary .ply files with
+triangles and quadrilaterals. assimp and Open3D reduce coordinates to single precision. plyfile
+trusts the counts in headers, and its license would extend to programs that use it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from ...words import as_text
 from ..colors import Colors, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
-from .polygons import check_corners, triangulated
+from .polygons import check_corners, triangulate
 from .scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 
 
 def _ints(numbers: array[int]) -> Ints:
-    """Return an array of Python as an array of NumPy, without a copy."""
+    """Return a Python array as a NumPy array without copying it."""
     return np.frombuffer(numbers, np.int64)
 
 
@@ -45,35 +45,37 @@ def _float_array() -> array[float]:
 
 # -- .obj ----------------------------------------------------------------------------------------
 
-_MAX_COORDINATE = 1 << 62  # texture coordinates that a number may name
+_MAX_COORDINATE = 1 << 62  # limit for the indices of texture coordinates
 
 
 class _ObjTriangles(NamedTuple):
     """Triangles of an object."""
 
-    vertices: Ints  # (t, 3), rows of the vertices
-    coordinates: Ints  # (t, 3), rows of the texture coordinates
-    materials: Ints  # (t,)
+    vertices: Ints  # (t, 3), indices of vertices
+    coordinates: Ints  # (t, 3), indices of texture coordinates
+    materials: Ints  # (t,), indices of materials
 
 
 @dataclass
 class _ObjPolygons:
-    """Polygons of an object during reading, as arrays: lists take ten times as much memory."""
+    """Polygons of an object while it is read.
 
-    corners: array[int] = field(default_factory=_int_array)  # rows of vertices
-    coordinates: array[int] = field(default_factory=_int_array)  # rows of texture coordinates
-    sizes: array[int] = field(default_factory=_int_array)  # corners of each polygon
-    materials: array[int] = field(default_factory=_int_array)  # number of each polygon's material
+    Arrays are used because lists would require ten times as much memory.
+    """
+
+    corners: array[int] = field(default_factory=_int_array)  # indices of vertices
+    coordinates: array[int] = field(default_factory=_int_array)  # indices of texture coordinates
+    sizes: array[int] = field(default_factory=_int_array)  # number of corners of each polygon
+    materials: array[int] = field(default_factory=_int_array)  # material index of each polygon
 
     def triangles(self, vertices: Floats) -> _ObjTriangles:
-        """Return the triangles of the polygons, with `vertices` (v, 3)."""
         corners = _ints(self.corners)
         sizes = _ints(self.sizes)
         check_corners(corners, len(vertices))
         if not self.materials:  # polygons were read without materials
-            faces = triangulated(vertices, corners, sizes)
+            faces = triangulate(vertices, corners, sizes)
             return _ObjTriangles(faces, faces, np.zeros(len(faces), np.int64))
-        faces = triangulated(vertices[corners], np.arange(len(corners)), sizes)
+        faces = triangulate(vertices[corners], np.arange(len(corners)), sizes)
         materials = np.repeat(_ints(self.materials), sizes)
         return _ObjTriangles(corners[faces], _ints(self.coordinates)[faces], materials[faces[:, 0]])
 
@@ -82,37 +84,38 @@ class _ObjPolygons:
 class _ObjContent:
     """Vertices, texture coordinates and polygons of a file."""
 
-    objects: dict[tuple[str, int], _ObjPolygons]  # {(name, number of the line 'o'): polygons}
+    objects: dict[tuple[str, int], _ObjPolygons]  # {(name, index of the 'o' statement): polygons}
     positions: array[float] = field(default_factory=_float_array)  # x, y, z of each vertex
     coordinates: array[float] = field(default_factory=_float_array)  # u, v
-    tints: array[float] = field(default_factory=_float_array)  # red, green, blue of vertices
+    tints: array[float] = field(default_factory=_float_array)  # red, green, blue of each vertex
     materials: list[bytes] = field(default_factory=list)  # names
 
     @cached_property
     def vertices(self) -> Floats:
-        """Vertices, (v, 3)."""
+        """Vertex positions of shape (v, 3)."""
         return np.frombuffer(self.positions).reshape(-1, 3)
 
     @cached_property
     def uv(self) -> Floats:
-        """Texture coordinates, (c, 2)."""
+        """Texture coordinates of shape (c, 2)."""
         return np.frombuffer(self.coordinates).reshape(-1, 2)
 
     @cached_property
     def vertex_colors(self) -> Bytes | None:
-        """Colors of the vertices, (v, 3), or None unless all vertices have a color."""
+        """Vertex colors of shape (v, 3), or None unless all vertices have a color."""
         if not self.tints or len(self.tints) != len(self.positions):
             return None
         return as_bytes(_color_shares(np.frombuffer(self.tints).reshape(-1, 3)))
 
 
 def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
+    """Read a Wavefront (.obj) file.
 
-    A repeated name starts another object after 'o', and continues the group after 'g', as the
-    format says. Objects are in order of their first face; materials do not divide objects. Without
-    the option masks, triangles are solid; without masks, colors and materials, neither files of
-    materials nor images are read.
+    There is an object for each 'o' statement, or for each 'g' statement if there are no 'o'
+    statements. If a name is repeated after 'o', it starts another object. After 'g', it continues
+    the group, as the format defines. Objects are in the order of these statements and are not split
+    by materials. If `options.masks` is not set, all triangles are opaque. Material files and images
+    are only read if required by the options.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
@@ -125,7 +128,7 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
         for (name, _), polygons in content.objects.items():
             pieces = _obj_pieces(content, polygons, materials, options)
             meshes += join_pieces(name, pieces)
-    except (ValueError, OverflowError) as error:  # OverflowError: of numbers beyond 64 bits
+    except (ValueError, OverflowError) as error:  # integers beyond 64 bits raise OverflowError
         raise ValueError(_obj_mistake(data, options.colors) or str(error)) from error
     return Content(meshes, notes=materials.notes.lines())
 
@@ -133,14 +136,14 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
 def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) -> _ObjContent:
     """Parse the lines of a file.
 
-    Without a name, polygons belong to the object `stem`.
+    Polygons before the first named object belong to the object `stem`.
     """
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     polygons = _ObjPolygons()
     content = _ObjContent({(stem, 0): polygons})
     positions = content.positions
     material = 0
-    materials = {b"": 0}  # {name: number}
+    materials = {b"": 0}  # {name: index}
     for line in text.split(b"\n"):
         key, _, value = line.lstrip(b" ").partition(b" ")
         if key == b"v":
@@ -194,13 +197,13 @@ def _obj_pieces(
 
 
 def _obj_names(key: bytes, text: bytes) -> list[bytes]:
-    """Return the distinct values of lines that start with a word, in order."""
+    """Return the distinct values of all statements with a keyword, in order."""
     values = re.findall(rb"^ *%s +(.*)$" % key, text, re.MULTILINE)
     return list(dict.fromkeys(name.strip() for name in values))
 
 
 def _obj_coordinates(value: bytes) -> list[float]:
-    """Return two texture coordinates, or NaN if a word is not a number."""
+    """Parse two texture coordinates, which are NaN if a word is not a number."""
     try:
         u, v = [*map(float, value.partition(b"#")[0].split()[:2]), 0.0][:2]
     except ValueError:
@@ -209,9 +212,9 @@ def _obj_coordinates(value: bytes) -> list[float]:
 
 
 def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
-    """Return the rows of texture coordinates of a face's corners, -1 for a missing row.
+    """Return the indices of the texture coordinates of a face, or -1 for missing ones.
 
-    `count` texture coordinates have been read so far.
+    `count` is the number of texture coordinates that have been read so far.
     """
     words = [word.split(b"/") for word in value.split()]
     try:
@@ -222,15 +225,16 @@ def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
 
 
 def _obj_corners(value: bytes, count: int) -> list[int]:
-    """Return the rows of vertices of a face, after `count` vertices that have been read.
+    """Return the vertex indices of a face.
 
-    ValueError if a number is none of a vertex before the face.
+    `count` is the number of vertices that have been read so far. Raise ValueError if a negative
+    index refers to a vertex before the first one.
     """
     words = value.split()
     if b"/" in value:
         words = [word.partition(b"/")[0] for word in words]
     numbers = list(map(int, words))
-    if numbers and min(numbers) <= 0:  # rare, so that this is the only check
+    if numbers and min(numbers) <= 0:  # a single check, since negative numbers are rare
         if 0 in numbers or min(numbers) < -count:
             raise ValueError("a face refers to a missing vertex")
         return [number - 1 if number > 0 else count + number for number in numbers]
@@ -238,9 +242,9 @@ def _obj_corners(value: bytes, count: int) -> list[int]:
 
 
 def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
-    """Return which line of a file is wrong, or None if each line is right by itself."""
+    """Return which line of a file is invalid, or None if each line is valid by itself."""
     total = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
-    count = 0  # vertices so far
+    count = 0  # vertices read so far
     for number, line in _logical_lines(data):
         key, *words = line.partition(b"#")[0].split() or [b""]
         if key == b"v":
@@ -265,7 +269,10 @@ def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
 
 
 def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the lines of a file, joined where a backslash ends them, and their first numbers."""
+    """Yield the lines of a file with their line numbers.
+
+    Lines that end with a backslash are joined with the next line.
+    """
     joined = b""
     first = 0
     for number, line in enumerate(re.split(rb"\r\n|\r|\n", data), 1):
@@ -280,7 +287,6 @@ def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _is_real(word: bytes) -> bool:
-    """Return True if a word is a number."""
     try:
         float(word)
     except ValueError:
@@ -289,19 +295,19 @@ def _is_real(word: bytes) -> bool:
 
 
 def _shown(line: bytes) -> str:
-    """Return the start of a line, for messages."""
+    """Return the start of a line for error messages."""
     return as_text(line.strip()[:60])
 
 
 # -- .off ----------------------------------------------------------------------------------------
 
-# Normals (N), colors (C) and texture coordinates (ST) may follow the position of a vertex. Some
-# files have the counts on the line of the word.
+# Normals (N), colors (C) and texture coordinates (ST) can follow the position of a vertex. Some
+# files have the counts in the same line as the keyword.
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
 def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read an Object File Format file as a single mesh, with the colors of vertices (COFF)."""
+    """Read an Object File Format (.off) file as a single mesh, with its vertex colors (COFF)."""
     uncommented = re.sub(rb"#[^\r\n]*", b"", data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = uncommented.lstrip()
     keyword = _OFF.match(text)
@@ -315,22 +321,20 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
     is_colored = options.colors and keyword is not None and keyword[0].upper() == b"COFF"
     vertices, tints = _off_vertices(vertex_lines, is_colored=is_colored)
     corners, sizes = _off_faces(face_lines, len(vertices))
-    faces = triangulated(vertices, corners, sizes)
+    faces = triangulate(vertices, corners, sizes)
     colors = None
     if is_colored and len(tints) == len(vertices):
         colors = _vertex_colors(_color_shares(tints), faces)
     return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colors)]))
 
 
-_NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
+_NumberedLine = tuple[int, list[bytes]]  # (line number, words)
 
 
 def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[_NumberedLine]]:
-    """Return the lines of vertices and of faces after the counts.
+    """Return the vertex lines and the face lines after the line with the counts.
 
-    Raises ValueError for other counts.
-
-    `first_line` is the number of the first line in the file.
+    `first_line` is the line number of the first line of `text`.
     """
     lines = [
         (number, line.split())
@@ -351,7 +355,7 @@ def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[
 
 
 def _off_vertices(lines: Sequence[_NumberedLine], *, is_colored: bool) -> tuple[Floats, Floats]:
-    """Return the vertices (v, 3) of lines, and the colors (k, 3) that follow them."""
+    """Return the vertices, and the colors of the vertices that have one."""
     numbers = array("d")
     tints = array("d")
     for number, words in lines:
@@ -366,7 +370,7 @@ def _off_vertices(lines: Sequence[_NumberedLine], *, is_colored: bool) -> tuple[
 
 
 def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
-    """Return the corners (sum of sizes,) and sizes (p,) of the faces of lines.
+    """Return the corners of all faces, and the number of corners of each face.
 
     `count` is the number of vertices.
     """
@@ -393,30 +397,32 @@ def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
 
 
 def _off_mistake(number: int, words: Sequence[bytes], expected: str) -> str:
-    """Return the message on a line that is wrong."""
     return f"line {number} is '{_shown(b' '.join(words))}', but {expected} were expected"
 
 
 def _color_shares(colors: Floats) -> Floats:
-    """Return colors as 0 to 1.
+    """Scale colors to the range 0 to 1.
 
-    If a number is above 1.5, all are written as 0 to 255.
+    If any value is above 1.5, all values are assumed to range from 0 to 255.
     """
     return colors / (255 if (colors > 1.5).any() else 1)
 
 
 def _vertex_colors(shares: Floats, faces: Ints) -> Colors:
-    """Return the colors of faces whose vertices have colors (v, 3), 0 to 1."""
-    return Colors.of_corners(as_bytes(shares)[faces])
+    """Return face colors from vertex colors that range from 0 to 1."""
+    return Colors.from_vertex_colors(as_bytes(shares)[faces])
 
 
 # -- .stl ----------------------------------------------------------------------------------------
 
 
 def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a stereolithography file: a single mesh if binary, a mesh for each solid if text."""
+    """Read a stereolithography (.stl) file.
+
+    A binary file contains a single mesh. A text file contains a mesh for each solid.
+    """
     announced = int.from_bytes(data[80:84], "little")
-    # A few more bytes may follow; in a text file the number does not fit.
+    # A few more bytes can follow. In a text file, the number does not match the size.
     if len(data) >= 84 and 0 <= len(data) - 84 - 50 * announced < 50:
         rows = np.frombuffer(data, np.uint8, 50 * announced, 84).reshape(-1, 50)
         corners = np.ascontiguousarray(rows[:, 12:48]).view("<f4").astype(np.float64)
@@ -450,7 +456,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _stl_mistake(text: bytes) -> str | None:
-    """Return which line of a text file is wrong, or None if each facet has three vertices."""
+    """Return which line of a text file is invalid, or None if all facets have three vertices."""
     count = 0
     for number, line in enumerate(text.split(b"\n"), 1):
         key, *words = line.lower().split() or [b""]
@@ -466,7 +472,7 @@ def _stl_mistake(text: bytes) -> str | None:
 
 
 def _stl_mesh(name: str, corners: Floats) -> list[SceneMesh]:
-    """Return a mesh of triangles that share no vertices, in a list, or [] without triangles."""
+    """Return a list with a mesh of separate triangles, which is empty if there are no triangles."""
     faces = np.arange(len(corners)).reshape(-1, 3)
     return [SceneMesh(name, corners, faces)] if len(faces) else []
 
@@ -489,42 +495,43 @@ _PLY_COLORS = ("red", "green", "blue")
 
 @dataclass
 class _Element:
-    """An element of a .ply header."""
+    """An element declared in a .ply header."""
 
     name: str
     count: int
-    # {name: (type of the numbers, type of the length of a list, '' for a single number)}
+    # {name: (type of the values, type of the list length, or '' for a single value)}
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
 class _PlyColumn(NamedTuple):
-    """Numbers of a property in all rows of an element."""
+    """The values of a property in all rows of an element."""
 
     numbers: AnyArray  # (sum of sizes,)
-    sizes: Ints  # (rows,), numbers of each row
+    sizes: Ints  # (rows,), number of values in each row
 
 
 _PlyRows = dict[str, dict[str, _PlyColumn]]  # {element: {property: column}}
 
 
 class _PlyHeader(NamedTuple):
-    """Header of a .ply file, and the bytes after the header."""
+    """The header of a .ply file, and the bytes that follow it."""
 
     elements: list[_Element]
-    order: str  # byte order, '' of text
+    order: str  # byte order, or '' for text
     body: bytes
-    lines: int  # lines of the header
-    comments: list[str]  # texts of comment and obj_info
+    lines: int  # number of header lines
+    comments: list[str]  # including obj_info
 
 
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a Stanford polygon file: text or binary, faces of any mixture.
+    """Read a Stanford polygon (.ply) file, which is text or binary and can mix any polygons.
 
-    Colors are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
+    Vertex colors are the properties red, green and blue. They are integers, or floating-point
+    numbers from 0 to 1 or 255.
     """
     header = _ply_header(data)
     counts = {element.name: element.count for element in header.elements}
-    # Types of the properties, before text is read as real numbers.
+    # These are the declared types, which `_ply_rows` changes for text files.
     types = {element.name: element.properties for element in header.elements}
     if counts.get("tristrips"):
         raise MeshFileError("has triangle strips, which are not supported. Export it with faces")
@@ -542,10 +549,6 @@ def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
-    """Return the triangles (t, 3) of all faces.
-
-    Raises ValueError if there are no indices.
-    """
     name = next((name for name in _PLY_LISTS if name in rows["face"]), None)
     if name is None:
         raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
@@ -553,46 +556,42 @@ def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("the vertex indices of faces must be integers")
-    return triangulated(vertices, corners, sizes)
+    return triangulate(vertices, corners, sizes)
 
 
 def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:
-    """Return the colors of faces whose vertices have colors of a type."""
+    """Return face colors from the vertex colors, which are stored with the given type."""
     columns = [rows["vertex"][name].numbers for name in _PLY_COLORS]
     colors = np.stack(columns, axis=1).astype(np.float64)
     kind = np.dtype(type_name)
-    # Integers of four bytes hold 0 to 255, as real numbers may do.
+    # Four-byte integers range from 0 to 255, like some floating-point colors.
     if kind.kind in "iu" and kind.itemsize < 4:
         return _vertex_colors(colors / np.iinfo(kind).max, faces)
     return _vertex_colors(_color_shares(colors), faces)
 
 
 def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
-    """Read the properties of vertices of a Stanford polygon file, but lists: {name: (n,)}."""
+    """Read the vertex properties of a Stanford polygon (.ply) file by name, except lists.
+
+    Each column has shape (n,).
+    """
     rows = _ply_rows(_ply_header(data)).get("vertex", {})
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
 
 
 def ply_comments(data: bytes) -> list[str]:
-    """Return the comments of a Stanford polygon file, with its lines obj_info."""
+    """Return the comments of a Stanford polygon (.ply) file, including obj_info lines."""
     return _ply_header(data).comments
 
 
 def _ply_vertices(rows: _PlyRows) -> Floats:
-    """Return the positions of vertices, (v, 3).
-
-    Raises ValueError if an axis is missing.
-    """
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     return np.stack([rows["vertex"][axis].numbers for axis in "xyz"], axis=1).astype(np.float64)
 
 
 def _ply_header(data: bytes) -> _PlyHeader:
-    """Parse the header of a .ply file.
-
-    Raises ValueError if the header is broken.
-    """
+    """Parse the header of a .ply file, or raise ValueError if it is invalid."""
     header_match = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
     header_match = header_match or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
     if not header_match:
@@ -627,8 +626,8 @@ def _ply_header(data: bytes) -> _PlyHeader:
 def _ply_rows(header: _PlyHeader) -> _PlyRows:
     """Return all rows of all elements.
 
-    Text is read in double precision, whatever type its header states: georeferenced vertices are
-    often declared `float` and have more digits.
+    Text is read in double precision regardless of the declared type, because georeferenced vertices
+    are often declared as `float` but have more digits.
     """
     elements, order, body, *_ = header
     if not order:
@@ -655,7 +654,7 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
 
 
 def _text_mistake(header: _PlyHeader) -> str | None:
-    """Return which line of a body of text is wrong, or None."""
+    """Return which line of a text body is invalid, or None."""
     for number, line in enumerate(header.body.splitlines(), header.lines + 1):
         for word in line.split():
             if not _is_real(word):
@@ -664,7 +663,7 @@ def _text_mistake(header: _PlyHeader) -> str | None:
 
 
 class _PlyElementReader:
-    """Reader of the rows of an element from bytes."""
+    """A reader of the rows of an element."""
 
     def __init__(self, element: _Element, order: str, body: bytes) -> None:
         self._element = element
@@ -690,9 +689,9 @@ class _PlyElementReader:
         return self._unequal_rows(start)
 
     def _equal_rows(self, start: int, sizes: list[int]) -> dict[str, _PlyColumn] | None:
-        """Return columns if all rows have as many numbers as the first, as most files, else None.
+        """Read all rows as a table, or return None if rows have different numbers of values.
 
-        The rows are read at once as a table.
+        In most files, all rows have the same number of values.
         """
         count = self._element.count
         properties = self._element.properties
@@ -711,9 +710,9 @@ class _PlyElementReader:
         return None
 
     def _unequal_rows(self, start: int) -> tuple[dict[str, _PlyColumn], int]:
-        """Return columns of rows that differ in length, and the offset after the last row."""
+        """Read rows with different numbers of values, and return the offset after the last row."""
         count = self._element.count
-        spans = array("q")  # tuples would take ten times as much memory
+        spans = array("q")  # tuples would require ten times as much memory
         offset = start
         for _ in range(count):
             row_spans, offset = self._row(offset)
@@ -723,7 +722,7 @@ class _PlyElementReader:
         table = np.frombuffer(spans, np.int64).reshape(count, len(self._kinds), 2)
         for column, (name, kind) in enumerate(self._kinds.items()):
             starts, sizes = table[:, column].T
-            # Offsets of all numbers, in order.
+            # Compute the offsets of all values in order.
             within_row = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
             offsets = np.repeat(starts, sizes) + kind.itemsize * within_row
             numbers = raw[offsets[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
@@ -731,7 +730,7 @@ class _PlyElementReader:
         return columns, offset
 
     def _row(self, start: int) -> tuple[list[tuple[int, int]], int]:
-        """Return offset and count of the numbers of each property of a row, and the row's end."""
+        """Return the offset and length of each property in a row, and the offset after the row."""
         element = self._element
         body = self._body
         spans = []
@@ -756,7 +755,6 @@ class _PlyElementReader:
         return spans, offset
 
     def _cut_short(self) -> CutShortError:
-        """Return the error of a body that ends within the rows."""
         count = self._element.count
         return CutShortError(
             f"{count:,} rows of {self._element.name[:20]} are declared, but there are fewer"

@@ -1,4 +1,4 @@
-"""Triangulation of polygons, also non-convex polygons, such as a wall with a door."""
+"""Triangulation of polygons, including nonconvex ones such as a wall with a door."""
 
 from __future__ import annotations
 
@@ -8,40 +8,44 @@ import numpy as np
 from ...numerics.arrays import Bools, Floats, Ints
 from ...numerics.vectors import matvec, norm, rotate
 
-# For an outline that crosses itself everywhere, the clipper's time grows with the cube of the
-# corners: 20 s for this number. Larger outlines are probably broken files.
+# If an outline intersects itself everywhere, the time for ear clipping grows with the cube of the
+# number of corners. It is 20 s for this number. Files with larger outlines are probably invalid.
 MAX_CORNERS = 5000
 
-_WARPED = 1e-5  # largest distance of a plane polygon's corners from the plane, over its size
-_FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
+_WARPED = 1e-5  # maximum deviation of a planar polygon from its plane, relative to its size
+_FLAT = 1e-12  # a corner is reflex if the sine of its turning angle is below minus this
 
 
-def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
-    """Cut polygons into triangles with the same corners and orientation.
+def triangulate(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
+    """Triangulate polygons without changing their corners and orientation.
 
-    Convex polygons and quadrangles become fans, all of the same size at once; mapbox_earcut clips
-    the ears of other polygons.
+    Convex polygons and quadrilaterals become fans, where all polygons with the same number of
+    corners are processed together. Other polygons are triangulated by ear clipping with
+    mapbox_earcut.
 
     Parameters
     ----------
     vertices
-        (v, 3).
+        Coordinates. Shape (v, 3).
     corners
-        (sum of sizes,): rows of `vertices` of all polygons in order.
+        Indices into `vertices` of the corners of all polygons in order. Shape (sum of sizes,).
     sizes
-        (p,): number of corners of each polygon; polygons with fewer than three are dropped.
+        Number of corners of each polygon. Polygons with fewer than three corners are ignored. Shape
+        (p,).
 
     Returns
     -------
-    (t, 3), rows of `vertices`, in the order of the polygons: for each polygon two triangles less
-    than corners. There are fewer triangles if a plane outline crosses or touches itself or runs
-    back on itself, such as around a hole: the enclosed area is filled, and parts without area are
-    left out.
+    Ints
+        Indices into `vertices` of the triangles in the order of the polygons. Shape (t, 3). A
+        polygon with n corners has n - 2 triangles. It has fewer triangles if it is planar and its
+        outline intersects, touches or retraces itself, such as around a hole. In this case, the
+        enclosed area is filled, and parts without area are omitted.
 
     Raises
     ------
     ValueError
-        If a corner refers to a missing vertex, or a non-convex polygon has too many corners.
+        If a corner refers to a vertex that does not exist, or if a nonconvex polygon has more than
+        `MAX_CORNERS` corners.
     """
     check_corners(corners, len(vertices))
     first = np.cumsum(sizes) - sizes
@@ -53,86 +57,98 @@ def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
         if size == 4:
             polygon_corners = _from_reflex_corner(vertices, polygon_corners)
         triangle_rows = stops[polygons, None] - (size - 2) + np.arange(size - 2)
-        triangles[triangle_rows] = fanned(polygon_corners)
+        triangles[triangle_rows] = fan_triangles(polygon_corners)
         if size > 4:
             has_reflex = _reflex_corners(vertices[polygon_corners]).any(axis=1)
             for i in np.flatnonzero(has_reflex).tolist():
-                clipped = _clipped_polygon(vertices, polygon_corners[i])
-                if len(clipped):  # else neither polygon nor fan have an area
+                clipped = _triangulate_nonconvex(vertices, polygon_corners[i])
+                if len(clipped):  # otherwise, neither the polygon nor the fan has an area
                     triangles[triangle_rows[i]] = -1
                     triangles[triangle_rows[i, : len(clipped)]] = clipped
     return triangles[triangles[:, 0] >= 0]
 
 
-def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
-    """Return the triangles (t, 3) of a polygon with reflex corners, or none without an area."""
-    clipped = with_holes(vertices, [corners])
+def _triangulate_nonconvex(vertices: Floats, corners: Ints) -> Ints:
+    """Triangulate a polygon with reflex corners, and return no triangles if it has no area."""
+    clipped = triangulate_with_holes(vertices, [corners])
     if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
         return np.asarray(corners[_all_triangles(vertices[corners])])
     return clipped
 
 
 def _from_reflex_corner(vertices: Floats, quadrangles: Ints) -> Ints:
-    """Rotate the corners of quadrangles (p, 4) to start at a reflex corner, so that a fan fits.
+    """Rotate the corners of quadrilaterals to start at a reflex corner, so that a fan is valid.
 
-    The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
+    Ear clipping would omit half of a quadrilateral that is so warped that its projection intersects
+    itself. Quadrilaterals have shape (p, 4).
     """
     reflex = _reflex_corners(vertices[quadrangles])
     start = np.where(reflex.sum(axis=1) == 1, reflex.argmax(axis=1), 0)
     return np.take_along_axis(quadrangles, (start[:, None] + np.arange(4)) % 4, axis=1)
 
 
-def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
-    """Return the triangles (t, 3) of a polygon with holes.
+def triangulate_with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
+    """Triangulate a polygon with holes.
 
-    The first of the `rings` is the outline, further rings are outlines of holes. The triangles have
-    the orientation of the outline; there are no triangles if the outline has no area.
+    The first ring is the outline, and the other rings are holes. The triangles have the orientation
+    of the outline. There are no triangles if the outline has no area.
 
     Raises
     ------
     ValueError
-        If a corner refers to a missing vertex, or there are too many corners.
+        If a corner refers to a vertex that does not exist, or if there are more than `MAX_CORNERS`
+        corners.
     """
     corners = np.concatenate(rings)
     if len(corners) > MAX_CORNERS:
         raise ValueError(f"a face has {len(corners):,} corners and is not convex. Triangulate it")
     check_corners(corners, len(vertices))
-    points = vertices[corners] - vertices[corners[0]]  # so that large coordinates lose no digits
+    points = vertices[corners] - vertices[corners[0]]  # preserves precision of large coordinates
     outline = points[: len(rings[0])]
     normal = _newell(outline)
     drop = int(np.abs(normal).argmax())
     across = (drop + 1) % 3
     up = (drop + 2) % 3
-    if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
+    if normal[drop] < 0:  # mapbox_earcut always returns counterclockwise triangles
         across, up = up, across
-    return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]
+    return corners[_clip_ears(points[:, [across, up]], [len(ring) for ring in rings])]
 
 
-def _clipped(flat: Floats, sizes: list[int]) -> Ints:
-    """Return the triangles (t, 3) of plane rings (k, 2): outline and holes, of `sizes` corners."""
+def _clip_ears(flat: Floats, sizes: list[int]) -> Ints:
+    """Triangulate planar rings, which are an outline and holes with the given sizes.
+
+    Points have shape (k, 2), and triangles have shape (t, 3).
+    """
     stops = np.cumsum(sizes).astype(np.uint32)
     triangles = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), stops)
     return np.asarray(triangles, np.int64).reshape(-1, 3)
 
 
-def unrolled(strip: Ints) -> Ints:
-    """Return the triangles (t, 3) of a strip of corners (t + 2,), all with the same orientation."""
+def unroll_strip(strip: Ints) -> Ints:
+    """Return the triangles of a triangle strip, all with the same orientation.
+
+    `strip` has shape (t + 2,), and the result has shape (t, 3).
+    """
     faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
     faces[1::2] = faces[1::2, [1, 0, 2]]
     return faces
 
 
-def fanned(corners: Ints) -> Ints:
-    """Return the triangles (…, t, 3) of fans of corners (…, t + 2)."""
+def fan_triangles(corners: Ints) -> Ints:
+    """Return the triangles of triangle fans.
+
+    `corners` has shape (…, t + 2), and the result has shape (…, t, 3).
+    """
     first = np.broadcast_to(corners[..., :1], corners[..., 2:].shape)
     return np.stack([first, corners[..., 1:-1], corners[..., 2:]], axis=-1)
 
 
 def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
-    """Return True if a polygon (k, 3) is warped and its triangles (t, 3, 3) leave gaps.
+    """Return whether a polygon is warped and its triangles leave gaps.
 
-    The projection of a warped polygon may cross itself, where the clipper leaves triangles out.
-    The area vectors of all triangles add up to the polygon's, however the polygon is cut.
+    If the projection of a warped polygon intersects itself, ear clipping omits triangles. The area
+    vectors of a complete triangulation add up to the area vector of the polygon. The polygon has
+    shape (k, 3), and triangles have shape (t, 3, 3).
     """
     points = points - points[0]
     size = np.abs(points).max()
@@ -144,16 +160,18 @@ def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
 
 
 def _all_triangles(points: Floats) -> Ints:
-    """Return triangles (k - 2, 3) of a warped polygon (k, 3): clipped along its normal, or a fan.
+    """Return the complete triangulation of a warped polygon.
 
-    The fan is the fan of the least area, which starts at the reflex corner if there is only one.
+    The polygon is clipped along its normal. If triangles are missing, the result is the fan with
+    the smallest area, which starts at the reflex corner if there is only one. The polygon has shape
+    (k, 3), and triangles have shape (k - 2, 3).
     """
     count = len(points)
     points = points - points[0]
     normal = _newell(points)
     normal = normal / norm(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    clipped = _clipped(rotate(points, np.stack([across, np.cross(normal, across)])), [count])
+    clipped = _clip_ears(rotate(points, np.stack([across, np.cross(normal, across)])), [count])
     if len(clipped) == count - 2:
         return clipped
 
@@ -162,18 +180,21 @@ def _all_triangles(points: Floats) -> Ints:
         return float(norm(np.cross(rotated[1:-1], rotated[2:])).sum())
 
     best = min(range(count), key=area)
-    return fanned((best + np.arange(count)) % count)
+    return fan_triangles((best + np.arange(count)) % count)
 
 
 def _newell(points: Floats) -> Floats:
-    """Return twice the area vector of a polygon (k, 3) (Newell)."""
+    """Return twice the area vector of a polygon by Newell's method."""
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 
 def check_corners(corners: Ints, vertex_count: int) -> None:
-    """Check that corners refer to existing vertices, numbered from 0.
+    """Check that corners refer to existing vertices.
 
-    Raises ValueError if not.
+    Raises
+    ------
+    ValueError
+        If a corner refers to a vertex that does not exist.
     """
     if len(corners) and not 0 <= corners.min() <= corners.max() < vertex_count:
         raise ValueError(
@@ -183,7 +204,10 @@ def check_corners(corners: Ints, vertex_count: int) -> None:
 
 
 def _reflex_corners(points: Floats) -> Bools:
-    """Return the mask (p, k) of reflex corners of polygons (p, k, 3)."""
+    """Return a mask of the reflex corners of polygons.
+
+    Polygons have shape (p, k, 3), and the mask has shape (p, k).
+    """
     points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)
     out_of = np.roll(into, -1, axis=1)

@@ -1,7 +1,8 @@
-"""Clouds of Leica's .pts: the number of points, and a point in each line, often several times.
+"""Reader of Leica .pts files, which consist of one or more point clouds.
 
-Leica Cyclone writes x, y, z, an intensity from -2048 to 2047, and red, green and blue; other
-programs leave out the intensity, the colors, or the number of points.
+A cloud consists of the number of points and a line for each point. Leica Cyclone writes x, y, z, an
+intensity from -2048 to 2047, and red, green and blue. Other programs omit the intensity, the
+colors, or the number of points.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from .intensity_scales import LEICA_LOWEST
 from .text_rows import RowReader
 
 COLORS = ("red", "green", "blue")
-_NAMES = {  # {cells of a line: names}
+_NAMES = {  # {number of cells in a line: names}
     3: ("x", "y", "z"),
     4: ("x", "y", "z", "intensity"),
     6: ("x", "y", "z", *COLORS),
@@ -31,16 +32,16 @@ _NAMES = {  # {cells of a line: names}
 
 
 def read_pts(path: Path) -> list[Sweep]:
-    """Read the clouds of a .pts, all in one frame.
+    """Read the clouds in a .pts file, all of which are in the same coordinate frame.
 
-    If an intensity of any cloud is negative, the intensities of all clouds are shifted by 2048, the
-    lowest value of Leica's scale.
+    If any intensity is negative, all intensities are shifted by 2048, since -2048 is the lowest
+    value on Leica's scale.
 
     Raises
     ------
     ValueError
-        If a line is wrong, or a cloud has another number of points than announced; the message
-        names the line.
+        If a line is invalid, or if the number of points in a cloud does not match the declared
+        number. The message contains the line number.
     LidarError
         If the file is larger than the memory.
     OSError
@@ -69,18 +70,21 @@ def read_pts(path: Path) -> list[Sweep]:
 
 
 def next_line(lines: Iterator[tuple[int, str]]) -> tuple[int, str] | None:
-    """Return the next line that is not blank, with its number, or None at the end."""
+    """Return the next nonblank line with its line number, or None at the end."""
     return next(((number, line) for number, line in lines if not line.isspace()), None)
 
 
 def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None) -> Sweep:
-    """Return the next `count` points, or all points without a count, after line `number`."""
+    """Read the next `count` points, or all points if `count` is None.
+
+    `number` is the number of the line that declares the count.
+    """
     if count == 0:
         return Sweep(np.zeros((0, 3)), {})
     first = next_line(lines)
     if first is None:
         raise CutShortError(f"line {number} declares {count:,} points, but none follow")
-    names = names_of_cells(first, _NAMES)
+    names = cell_names(first, _NAMES)
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
@@ -88,10 +92,13 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     return Sweep(values[:, :3], point_columns(values, names))
 
 
-def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the names of the cells of a line, by their number.
+def cell_names(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the cell names of a line according to the number of cells.
 
-    Raises ValueError for another number.
+    Raises
+    ------
+    ValueError
+        If the number of cells is not among the keys of `names`.
     """
     number, line = entry
     count = len(line.split())
@@ -105,7 +112,10 @@ def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) ->
 
 
 def point_columns(values: Floats, names: Sequence[str]) -> dict[str, AnyArray]:
-    """Return the columns of rows (n, k) after x, y and z, with colors of 0 to 255 as bytes."""
+    """Return the columns after x, y and z by name.
+
+    `values` has shape (n, k). Colors from 0 to 255 are converted to bytes.
+    """
     columns: dict[str, AnyArray] = {}
     for index, name in enumerate(names[3:], 3):
         columns[name] = values[:, index]

@@ -1,8 +1,8 @@
-"""Scans of Leica's .ptx: a header of ten lines, then a point for each cell of the scanner's grid.
+"""Reader of Leica .ptx files, in which each scan has a header and a line for each grid cell.
 
-The header is the number of columns and of rows, the scanner's position and its axes x, y and z, and
-a matrix of four rows. A point is multiplied by the matrix from the left: its last row is the
-position. Points without a return are zeros.
+The ten header lines contain the number of columns and rows, the position of the scanner, its x, y
+and z axes, and a transformation matrix with four rows. Points are row vectors that are multiplied
+by the matrix from the right, so its last row is the translation. Points without a return are zeros.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ...numerics.arrays import Floats
 from ...numerics.vectors import matmul
 from ...words import plural, printable
 from ..transform import affine
-from .pts import COLORS, names_of_cells, next_line, point_columns
+from .pts import COLORS, cell_names, next_line, point_columns
 from .text_rows import RowReader
 
-_NAMES = {  # {cells of a line: names}
+_NAMES = {  # {number of cells in a line: names}
     4: ("x", "y", "z", "intensity"),
     7: ("x", "y", "z", "intensity", *COLORS),
 }
-_HEADER_LINES = (  # numbers of each line, and their meaning
+_HEADER_LINES = (  # (number of values, meaning)
     (1, "the number of columns"),
     (1, "the number of rows"),
     (3, "the position of the scanner"),
@@ -40,19 +40,21 @@ _HEADER_LINES = (  # numbers of each line, and their meaning
     (4, "the third row of the transformation"),
     (4, "the last row of the transformation"),
 )
-_MAX_ROTATION_ERROR = 1e-3  # error of the transformation's axes, which are rounded
+_MAX_ROTATION_ERROR = 1e-3  # tolerance for rounded axes in the transformation
 
 _Lines = Iterator[tuple[int, str]]
 
 
 def read_ptx(path: Path) -> list[Sweep]:
-    """Read the scans of a .ptx, each in the frame of its scanner, with its pose.
+    """Read the scans in a .ptx file.
+
+    Points are in the frame of their scanner, and each sweep contains the pose of the scanner.
 
     Raises
     ------
     ValueError
-        If a line is wrong, or a scan has fewer points than its header announces; the message names
-        the line.
+        If a line is invalid, or if a scan has fewer points than its header declares. The message
+        contains the line number.
     LidarError
         If the file is larger than the memory.
     OSError
@@ -70,7 +72,10 @@ def read_ptx(path: Path) -> list[Sweep]:
 
 
 def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
-    """Return the scan whose header begins with a line, from a file of a size in bytes."""
+    """Read the scan whose header starts with the given line.
+
+    `size` is the size of the file in bytes.
+    """
     start = entry[0]
     header = [_header_numbers(entry, *_HEADER_LINES[0])]
     for width, meaning in _HEADER_LINES[1:]:
@@ -89,18 +94,19 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
         )
     count = int(columns) * int(rows)
     pose = _pose(np.array(header[6:]), start)
-    # Programs that write points in the frame of the file give no transformation.
+    # Programs that write points in the frame of the file write an identity matrix.
     is_placed = np.array_equal(pose, np.eye(4))
     scanner = np.array(position) if is_placed else pose[:3, 3]
     if not count:
         return Sweep(np.zeros((0, 3)), {}, pose=pose, scanner=scanner)
     first = next_line(lines)
-    names = ("x", "y", "z", "intensity") if first is None else names_of_cells(first, _NAMES)
+    names = ("x", "y", "z", "intensity") if first is None else cell_names(first, _NAMES)
     values = np.zeros((0, len(names)))
-    if first is not None and 8 * count <= size:  # a digit and a space for each of four numbers
+    # A line has at least a digit and a separator for each of four numbers.
+    if first is not None and 8 * count <= size:
         texts = (line for _, line in lines)
         values = RowReader(names, range(len(names))).read(
-            _begun(first[1], islice(texts, count - 1)), first[0]
+            _with_first(first[1], islice(texts, count - 1)), first[0]
         )
     if len(values) < count:
         following_points = f"{len(values):,} follow" if len(values) else "there are fewer"
@@ -112,17 +118,13 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
     return Sweep(values[:, :3], point_columns(values, names), pose=pose, scanner=scanner)
 
 
-def _begun(first: str, lines: Iterator[str]) -> Iterator[str]:
-    """Yield a line, and further lines."""
+def _with_first(first: str, lines: Iterator[str]) -> Iterator[str]:
     yield first
     yield from lines
 
 
 def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[float]:
-    """Return the numbers of a line of the header.
-
-    Raises ValueError if they are others.
-    """
+    """Parse a header line, or raise ValueError if it does not contain `width` numbers."""
     number, line = entry
     try:
         values = list(map(float, line.split()))
@@ -137,10 +139,10 @@ def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[fl
 
 
 def _pose(matrix: Floats, start: int) -> Floats:
-    """Return the matrix (4, 4) from the frame of the scan to the frame of the file.
+    """Return the transform from scan coordinates to file coordinates.
 
-    `matrix` (4, 4) is the transformation of the file, whose header begins with line `start`.
-    ValueError if it is not a rotation and a position.
+    `matrix` is the transformation in the file, whose header starts at line `start`. Raise
+    ValueError if it is not a rotation and a translation.
     """
     rotation = matrix[:3, :3]
     error = np.abs(matmul(rotation, rotation.T) - np.eye(3)).max()

@@ -1,4 +1,4 @@
-"""Scene graphs of mesh files: nodes that place meshes and other nodes."""
+"""Scene graphs of mesh files, whose nodes place meshes and other nodes."""
 
 from __future__ import annotations
 
@@ -21,57 +21,59 @@ from ..animation import Animation
 from ..colors import Colors
 from ..face_materials import FaceMaterials
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
-from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
+from ..scene_mesh import Cutout, SceneMesh, drop_unused_vertices, stack_meshes
 from .polygons import check_corners
 
-# Advice on a file that unpacks to too much, without and with an animation.
+# Advice for files whose content is too large, without and with an animation.
 SMALLER = "Export it in parts, or as .ply"
 SHORTER = "Shorten its animation, or simplify its mesh"
-# A mesh becomes instances if that saves as many triangles; triangles of faces are cast faster.
+# A mesh is instantiated only if this saves as many triangles, since ray casting is faster for
+# triangles that are copied.
 SHARED_TRIANGLES = 100_000
-MAX_NODES = 200_000  # nodes of a scene, counting every instance
-_MAX_PATH_NAMES = 16  # names of nodes that a placed node remembers
-MAX_TRIANGLES = np.iinfo(np.int32).max  # limit for all placed meshes
+MAX_NODES = 200_000  # maximum number of nodes in a scene, including copies
+_MAX_PATH_NAMES = 16  # maximum number of names in `PlacedNode.path`
+MAX_TRIANGLES = np.iinfo(np.int32).max  # maximum total of all placed meshes
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Description of a mesh read from a raster of heights."""
+    """Metadata of a mesh that was read from an elevation raster."""
 
     crs: str  # coordinate system of the mesh, as "EPSG:25832" or WKT; empty if unknown
     epsg: int | None
-    summary: str  # size, step and coordinate system, for users
+    summary: str  # size, step and coordinate system, as shown to users
 
 
 class ObjectClass(NamedTuple):
-    """A semantic class that a format gives to its objects."""
+    """A semantic class that a file format assigns to its objects."""
 
     name: str
-    patterns: tuple[str, ...]  # patterns of the names of its objects
+    patterns: tuple[str, ...]  # name patterns of its objects
 
 
 class MeshFileError(Exception):
-    """An error of a mesh file, as a clause that follows the file's name."""
+    """An error in a mesh file, whose message is a clause that follows the name of the file."""
 
 
 class ReadOptions(NamedTuple):
-    """Content to read from a mesh file, besides triangles."""
+    """Options that control what is read from a mesh file besides triangles."""
 
     masks: bool
     colors: bool
-    # Resolved folders: files that the mesh file names are read only from these and below.
+    # Resolved folders. Files that the mesh file refers to are only read from these folders and
+    # their subfolders.
     folders: tuple[Path, ...]
-    # Unit and up axis that the user gives, else None. They are applied to the content, except the
-    # unit of rasters, for which the reader applies the unit to the heights.
+    # Unit and up axis if the user specifies them. They are applied after reading, except for
+    # rasters, whose reader applies the unit to the heights.
     unit: str | None = None
     up_axis: str | None = None
-    animation: str | None = None  # name of the animation to bake; "" for the first
-    materials: bool = False  # names of the materials of faces
-    skins_at_rest: bool = False  # meshes that a skeleton moves, which else are refused
-    own: Any = None  # options of this format alone, an instance of `MeshFormat.options`
+    animation: str | None = None  # name of the animation to bake, or "" for the first
+    materials: bool = False  # whether to read the material names of faces
+    skins_at_rest: bool = False  # whether to read skinned meshes, which are rejected otherwise
+    own: Any = None  # format-specific options, an instance of `MeshFormat.options`
 
     def allows(self, file: Path) -> bool:
-        """Return True if a file that the mesh file names may be read."""
+        """Return whether a file that the mesh file refers to can be read."""
         return is_inside(file, self.folders)
 
 
@@ -80,12 +82,12 @@ class RigidPart(NamedTuple):
 
     name: str
     objects: Sequence[SceneMesh | SceneInstance]
-    times_s: Floats  # (k,), ascending, since the survey's start; static before and after
+    times_s: Floats  # (k,), ascending, since the start of the survey; static before and after
     positions: Floats  # (k, 3)
-    rotations: Floats  # (k, 3, 3), perhaps rounded or scaled
+    rotations: Floats  # (k, 3, 3), possibly rounded or scaled
 
 
-# Generator that files written by lidarpool name: .glb is Y-up, others are Z-up.
+# Generator stated in files written by lidarpool, of which .glb is Y-up and all others are Z-up.
 GENERATOR = "lidarpool"
 
 
@@ -93,60 +95,70 @@ GENERATOR = "lidarpool"
 class Content:
     """Content of a mesh file.
 
-    `meshes` and `moving` are in the file's unit and frame.
+    `meshes` and `moving` are in the units and the coordinate frame of the file.
     """
 
     meshes: Sequence[SceneMesh | SceneInstance]
     moving: list[RigidPart] = field(default_factory=list)
-    unit_m: float | None = None  # meters in the file's unit; None if unknown
-    up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither file nor format states an axis
-    generator: str = ""  # the program that wrote the file, if known
-    turned: str = ""  # why a Y-up file is rotated, for a note; empty for no note
-    unit_note: str = ""  # clause on a unit that the file does not state
-    skipped: list[str] = field(default_factory=list)  # names of objects without an area
-    notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
+    unit_m: float | None = None  # length unit of the file in meters, or None if unknown
+    up_axis: str | None = None  # 'x', 'y' or 'z', or None if neither file nor format specifies it
+    generator: str = ""  # program that wrote the file, if known
+    rotation_note: str = ""  # note on why a Y-up file is rotated, or empty
+    unit_note: str = ""  # note on the unit if the file does not state it, or empty
+    skipped: list[str] = field(default_factory=list)  # names of objects with zero area
+    notes: list[str] = field(default_factory=list)  # clauses that follow the name of the file
     raster: Raster | None = None
     epsg: int | None = None  # code of the coordinate system in meters, if the file states it
-    is_landscape: bool = False  # whether the file is of land, never of a single object
-    # {number of ASPRS LAS: class} of formats whose objects have types
+    is_landscape: bool = False  # whether the file represents terrain rather than an object
+    # {ASPRS LAS class number: class}, for formats in which objects have types
     classes: Mapping[int, ObjectClass] = field(default_factory=dict)
 
 
 @dataclass
 class Node:
-    """A node, which places meshes and child nodes."""
+    """A scene graph node, which places meshes and child nodes."""
 
-    name: str  # empty where the file has no name
-    matrix: Floats  # (4, 4), from the node's coordinates to the parent's
-    # In the node's coordinates; nodes of the same mesh have the same object.
+    name: str  # empty if the file does not state a name
+    matrix: Floats  # (4, 4), from node coordinates to parent coordinates
+    # In node coordinates. Nodes with the same mesh refer to the same object.
     meshes: Sequence[SceneMesh] = ()
     children: Iterable[Hashable] = ()  # keys of the child nodes
-    # (k, 4, 4), to the node's coordinates: poses of copies of the meshes; None for a single copy
+    # Poses of several copies of the meshes in node coordinates, (k, 4, 4). None for a single copy.
     copies: Floats | None = None
-    skinned: bool = False  # joints place the meshes, which are in coordinates of the file
+    skinned: bool = False  # whether joints place the meshes, which are in file coordinates then
 
 
 class PlacedNode(NamedTuple):
-    """A mesh, and its matrix in a scene graph."""
+    """A mesh and its transform in a scene graph."""
 
     mesh: SceneMesh
-    matrix: Floats  # (4, 4), from the mesh's coordinates to the file's
+    matrix: Floats  # (4, 4), from mesh coordinates to file coordinates
     name: str
-    path: tuple[str, ...] = ()  # names of the innermost nodes that contain the mesh
+    path: tuple[str, ...] = ()  # names of the closest ancestors and of the node, which is last
 
 
 def placed_nodes(
     roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str
 ) -> list[PlacedNode]:
-    """Return all placed meshes of a scene graph, whose nodes may have several parents.
+    """Return all placed meshes of a scene graph, in which a node can have several parents.
 
-    `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. A placed mesh
-    is named by the nearest node with a name, else by the mesh, else by `stem`.
+    A placed mesh is named after its node. If the node has no name, the mesh is named after the
+    closest ancestor with a name. Without such an ancestor, the mesh keeps its own name, or is named
+    `stem` if it has none.
+
+    Parameters
+    ----------
+    roots
+        Keys of the root nodes.
+    node_of
+        Function that returns the node with a given key.
+    stem
+        Name for meshes without a name.
 
     Raises
     ------
     MeshFileError
-        If nodes contain each other without end, or there are more than `MAX_NODES`.
+        If nodes contain each other in a cycle, or if there are more than `MAX_NODES` nodes.
     """
     node_of = cache(node_of)
     placed = []
@@ -156,7 +168,7 @@ def placed_nodes(
         key, parent_matrix, path = stack.pop()
         node = node_of(key)
         visited += 1 if node.copies is None else 1 + len(node.copies)
-        # A few lines can make any number of nodes.
+        # A small file can declare any number of nodes.
         if visited + len(stack) > MAX_NODES:
             raise MeshFileError(
                 f"has more than {MAX_NODES:,} nodes and copies, or nodes that contain each other. "
@@ -176,16 +188,17 @@ def placed_nodes(
 
 
 def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> Content:
-    """Return the content of placed meshes: instances of meshes that many share, and copies.
+    """Convert placed meshes to instances and copies.
 
-    Meshes with masks that are placed twice become instances too, since each copy would have a part
-    for itself. With `copy_all` all meshes are copied, even meshes scaled to zero.
+    Meshes that are placed often become instances if this saves many triangles. Meshes with masks
+    become instances if they are placed at least twice, since each copy would require a separate
+    part. With `copy_all`, all meshes are copied, even those that are scaled to zero.
 
     Raises
     ------
     MeshFileError
         If a matrix is not finite or not affine, if there are too many triangles, or if the copies
-        would take more than a quarter of the memory.
+        would require more than a quarter of the memory.
     """
     objects: list[SceneMesh | SceneInstance] = []
     content = Content(objects)
@@ -234,12 +247,14 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
 def bake_animation(
     contents: Iterable[Content], times_s: Sequence[float], allowance: Allowance
 ) -> Content:
-    """Join contents of the same meshes at even times (k,) to a content of animated meshes.
+    """Combine the poses of the same meshes at evenly spaced times into animated meshes.
+
+    `contents` yields the meshes at each time.
 
     Raises
     ------
     MeshFileError
-        If the animation has no duration, or the number of vertices changes.
+        If the animation has no duration, or if the number of vertices changes.
     """
     if not times_s[-1] > times_s[0]:
         raise MeshFileError("has an animation without a duration. Add a second keyframe")
@@ -269,35 +284,35 @@ def bake_animation(
 
 
 class Piece(NamedTuple):
-    """Triangles of a mesh: all opaque, or all with the same mask."""
+    """Triangles of a mesh that are either all opaque or have the same mask."""
 
     vertices: AnyArray  # (v, 3)
     faces: Ints  # (f, 3)
     cutout: Cutout | None = None
     colors: Colors | None = None
-    material: str = ""  # name of the material of all faces, if `ReadOptions.materials`
+    material: str = ""  # material name of all faces if `ReadOptions.materials` is set
 
 
 def join_pieces(
     name: str, pieces: Iterable[Piece], allowance: Allowance | None = None
 ) -> list[SceneMesh]:
-    """Join pieces to a mesh, in a list, which is empty if the pieces have no faces.
+    """Merge pieces into a list with one mesh, which is empty if the pieces have no faces.
 
-    Pieces with masks are last. Formats whose files cannot unpack to much more than they hold need
-    no allowance.
+    Pieces with masks come last. No allowance is required for formats in which the content cannot be
+    much larger than the file.
 
     Raises
     ------
     ValueError
-        If a face refers to a missing vertex.
+        If a face refers to a vertex that does not exist.
     LidarError
-        If the pieces take more memory than allowed.
+        If the pieces require more memory than allowed.
     """
     solid: list[Piece] = []
     masked: dict[int, list[Piece]] = {}  # {id of a mask: its pieces}
     for piece in pieces:
         if len(piece.faces):
-            compact = _compacted_piece(piece, allowance)
+            compact = _compact_piece(piece, allowance)
             cut = compact.cutout
             group = solid if cut is None else masked.setdefault(id(cut.mask), [])
             group.append(compact)
@@ -309,7 +324,7 @@ def join_pieces(
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
     ordered = [*chain(solid, *masked.values())]
     sizes = [len(piece.faces) for piece in ordered]
-    vertices, faces = stacked((piece.vertices, piece.faces) for piece in ordered)
+    vertices, faces = stack_meshes((piece.vertices, piece.faces) for piece in ordered)
     return [
         SceneMesh(
             name,
@@ -318,21 +333,21 @@ def join_pieces(
             tuple(cutouts),
             colors.join_colors([piece.colors for piece in ordered], sizes),
             materials=face_materials.join_materials(
-                [FaceMaterials.named(piece.material) for piece in ordered], sizes
+                [FaceMaterials.from_name(piece.material) for piece in ordered], sizes
             ),
         )
     ]
 
 
-def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
-    """Return a piece without unused vertices, which many pieces may share."""
+def _compact_piece(piece: Piece, allowance: Allowance | None) -> Piece:
+    """Remove unused vertices from a piece, which can share its vertices with other pieces."""
     vertices, faces, cutout, face_colors, material = piece
     check_corners(faces, len(vertices))
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
         extra += 0 if face_colors is None else 40 * len(faces)
         allowance.take(faces.nbytes + extra)
-    vertices, faces = compacted(vertices, faces)
+    vertices, faces = drop_unused_vertices(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # double precision
     return Piece(vertices, faces, cutout, face_colors, material)

@@ -1,7 +1,7 @@
-"""The coordinate system that a cloud states, and positions in true meters by that system.
+"""Coordinate systems stated in point cloud files, and conversion of positions to true meters.
 
-Coordinates are taken as they are if their meters, feet or other units are true to scale; else they
-are refused, or brought to a system that the user chooses.
+Coordinates are used without a transformation if their unit is true to scale. Otherwise, they are
+rejected, or transformed to a system that the user specifies.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from ...words import printable
 from .coordinate_systems import (
     MAX_SCALE_ERROR,
     UNNAMED,
+    crs_from_code,
+    crs_from_text,
     crs_key,
     crs_name,
-    crs_of_code,
-    crs_of_text,
     ground_scale,
     has_registry,
     horizontal_part,
@@ -34,13 +34,13 @@ from .coordinate_systems import (
     is_true_in_utm,
     is_utm,
     missed_area,
-    need_registry,
     outside_system,
     projection_kind,
     projjson,
+    require_registry,
     suggested_epsg,
     target_problem,
-    transformed,
+    transform_coordinates,
 )
 from .las_units import (
     GEO_DOUBLES,
@@ -50,10 +50,10 @@ from .las_units import (
     USER_DEFINED,
     WKT_KEYWORDS,
     CoordinateUnits,
-    advice_to_project,
     geo_keys,
     height_unit_of_keys,
     method_of_keys,
+    reprojection_advice,
     units_of_epsg,
     units_of_keys,
     wkt_code,
@@ -61,18 +61,18 @@ from .las_units import (
     wkt_units,
 )
 
-WKT_RECORD = 2112  # record of LASF_Projection, by ASPRS LAS 1.4
+WKT_RECORD = 2112  # record number of LASF_Projection in ASPRS LAS 1.4
 _CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:(?:[\d.]*:)?(\d{4,6})")
 _COMMENT = re.compile(
     r"(?i)(?:(?:crs|srs|projection|coordinate system|spatial reference)(?: wkt)?\s*[:=]?\s*)?"
     r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
     rf"(?P<wkt>(?:{'|'.join(sorted(WKT_KEYWORDS))})\s*\[.*))"
 )
-Meters = tuple[float, float, float]  # meters in the units of x, y and z
+Meters = tuple[float, float, float]  # units of x, y and z in meters
 
 
 class _TiffTag(NamedTuple):
-    """A tag of TIFF."""
+    """A TIFF tag."""
 
     number: int
     type: int  # 3 for 16 bits, 4 for 32 bits, 12 for doubles, 2 for text
@@ -82,25 +82,30 @@ class _TiffTag(NamedTuple):
 
 @dataclass(frozen=True)
 class StatedSystem:
-    """Coordinate system that a file states: text, or GeoTIFF keys as LAS has them.
+    """The coordinate system that a file states as text or GeoTIFF keys.
 
     Attributes
     ----------
     text
-        WKT 1 or 2, or a code such as EPSG:25832; empty for keys.
+        WKT 1 or 2, or a code such as EPSG:25832, or an empty string for GeoTIFF keys.
     records
-        {number of a record of GeoTIFF keys: its content}.
+        Contents of the records with GeoTIFF keys, by record number.
     """
 
     text: str = ""
     records: Mapping[int, bytes] = field(default_factory=dict)
 
     @classmethod
-    def of_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
-        """Return the system of the records of LASF_Projection in a LAS file, or None without one.
+    def from_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
+        """Create a system from the LASF_Projection records of a LAS file.
 
-        `prefer_wkt` says whether WKT counts where a file also has GeoTIFF keys. ValueError if a
-        record is broken.
+        The result is None if the records do not state a system. `prefer_wkt` specifies whether WKT
+        has precedence if a file also has GeoTIFF keys.
+
+        Raises
+        ------
+        ValueError
+            If a record is invalid.
         """
         text = records.get(WKT_RECORD, b"").partition(b"\0")[0].decode("utf-8", "replace").strip()
         keys = geo_keys(records)
@@ -109,57 +114,59 @@ class StatedSystem:
         return cls(records=records) if keys else None
 
     @classmethod
-    def of_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
-        """Return the system that a comment of a file consists of, such as «crs: EPSG:3857»."""
+    def from_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
+        """Create a system from the first comment that only states a system, or return None.
+
+        For example, "crs: EPSG:3857" is such a comment.
+        """
         matches = (_COMMENT.fullmatch(comment.strip()) for comment in comments)
         texts = (match["wkt"] or f"EPSG:{match['code']}" for match in matches if match)
         return next((cls(text) for text in texts), None)
 
     @cached_property
     def _keys(self) -> dict[int, float]:
-        """Numbers of the GeoTIFF keys."""
         return geo_keys(self.records)
 
     @cached_property
     def _is_code(self) -> bool:
-        """Whether the text is a code alone."""
+        """Whether the text is only a code."""
         return _CODE.fullmatch(self.text) is not None
 
     @cached_property
     def _code(self) -> int | None:
-        """EPSG code that the text or the keys state, of a projected system if they are no code."""
+        """EPSG code in the text, or of the projected system in WKT or GeoTIFF keys."""
         if match := _CODE.fullmatch(self.text):
             return int(match[1])
         if self.text:
             try:
                 return wkt_code(self.text)
-            except ValueError:  # no WKT, which counts as meters where the user gives the unit
+            except ValueError:  # text that is not WKT is ignored if the user specifies the unit
                 return None
         code = int(self._keys.get(PROJECTED_CRS, 0))
         return None if code in (0, USER_DEFINED) else code
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the system, or None if the file states none."""
+        """EPSG code of the system, or None if the file does not state one."""
         return self._code
 
     @property
     def epsg_in_meters(self) -> int | None:
-        """EPSG code of a projected system in meters, or None if none is known."""
+        """EPSG code of the system if it is projected and in meters, or None."""
         if self.crs is None:
             return self._code if self._stated_m == 1.0 else None
         code = self._code or crs_key(self.crs)[1]
         return code if self.horizontal_m == 1.0 else None
 
     def units(self) -> CoordinateUnits | None:
-        """Return the units of the coordinates, or None if the file says nothing of a projection.
+        """Return the units of the coordinates, or None if the file does not describe a projection.
 
         Raises
         ------
         LidarError
-            If coordinates are angles or geocentric, or have a unit that cannot be known.
+            If coordinates are angles or geocentric, or if their unit cannot be determined.
         ValueError
-            If the text is no WKT.
+            If the text is not valid WKT.
         """
         if not self.text:
             return units_of_keys(self._keys)
@@ -169,34 +176,37 @@ class StatedSystem:
 
     @cached_property
     def crs(self) -> Any:
-        """The `rasterio.crs.CRS`, or None without rasterio, or if PROJ knows none on Earth."""
+        """The `rasterio.crs.CRS`, or None if it is unknown.
+
+        It is unknown without rasterio, and if PROJ knows no such system on Earth.
+        """
         if not has_registry():
             return None
-        crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
+        crs = crs_from_text(self.text) if self.text else _crs_from_keys(self.records)
         on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
-        if not on_earth and self._code:  # codes of Esri are beside EPSG codes in GeoTIFF keys
-            return crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
+        if not on_earth and self._code:  # GeoTIFF keys contain Esri codes as well as EPSG codes
+            return crs_from_code(self._code) or crs_from_text(f"ESRI:{self._code}")
         return crs if on_earth else None
 
     @property
     def horizontal_m(self) -> float | None:
-        """Meters in the unit of x and y, or None for angles, and if the unit is not known."""
+        """Unit of x and y in meters, or None if they are angles or the unit is unknown."""
         if self.crs is not None:
             return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
         return self._stated_m
 
     @property
     def _stated_m(self) -> float | None:
-        """Meters in the unit of x and y by the text or keys themselves, or None."""
+        """Unit of x and y in meters as stated by the file itself, or None."""
         try:
             units = self.units()
-        except (LidarError, ValueError):  # angles, or a text that is no WKT
+        except (LidarError, ValueError):  # angles, or text that is not WKT
             return None
         return None if units is None else units.horizontal.meters
 
     @property
     def angles(self) -> str:
-        """A clause on angles or geocentric coordinates that follows a file's name, or empty."""
+        """Clause about angular or geocentric coordinates that follows the file name, or empty."""
         if self.crs is None or self.crs.is_projected:
             return ""
         if is_geocentric(self.crs):
@@ -205,7 +215,10 @@ class StatedSystem:
 
     @property
     def is_true_by_name(self) -> bool | None:
-        """Whether the projection is for true lengths, by its code or name, or None if unknown."""
+        """Whether the projection preserves lengths, or None if this is unknown.
+
+        This is inferred from the code of the system or the name of the projection.
+        """
         if self._code in WORLD_EPSG:
             return False
         if self._code is not None and is_utm(self._code):
@@ -218,19 +231,22 @@ class StatedSystem:
         else:
             try:
                 method = wkt_method(self.text)
-            except ValueError:  # no WKT, which counts as meters where the user gives the unit
+            except ValueError:  # text that is not WKT is ignored if the user specifies the unit
                 return None
             has_projection = bool(method)
         return projection_kind(method) if has_projection else True  # local systems are true
 
     def is_in_utm_zone(self, positions: Floats) -> bool:
-        """Return True for a UTM zone whose meters are true at all positions (n, 3)."""
+        """Return whether the system is a UTM zone in meters that is true to scale at all positions.
+
+        Positions have shape (n, 3).
+        """
         if self._code is None or not is_utm(self._code) or self._stated_m != 1:
             return False
         return not len(positions) or is_true_in_utm(positions[:, 0])
 
     def height_m(self) -> tuple[float, str]:
-        """Return the meters in the unit of heights, and a clause if the unit is not stated."""
+        """Return the height unit in meters, and a note if the file does not state it."""
         stated = height_unit_of_keys(self._keys) if not self.text else None
         if stated is not None:
             return stated.meters, ""
@@ -259,39 +275,39 @@ class StatedSystem:
 
     @property
     def _has_name(self) -> bool:
-        """Whether PROJ knows a code or a name of the system."""
+        """Whether PROJ knows a code or a name for the system."""
         _, code = crs_key(self.crs)
         return code is not None or projjson(self.crs)["name"] not in UNNAMED
 
 
 @dataclass(frozen=True)
 class _Scale:
-    """What is known of the scale of a system where positions are."""
+    """The scale of a system at the location of the positions, as far as it is known."""
 
-    problem: str = ""  # why lengths are not true, as a clause that follows a file's name
-    epsg: int | None = None  # code of a system with true meters
-    note: str = ""  # clause on lengths at the edges, or on a scale that is unknown
+    problem: str = ""  # why lengths are not true to scale, as a clause after the file name
+    epsg: int | None = None  # code of a suggested system that is true to scale
+    note: str = ""  # note on lengths at the edges, or on an unknown scale
 
 
 def stated_meters(
     system: StatedSystem | None, positions: Floats, unit: str | None
 ) -> tuple[Meters, list[str]]:
-    """Return the meters in the units of x, y and z, and notes as clauses that follow a file's name.
+    """Return the units of x, y and z in meters, and notes that follow the name of the file.
 
     Parameters
     ----------
     system
-        The system that the file states; None counts as meters.
+        The system that the file states, or None for meters.
     positions
-        (n, 3): points of the file, or a sample, in its units.
+        All positions in the file, or a sample, in the units of the file. Shape (n, 3).
     unit
-        Unit that the user gives, in place of the units of the system.
+        Unit specified by the user, which replaces the units of the system.
 
     Raises
     ------
     LidarError
-        If coordinates are angles or geocentric, have a unit that cannot be known, or are lengths on
-        a map whose scale is not true.
+        If coordinates are angles or geocentric, if their unit cannot be determined, or if the map
+        projection is not true to scale.
     """
     if unit is not None or system is None:
         meter = UNITS_M[unit or "m"]
@@ -300,7 +316,7 @@ def stated_meters(
         return (meter, meter, meter), [note] if problem else []
     scale = _scale_of(system, positions)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {reprojection_advice(scale.epsg)}.")
     units = system.units()
     if units is None:
         return (1.0, 1.0, 1.0), []
@@ -308,20 +324,20 @@ def stated_meters(
 
 
 def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:
-    """Check the system of a file whose format has true meters, such as E57, and return notes.
+    """Check the system of a file whose format requires meters, such as E57, and return notes.
 
-    `positions` (n, 3) are points of the file, or a sample, in meters.
+    `positions` contains all positions in the file, or a sample, in meters. Its shape is (n, 3).
 
     Raises
     ------
     LidarError
-        If coordinates are geocentric, or lengths on a map whose scale is not true.
+        If coordinates are geocentric, or if the map projection is not true to scale.
     """
     if system is None:
         return []
     if system.crs is not None and is_geocentric(system.crs):
         raise LidarError(
-            f"its coordinates are geocentric ({system.name}). {advice_to_project(None)}."
+            f"its coordinates are geocentric ({system.name}). {reprojection_advice(None)}."
         )
     meter = system.horizontal_m
     if meter is None:
@@ -330,7 +346,7 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
         ]
     scale = _scale_of(system, positions / meter)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {reprojection_advice(scale.epsg)}.")
     notes = [scale.note] if scale.note else []
     if meter != 1.0:
         notes.append(
@@ -340,13 +356,14 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
 
 
 def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
-    """Return what is known of the scale of a system in the middle of positions (n, 3).
+    """Determine the scale of a system at the median of positions.
 
-    Without rasterio, or where PROJ cannot tell, the name of the projection counts.
+    Without rasterio, or if PROJ cannot compute the scale, it is inferred from the name of the
+    projection.
     """
     middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
     if system.is_in_utm_zone(positions):  # the registry takes half a second to load
-        return _Scale(note=_place_note(system, middle) if len(positions) else "")
+        return _Scale(note=_location_note(system, middle) if len(positions) else "")
     horizontal = None
     if system.crs is not None and not is_geocentric(system.crs):
         horizontal, _ = horizontal_part(system.crs)
@@ -368,16 +385,16 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     scales = [ground_scale(horizontal, x, y) for x in corners[:, 0] for y in corners[:, 1]]
     error = max((scale.error for scale in scales if scale is not None), default=0.0)
     if error <= MAX_SCALE_ERROR:
-        return _Scale(note=_place_note(system, middle))
+        return _Scale(note=_location_note(system, middle))
     return _Scale(
         note=f"is so large that lengths in {system.name} are wrong by {error:.1%} at its edges"
     )
 
 
-def _place_note(system: StatedSystem, middle: Floats) -> str:
-    """Return a clause on coordinates far outside the system's area of use, or "".
+def _location_note(system: StatedSystem, middle: Floats) -> str:
+    """Return a note if coordinates are far outside the area of use, or an empty string.
 
-    `middle` (2,) is the middle of the positions, in the unit of the system.
+    `middle` contains x and y in the unit of the system.
     """
     x, y = middle.tolist()
     area = outside_system(system.epsg, x, y) if system.epsg is not None else ""
@@ -385,7 +402,7 @@ def _place_note(system: StatedSystem, middle: Floats) -> str:
 
 
 def _scale_by_name(system: StatedSystem) -> _Scale:
-    """Return what the name of a projection says of its scale."""
+    """Infer the scale of a system from the name of its projection."""
     is_true = system.is_true_by_name
     if is_true:
         return _Scale()
@@ -400,10 +417,10 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
 
 
 class Reprojection:
-    """Brings positions from the system that a file states to a system in true meters.
+    """A transformation from the system of a file to a system that is true to scale in meters.
 
-    Heights are converted to meters and stay as in the file, with their vertical datum; heights of
-    geocentric coordinates are above the ellipsoid.
+    Heights are converted to meters, but keep their vertical datum. Heights of geocentric
+    coordinates are above the ellipsoid.
 
     Parameters
     ----------
@@ -420,12 +437,12 @@ class Reprojection:
     Raises
     ------
     LidarError
-        If the file states no system, PROJ does not understand one of the systems, or rasterio is
-        missing.
+        If the file states no system, if PROJ does not know one of the systems, or if rasterio is
+        not installed.
     """
 
     def __init__(self, system: StatedSystem | None, epsg: int) -> None:
-        need_registry("Transforming a cloud to another coordinate system")
+        require_registry("Transforming a cloud to another coordinate system")
         if system is None:
             raise LidarError(
                 f"it states no coordinate system, so it cannot be transformed to EPSG:{epsg}. "
@@ -435,7 +452,7 @@ class Reprojection:
         source = system.crs
         if source is None:
             raise LidarError(f"its coordinate system {system.name!r} is unknown to PROJ.")
-        target = crs_of_code(epsg)
+        target = crs_from_code(epsg)
         if target is None:
             raise LidarError(f"EPSG:{epsg} is unknown to PROJ. Use the code of a different system.")
         self._epsg = epsg
@@ -449,9 +466,12 @@ class Reprojection:
             self.notes += [note] if note else []
 
     def check(self, positions: Floats) -> None:
-        """Check that the chosen system is in true meters in the middle of positions (n, 3).
+        """Check that the target system is true to scale at the median of positions.
 
-        LidarError if it is not.
+        Raises
+        ------
+        LidarError
+            If it is not true to scale.
         """
         moved = self.apply(positions)
         if len(moved):
@@ -460,33 +480,41 @@ class Reprojection:
                 raise LidarError(f"it cannot be transformed to {problem}.")
 
     def apply(self, positions: Floats) -> Floats:
-        """Return positions (n, 3) in meters of the chosen system, NaN for positions not finite.
+        """Transform positions to the target system in meters.
 
-        LidarError for a position that is outside of one of the systems.
+        Positions that are not finite become NaN. The shape is (n, 3).
+
+        Raises
+        ------
+        LidarError
+            If a position is outside the domain of one of the systems.
         """
         finite = np.asarray(np.isfinite(positions).all(axis=1))
         moved = np.where(finite[:, None], positions, np.nan).astype(np.float64)
         axes = slice(3) if self._is_geocentric else slice(2)
         try:
-            moved[finite, axes] = transformed(self._source, self._target, moved[finite, axes])
-        except Exception as error:  # errors of GDAL have classes that rasterio keeps private
-            raise self._no_place() from error
+            moved[finite, axes] = transform_coordinates(
+                self._source, self._target, moved[finite, axes]
+            )
+        except Exception as error:  # rasterio does not export the classes of GDAL errors
+            raise self._location_error() from error
         if not np.isfinite(moved[finite]).all():
-            raise self._no_place()
+            raise self._location_error()
         moved[:, 2] *= self._height_m
         return moved
 
-    def _no_place(self) -> LidarError:
+    def _location_error(self) -> LidarError:
         return LidarError(
             f"it contains points that cannot be transformed to EPSG:{self._epsg}. Use the code of "
             "a different system."
         )
 
 
-def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
-    """Return the `rasterio.crs.CRS` of GeoTIFF keys, or None.
+def _crs_from_keys(records: Mapping[int, bytes]) -> Any:
+    """Return the `rasterio.crs.CRS` for GeoTIFF keys, or None.
 
-    GDAL reads them from a TIFF of one pixel, so that projections of a file's own are understood.
+    GDAL reads the keys from a TIFF with a single pixel, so that user-defined projections are
+    supported.
     """
     from rasterio.errors import RasterioError
     from rasterio.io import MemoryFile
@@ -499,17 +527,17 @@ def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
 
 
 def _tiff(records: Mapping[int, bytes]) -> bytes:
-    """Return a TIFF of one pixel with GeoTIFF keys, little-endian, by TIFF 6.0."""
+    """Return a little-endian TIFF 6.0 file that consists of a single pixel and GeoTIFF keys."""
     tags = [
         _TiffTag(256, 4, 1, struct.pack("<I", 1)),  # width
         _TiffTag(257, 4, 1, struct.pack("<I", 1)),  # length
-        _TiffTag(258, 3, 1, struct.pack("<H", 8)),  # bits of a sample
+        _TiffTag(258, 3, 1, struct.pack("<H", 8)),  # bits per sample
         _TiffTag(259, 3, 1, struct.pack("<H", 1)),  # no compression
         _TiffTag(262, 3, 1, struct.pack("<H", 1)),  # black is zero
         _TiffTag(273, 4, 1, struct.pack("<I", 8)),  # offset of the pixel
-        _TiffTag(277, 3, 1, struct.pack("<H", 1)),  # samples of a pixel
+        _TiffTag(277, 3, 1, struct.pack("<H", 1)),  # samples per pixel
         _TiffTag(278, 4, 1, struct.pack("<I", 1)),  # rows
-        _TiffTag(279, 4, 1, struct.pack("<I", 1)),  # bytes of the pixel
+        _TiffTag(279, 4, 1, struct.pack("<I", 1)),  # bytes in the strip
         _TiffTag(33550, 12, 3, struct.pack("<3d", 1, 1, 0)),  # size of the pixel
         _TiffTag(33922, 12, 6, bytes(6 * 8)),  # its position, six zeros
         *(
@@ -518,7 +546,7 @@ def _tiff(records: Mapping[int, bytes]) -> bytes:
             if records.get(number)
         ),
     ]
-    directory = 12  # its offset: after the head, and four bytes that begin with the pixel
+    directory = 12  # its offset, after the header and four bytes, the first of which is the pixel
     body_start = directory + 2 + 12 * len(tags) + 4
     rows = b""
     body = b""

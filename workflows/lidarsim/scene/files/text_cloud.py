@@ -1,7 +1,8 @@
-"""Text clouds: .xyz, .txt, .asc and .csv, with and without a header.
+"""Reader of text point clouds (.xyz, .txt, .asc and .csv), with or without a header.
 
-CloudCompare begins with `//X Y Z R G B` and the number of points; others with `x,y,z`, `# x y z` or
-`X;Y;Z`. Without a header, x, y and z are the first numbers of a line.
+CloudCompare starts files with `//X Y Z R G B` and the number of points. Other programs write
+headers such as `x,y,z`, `# x y z` or `X;Y;Z`. Without a header, the first numbers in a line are x,
+y and z.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from ...io.tables import column_name
 from ...numerics.arrays import AnyArray, Floats
 from ...schema.vocabulary import UNITS_M
 from ...words import distinct, plural, printable
-from .text_rows import REMARKS, RowReader, cells_of
+from .text_rows import COMMENT_PREFIXES, RowReader, cells_of
 
 _SEPARATORS = (";", "\t", ",", None)
 _HEAD_BYTES = 1 << 12
-_MAX_HEAD_LINES = 1_000  # remarks before the first point
-# A name of a header that spaces separate, with its unit: X [m]
+_MAX_HEAD_LINES = 1_000  # maximum number of comment lines before the first point
+# A name in a space-separated header and its unit, such as X [m]
 _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
-# {name without case and separators: axis}; of several, the first in this order counts.
+# {name in lower case without separators: axis}. The first name in this order has precedence.
 _AXES = {
     **{axis: axis for axis in "xyz"},
-    **{f"points{index}": axis for index, axis in enumerate("xyz")},  # names in ParaView
-    **{f"pointsmxyz{index}": axis for index, axis in enumerate("xyz")},  # and in newer VeloViews
+    **{f"points{index}": axis for index, axis in enumerate("xyz")},  # ParaView
+    **{f"pointsmxyz{index}": axis for index, axis in enumerate("xyz")},  # newer VeloView versions
     "easting": "x",
     "northing": "y",
     "east": "x",
@@ -47,35 +48,36 @@ _AXES = {
 _QUATERNION = {"qx", "qy", "qz", "qw"}
 _DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
 _TUM_COLUMNS = 8  # time, position and quaternion
-_KITTI_COLUMNS = 12  # three rows of a matrix, in each of them a rotation and an offset
+_KITTI_COLUMNS = 12  # the first three rows of a homogeneous matrix
 _RASTER = b"ncols"  # first word of an Esri ASCII grid
-_MIN_AMBIGUOUS = 6  # cells between commas that may be three numbers with decimal commas
-_MAX_EXACT = 1 << 53  # integers that double precision holds
-_MANY_POINTS = 3  # a column may count the points from so many points on
+_MIN_AMBIGUOUS = 6  # as many cells between commas could be three numbers with decimal commas
+_MAX_EXACT = 1 << 53  # integers below this are exact in double precision
+_MANY_POINTS = 3  # minimum number of points for detecting a column that numbers them
 
 
 class _Head(NamedTuple):
-    """What precedes the points of a file."""
+    """The lines of a file up to the first point."""
 
-    names: list[str] | None  # names of the columns; None without a header
-    names_line: int  # number of the header's line
-    is_remark: bool  # whether the header is a remark
-    announced: int | None  # points, in a separate line
-    first: str  # first line of the points
+    names: list[str] | None  # column names, or None without a header
+    names_line: int  # line number of the header
+    is_remark: bool  # whether the header is a comment
+    announced: int | None  # number of points if it is declared in a separate line
+    first: str  # line of the first point
     first_line: int
 
 
 def read_text_cloud(path: Path) -> list[Sweep]:
-    """Read a cloud of a point in each line.
+    """Read a point cloud with one point per line.
 
-    Columns are named by the header; without a header, those after z are `column_4`, …. Cells are
-    separated by spaces, tabs, commas or semicolons. Decimal commas are read where something else
-    separates cells. Columns of words are left out.
+    Columns are named by the header. Without a header, the columns after z are named `column_4`,
+    `column_5` and so on. Columns are separated by spaces, tabs, commas or semicolons. Decimal
+    commas are supported if columns have a different separator. Text columns are skipped.
 
     Raises
     ------
     ValueError
-        If a line is wrong, or the columns are not columns of a cloud; the message names the line.
+        If a line is invalid, or if the columns are not those of a point cloud. The message contains
+        the line number.
     LidarError
         If the file is larger than the memory.
     OSError
@@ -108,20 +110,16 @@ def read_text_cloud(path: Path) -> list[Sweep]:
 
 
 def is_text_raster(path: Path) -> bool:
-    """Return True if a text file begins as an Esri ASCII grid, a raster of heights."""
+    """Return whether a text file starts like an Esri ASCII grid, which is an elevation raster."""
     return _begins_as_raster(read_input(path, _HEAD_BYTES))
 
 
 def _begins_as_raster(start: bytes) -> bool:
-    """Return True if a file with a start is a raster."""
     return start.lstrip()[: len(_RASTER)].lower() == _RASTER
 
 
 def _check_text(start: bytes) -> None:
-    """Check that a file begins as text in UTF-8, and is not a raster.
-
-    Raises ValueError if not.
-    """
+    """Raise ValueError if a file does not start with UTF-8 text, or is a raster."""
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise ValueError("it is encoded in UTF-16. Save it as UTF-8")
     if b"\0" in start:
@@ -134,10 +132,7 @@ def _check_text(start: bytes) -> None:
 
 
 def _read_head(lines: Iterator[str]) -> _Head:
-    """Read up to the first line of points.
-
-    Raises ValueError if there is none.
-    """
+    """Read the lines up to the first point, or raise ValueError if there are no points."""
     names: list[str] | None = None
     names_line = 0
     is_remark = False
@@ -147,8 +142,8 @@ def _read_head(lines: Iterator[str]) -> _Head:
         if names is None and (header := _header_names(text.lstrip("#/% "))) is not None:
             names = header
             names_line = number
-            is_remark = text.startswith(REMARKS)
-        elif not text or text.startswith(REMARKS):
+            is_remark = text.startswith(COMMENT_PREFIXES)
+        elif not text or text.startswith(COMMENT_PREFIXES):
             if number > _MAX_HEAD_LINES:
                 raise ValueError(f"its first {_MAX_HEAD_LINES:,} lines contain no points")
         elif text.isdecimal() and announced is None:
@@ -164,7 +159,7 @@ def _read_head(lines: Iterator[str]) -> _Head:
 
 
 def _header_names(text: str) -> list[str] | None:
-    """Return the names of the columns in a line, or None if it is no header of a cloud."""
+    """Return the column names in a line, or None if the line is not a header."""
     for separator in _SEPARATORS:
         cells = cells_of(text, separator) if separator else _WORD.findall(text)
         words = [column_name(cell).words for cell in cells]
@@ -176,14 +171,14 @@ def _header_names(text: str) -> list[str] | None:
 
 
 def _begins_with_numbers(text: str) -> bool:
-    """Return True if the first cells of a line are three numbers."""
+    """Return whether the first three cells in a line are numbers."""
     separator = _separator(text)
     cells = cells_of(text, separator)[:3]
     return len(cells) == 3 and all(_is_number(cell, separator) for cell in cells)
 
 
 def _separator(line: str) -> str | None:
-    """Return what separates the cells of a line of numbers, or None for spaces and tabs."""
+    """Return the separator of the cells in a line of numbers, or None for spaces and tabs."""
     if ";" in line:
         return ";"
     words = line.split()
@@ -195,7 +190,10 @@ def _separator(line: str) -> str | None:
 
 
 def _is_number(cell: str, separator: str | None) -> bool:
-    """Return True if a cell is a number, with a decimal comma if commas separate no cells."""
+    """Return whether a cell is a number.
+
+    Decimal commas are allowed unless the separator is a comma.
+    """
     if separator != "," and cell.count(",") == 1:
         cell = cell.replace(",", ".")
     try:
@@ -209,10 +207,7 @@ def _is_number(cell: str, separator: str | None) -> bool:
 
 
 def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> list[str]:
-    """Return the names of all cells of a line.
-
-    Raises ValueError if the header has other cells.
-    """
+    """Return the names of all cells, or raise ValueError if they do not match the header."""
     names = head.names or []
     count = len(first_cells)
     if count < len("xyz"):
@@ -223,7 +218,7 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
         names = names[:-1]
     if len(names) == count:
         return [name or f"column_{index + 1}" for index, name in enumerate(names)]
-    # A remark in prose, «x y z in meters», says nothing else than that.
+    # A comment in prose, such as "x y z in meters", only names these three columns.
     if not names or (head.is_remark and [name.lower() for name in names[:3]] == ["x", "y", "z"]):
         return ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, count))]
     hint = ""
@@ -240,9 +235,9 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
 
 
 def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, float, float] | None]:
-    """Return the indices of x, y and z, and their units in meters, or None without any.
+    """Return the indices of x, y and z, and their units in meters, or None if they are not stated.
 
-    ValueError if the columns belong to a trajectory, or have no lengths.
+    Raise ValueError if the columns belong to a trajectory, or if the coordinates are not lengths.
     """
     columns = [column_name(name) for name in names]
     words = [column.words for column in columns]
@@ -277,10 +272,7 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
 def _numeric_cells(
     head: _Head, first_cells: Sequence[str], separator: str | None, axes: Sequence[int]
 ) -> list[int]:
-    """Return the indices of the cells that are numbers.
-
-    Raises ValueError if x, y or z is none.
-    """
+    """Return the indices of numeric cells, or raise ValueError if x, y or z is not numeric."""
     numeric = [
         index
         for index, cell in enumerate(first_cells)
@@ -296,7 +288,10 @@ def _numeric_cells(
 
 
 def _column(values: Floats, first_cell: str) -> AnyArray:
-    """Return a column, as integers if it was written so: the class 2, and not the share 1.0."""
+    """Return a column as integers if its numbers are written as integers.
+
+    For example, the class 2 is an integer, but the fraction 1.0 is not.
+    """
     if not first_cell.strip("+-").isdecimal() or (values % 1 != 0).any():  # also NaN
         return values
     return values.astype(np.int64) if np.abs(values).max(initial=0) < _MAX_EXACT else values
@@ -306,10 +301,7 @@ def _column(values: Floats, first_cell: str) -> AnyArray:
 
 
 def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
-    """Check the number of points, and that headless rows are points.
-
-    Raises ValueError if not.
-    """
+    """Check the number of points, and whether the rows of a file without a header are points."""
     if head.announced is not None and len(values) != head.announced:
         failure = CutShortError if len(values) < head.announced else ValueError
         raise failure(
@@ -338,7 +330,7 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
 
 
 def _are_poses(values: Floats) -> bool:
-    """Return True if rows (n, k) are poses as TUM or KITTI write them."""
+    """Return whether rows are poses in the format of TUM or KITTI."""
     if values.shape[1] == _TUM_COLUMNS:
         units = values[:, None, 4:]
     elif values.shape[1] == _KITTI_COLUMNS:

@@ -1,7 +1,8 @@
-"""Rows of numbers in text: read at once where they are regular, else cell by cell.
+"""Readers for rows of numbers in text files.
 
-NumPy reads ten lines while Python reads one, but it neither names a line that is
-wrong, nor reads decimal commas, columns of words and empty cells.
+NumPy is ten times as fast as parsing cells in Python. However, it neither reports the line with an
+error nor reads decimal commas, text columns and empty cells. It is therefore used first, and cells
+are parsed one by one if it fails.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ import numpy as np
 from ...numerics.arrays import Floats
 from ...words import plural, printable
 
-REMARKS = ("#", "//", "%")  # starts of lines that hold no points
+COMMENT_PREFIXES = ("#", "//", "%")  # prefixes of comment lines
 _BLOCK = 1 << 16  # lines that are read at once
-_SHOWN = 40  # letters of a cell in a message
+_SHOWN = 40  # maximum number of characters of a cell in an error message
 
 
 def cells_of(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a line, without quotes and the spaces around them."""
+    """Split a line into cells, and remove quotes and surrounding whitespace."""
     if separator is not None and '"' in line:
         with suppress(csv.Error):
             (cells,) = csv.reader([line.strip()], delimiter=separator, skipinitialspace=True)
@@ -34,31 +35,37 @@ def cells_of(line: str, separator: str | None) -> list[str]:
 
 @dataclass
 class RowReader:
-    """Reader of lines that have the same cells.
+    """A reader of lines that have the same cells.
 
     Parameters
     ----------
     names
-        Names of the cells of a line.
+        Names of the cells in a line.
     required
-        Indices of the cells that must be numbers; others may be empty, for NaN.
+        Indices of the cells that must contain a number. Other cells can be empty and are read as
+        NaN.
     separator
-        What separates the cells; None for spaces and tabs.
+        Separator of the cells, or None for spaces and tabs.
     used
-        Indices of the cells that are read; None for all.
+        Indices of the cells to read, or None for all.
     """
 
     names: Sequence[str]
     required: Collection[int]
     separator: str | None = None
     used: Sequence[int] | None = None
-    point_line: int = field(default=0, init=False)  # first line with a decimal point; 0 for none
-    comma_line: int = field(default=0, init=False)  # first line with a decimal comma; 0 for none
+    point_line: int = field(default=0, init=False)  # first line with a decimal point, or 0
+    comma_line: int = field(default=0, init=False)  # first line with a decimal comma, or 0
 
     def read(self, lines: Iterable[str], number: int) -> Floats:
-        """Return the numbers (n, k) of all lines but blank ones and remarks.
+        """Read the numbers in all lines except blank lines and comments.
 
-        `number` is the number of the first line in its file. ValueError names a line that is wrong.
+        `number` is the line number of the first line. The shape is (n, k).
+
+        Raises
+        ------
+        ValueError
+            If a line is invalid, with its line number in the message.
         """
         width = len(self.names if self.used is None else self.used)
         blocks = [np.empty((0, width))]
@@ -74,7 +81,6 @@ class RowReader:
         return np.concatenate(blocks)
 
     def _read_block(self, lines: list[str], number: int, width: int) -> Floats:
-        """Return the numbers (n, width) of some lines."""
         has_points = any("." in line for line in lines)
         has_commas = self.separator != "," and any("," in line for line in lines)
         if self.used is None and not (has_points and has_commas):
@@ -84,7 +90,7 @@ class RowReader:
             try:
                 values = np.loadtxt(filled, delimiter=self.separator, comments=None, ndmin=2)
             except ValueError:
-                pass  # cell by cell, which names the line
+                pass  # parsing cell by cell reports the line number
             else:
                 if values.shape == (len(filled), width):
                     if has_points and not self.point_line:
@@ -95,12 +101,11 @@ class RowReader:
         return self._read_cells(lines, number, width)
 
     def _read_cells(self, lines: list[str], number: int, width: int) -> Floats:
-        """Return the numbers (n, width) of some lines, read cell by cell."""
         numbers = array("d")
         used = range(width) if self.used is None else self.used
         for line_number, line in enumerate(lines, number):
             text = line.strip()
-            if not text or text.startswith(REMARKS):
+            if not text or text.startswith(COMMENT_PREFIXES):
                 continue
             cells = cells_of(text, self.separator)
             if len(cells) == len(self.names) + 1 and not cells[-1]:
@@ -111,10 +116,7 @@ class RowReader:
         return np.frombuffer(numbers, np.float64).reshape(-1, width)
 
     def _number(self, cell: str, index: int, line_number: int) -> float:
-        """Return the number in a cell.
-
-        Raises ValueError if there is none.
-        """
+        """Parse the number in a cell, and record which decimal mark it contains."""
         text = cell
         if "." in cell and not self.point_line:
             self.point_line = line_number
@@ -132,7 +134,7 @@ class RowReader:
             ) from error
 
     def _wrong_width(self, line_number: int, cells: Sequence[str]) -> str:
-        """Return the message on a line with too few or too many cells."""
+        """Return the error message for a line with too few or too many cells."""
         names = printable(", ".join(self.names))
         message = (
             f"line {line_number} has {plural(len(cells), 'cell')}, but {len(self.names)} were "
@@ -147,5 +149,8 @@ class RowReader:
 
 
 def _line_with(mark: str, lines: Sequence[str], number: int) -> int:
-    """Return the number of the first line with a mark, counted from `number`, the first line's."""
+    """Return the line number of the first line that contains a character.
+
+    `number` is the line number of `lines[0]`.
+    """
     return number + next(index for index, line in enumerate(lines) if mark in line)

@@ -144,7 +144,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         frames = np.zeros((2, len(actors)))
         for actor in np.unique(actors).tolist():
             row_indices = np.flatnonzero(actors == actor)
-            frames[:, row_indices] = self.animated[actor].played(
+            frames[:, row_indices] = self.animated[actor].frames_at(
                 times_ns[row_indices].astype(np.float64)
             )
         return frames

@@ -31,7 +31,7 @@ from ...errors import LidarError
 from ...numerics.arrays import Bools, Floats, Indices, Ints, Ints32
 from ...scene.actors import Actor, distinct_meshes
 from ...scene.scene import Scene
-from ...scene.scene_instances import Instances, parts_of
+from ...scene.scene_instances import Instances, split_by_masks
 from ...survey.survey import Survey
 from ...words import did_you_mean
 from .actor_trajectories import ActorTrajectories
@@ -58,7 +58,7 @@ class _ActorShapes(NamedTuple):
     """The s distinct shapes of the a actors in a scene.
 
     Actors with the same mesh share a shape. A mesh has a part for its opaque triangles and a part
-    for each mask (`parts_of`). Each part is an instance in the shape's caster.
+    for each mask (`split_by_masks`). Each part is an instance in the shape's caster.
     """
 
     casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the mesh frame
@@ -456,7 +456,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     if not actors:
         return None
     meshes, shape = distinct_meshes(actors)
-    parts_of_meshes = [[*parts_of(mesh)] for mesh in meshes]
+    parts_of_meshes = [[*split_by_masks(mesh)] for mesh in meshes]
     part_triangles = np.zeros((len(meshes), max(map(len, parts_of_meshes))), np.int32)
     for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):
         row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]

@@ -14,7 +14,7 @@ import numpy as np
 from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
 from ...numerics.vectors import rotate_into_frames
-from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
+from ...scene.colors import GRAY, Lookup, join_colors, luminance, pack_colors
 from ...scene.scene import Scene
 from ...sensor import Sensor
 from ...survey.survey import Survey
@@ -234,7 +234,7 @@ class SceneSurfaces:
         Actors have their poses at `times` (n,) in nanoseconds.
         """
         if self._lookup is None:
-            return np.full(len(triangle), packed(GRAY[0])[0])
+            return np.full(len(triangle), pack_colors(GRAY[0])[0])
         result = np.empty(len(triangle), np.uint32)
         for begin in range(0, len(triangle), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)

@@ -117,7 +117,7 @@ class TriangleKinds:
         face_indices = order[starts[owner] : starts[owner + 1]]
         if self._scene.materials is None:
             return self._scene.faces[face_indices]
-        materials = self._scene.materials.of_object(owner, face_indices)
+        materials = self._scene.materials.for_object(owner, face_indices)
         return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:

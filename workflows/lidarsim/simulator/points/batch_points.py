@@ -17,7 +17,7 @@ from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, U
 from ...numerics.elementary import arccos, arcsin, arctan2
 from ...numerics.random_numbers import normal
 from ...numerics.vectors import dot, rotate
-from ...scene.colors import unpacked
+from ...scene.colors import unpack_colors
 from ...scene.scene import Scene
 from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
@@ -458,17 +458,17 @@ class BatchPoints:
     @property
     def red(self) -> Bytes:
         """Red component of the surface color, sRGB."""
-        return unpacked(self._colors)[:, 0]
+        return unpack_colors(self._colors)[:, 0]
 
     @property
     def green(self) -> Bytes:
         """Green component of the surface color, sRGB."""
-        return unpacked(self._colors)[:, 1]
+        return unpack_colors(self._colors)[:, 1]
 
     @property
     def blue(self) -> Bytes:
         """Blue component of the surface color, sRGB."""
-        return unpacked(self._colors)[:, 2]
+        return unpack_colors(self._colors)[:, 2]
 
     @property
     def _clipped_energy(self) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...numerics.arrays import Bools, owned
 from ...numerics.random_numbers import quantiles, starts
-from ...scene.colors import GRAY, packed
+from ...scene.colors import GRAY, pack_colors
 from ...sensor.disc import neighbors
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import Mode
@@ -163,7 +163,7 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     cause[from_air] = required(air_hits.cause)[-1 - row[from_air]]
     returns.triangle[from_air] = NO_SURFACE
     if returns.color is not None:
-        returns.color[from_air] = packed(GRAY[0])[0]
+        returns.color[from_air] = pack_colors(GRAY[0])[0]
     return returns._replace(cause=cause)
 
 
