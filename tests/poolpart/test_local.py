@@ -12,7 +12,7 @@ import pytest
 from distributed import Client
 
 from poolpart import Pool, PoolError
-from poolpart.deploy import local_cluster
+from poolpart.deploy import local, local_cluster
 
 SCRIPT = """
 import sys, time
@@ -204,3 +204,9 @@ def test_workers_that_close_while_the_scheduler_owes_an_answer_say_nothing(tmp_p
     running = script(tmp_path, LATE)
     _, told = running.communicate(timeout=300)
     assert (running.returncode, told) == (0, "")
+
+
+def test_encryption_needs_a_package_that_is_optional(monkeypatch):
+    monkeypatch.setattr(local, "find_spec", lambda name: None)
+    with pytest.raises(PoolError, match="requires cryptography.* Run pip install cryptography"):
+        local_cluster({"A": (1, 1)}, security=True)

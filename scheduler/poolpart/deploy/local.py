@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from importlib.util import find_spec
 from typing import Any
 
 import dask
@@ -59,7 +60,8 @@ def local_cluster(
     ------
     PoolError
         If there would be no workers, if a number of workers is below 0 or a number of slots below
-        1, or if the workers do not start.
+        1, if the workers do not start, or if an encrypted cluster is requested and the package
+        cryptography is not installed.
 
     Examples
     --------
@@ -77,7 +79,7 @@ def local_cluster(
             '`{"NAME": (workers, slots)}`, with at least one worker.'
         )
     if not isinstance(security, Security):
-        security = Security.temporary() if security else Security()
+        security = _temporary_security() if security else Security()
     workers = {
         f"{name}-{number}": _worker_spec(name, slots, security)
         for name, (count, slots) in partitions.items()
@@ -107,6 +109,16 @@ def local_cluster(
             f"The workers did not start: {cause}. Check their output above, and whether the "
             "machine has enough memory."
         ) from error
+
+
+def _temporary_security() -> Security:
+    """Return credentials for one cluster, which exist only in memory."""
+    if find_spec("cryptography") is None:
+        raise PoolError(
+            "An encrypted cluster requires cryptography, which is not installed. Run "
+            "pip install cryptography."
+        )
+    return Security.temporary()
 
 
 def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, Any]:
