@@ -20,7 +20,9 @@ _FLOOR = 1e-35  # more than the error of products of tiny edges that underflow i
 
 @dataclass(frozen=True)
 class MeshTables:
-    """Tables of the meshes. The comment at the top of intersect.cu describes their columns.
+    """Tables of the meshes.
+
+    The comment at the top of intersect.cu describes the columns.
 
     Attributes
     ----------

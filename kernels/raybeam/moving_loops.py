@@ -100,9 +100,9 @@ NEAREST_HITS = named_tuple_type(NearestHits, _f64_1, _i64_1, _i32_1, _i32_1)
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
 def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Return the table (c, 15) of cells of `size` consecutive rays each.
+    """Return the table of cells with `size` consecutive rays each.
 
-    The constants `AXIS` to `MAX_SINE` are the indices of its columns.
+    The table has shape (c, 15). The constants `AXIS` to `MAX_SINE` are its column indices.
     """
     count = -(-len(times) // size)
     cells = np.empty((count, 15))
@@ -220,7 +220,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
 # The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write pairs (2, k) of a cell and a body that it may hit, and return their number k."""
+    """Write the pairs of a cell and a body that it may hit, and return the number of pairs."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers are used because reference counting of array views takes longer than the comparisons.

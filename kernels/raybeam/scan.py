@@ -246,7 +246,7 @@ class HitCollector(HitGroups):
         return row_indices
 
     def count_triangles(self, tally_indices: Integers) -> None:
-        """Add the hits of a chunk to the tally, given their tally rows (m,).
+        """Add the hits of a chunk to the tally, given their tally rows.
 
         Without a tally, the call has no effect.
         """
