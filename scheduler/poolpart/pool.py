@@ -390,8 +390,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If not exactly one selector is passed, if the rule selects fewer workers than `minimum`,
-            or if other workers already have this partition.
+            If no selector or several selectors are passed, if the rule selects fewer workers than
+            `minimum`, or if other workers already have this partition.
 
         Examples
         --------

@@ -268,7 +268,7 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
 
 
 class _WaitHooks:
-    """Implementation of `internals.client.WaitHooks`, whose methods the waits of clients call."""
+    """Implementation of `internals.client.WaitHooks`, which Dask's clients call while they wait."""
 
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""
