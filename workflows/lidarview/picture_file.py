@@ -402,7 +402,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
 def moving_positions(
     sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Return the positions (k, 3) that a picture of a survey with motion must show.
+    """Return the positions that a picture of a survey with motion must show.
 
     These are the positions of the moving sensors or, if only actors move, of all sensors and
     actors. The result is empty without motion.

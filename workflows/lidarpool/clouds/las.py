@@ -165,7 +165,7 @@ def _start_s(sweeps: Sweeps) -> float:
 
 
 def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]:
-    """Return intensities (n,) as the integers that are stored in the format."""
+    """Return intensities as the integers that are stored in the format."""
     fractions = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
     return np.round(fractions * _MAX_INTENSITY).astype(np.uint16)
 

@@ -277,7 +277,7 @@ class _CityFile:
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
-        """Triangulate polygons, and return the triangles (t, 3) and their owners (t, 2)."""
+        """Triangulate polygons, and return the triangles and their owners (t, 2)."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
@@ -400,7 +400,7 @@ class _System:
         return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
 
     def check(self, corners: Floats) -> None:
-        """Raise MeshFileError if coordinates (n, 3) are angles or not true to scale."""
+        """Raise MeshFileError if coordinates are angles or not true to scale."""
         reproject = "Reproject it, for example with `cjio FILE crs_reproject {} save NEW`"
         if self.is_of_angles:
             raise MeshFileError(
@@ -430,14 +430,14 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners (n, 3) of a city are apparently in degrees."""
+    """Return True if the corners of a city are apparently in degrees."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))
 
 
 def _points(coordinates: Any) -> Floats:
-    """Return coordinates (v, 3).
+    """Return coordinates.
 
     Raises ValueError if they have another shape.
     """
@@ -451,7 +451,7 @@ def _points(coordinates: Any) -> Floats:
 
 
 def _integers(numbers: Sequence[int]) -> Ints:
-    """Return integers (n,).
+    """Return integers.
 
     Raises ValueError if the values are not integers.
     """

@@ -254,7 +254,7 @@ class _Document:
         return None if shade is None else Colors.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
-        """Return texture coordinates (c, 2), and the offset of their indices in <p>."""
+        """Return texture coordinates, and the offset of their indices in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")
@@ -281,7 +281,7 @@ class _Document:
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
-        """Return the positions (v, 3) in <vertices>."""
+        """Return the positions in <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
             raise ValueError(f"{_tag(vertices)} has no <input> with the semantic POSITION")
@@ -370,7 +370,7 @@ class _Effects:
 def _triangles(
     primitive: Element, points: Floats, corners: Callable[[Element], Ints]
 ) -> Iterator[Ints]:
-    """Yield the triangles (t, 3) of a primitive.
+    """Yield the triangles of a primitive.
 
     `corners` returns the corners in a <p> or <h>.
     """

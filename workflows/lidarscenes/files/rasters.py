@@ -508,7 +508,7 @@ def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def _corners(file: Any, affine: Any) -> Floats:
-    """Return the corners (4, 2) of a file in its coordinate system."""
+    """Return the corners of a file in its coordinate system."""
     return np.array([_apply(affine, x, y) for x in (0, file.width) for y in (0, file.height)])
 
 

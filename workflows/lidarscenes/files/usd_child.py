@@ -193,7 +193,7 @@ class StageNodes:
         return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
-        """Return the time codes and world poses (k, 13) of a prim, or None if it does not move.
+        """Return the time codes and world poses of a prim, or None if it does not move.
 
         Interpolating positions linearly, and rotations about a single axis, deviates from OpenUSD
         by at most `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD`.

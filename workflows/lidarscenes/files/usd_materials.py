@@ -78,7 +78,7 @@ class MeshAppearance:
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
     def coordinates(self, source: ColorSource, face_indices: Ints) -> tuple[Floats, Ints]:
-        """Return texture coordinates (c, 2) in glTF's convention, and their indices (k, 3).
+        """Return texture coordinates in glTF's convention, and their indices (k, 3).
 
         There is an index for each corner of the triangles.
         """

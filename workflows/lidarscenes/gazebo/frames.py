@@ -177,7 +177,7 @@ class FrameGraph:
 
 
 def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
-    """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose (4, 4)."""
+    """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose."""
     if not placement_frame:
         return pose
     return matmul(pose, inverted(frames.matrix(placement_frame)))

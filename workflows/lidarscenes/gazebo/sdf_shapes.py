@@ -93,7 +93,7 @@ def _plane(shape: Element) -> SceneMesh | None:
 
 
 def _from_z(normal: Floats) -> Floats:
-    """Return the shortest rotation (3, 3) from the z axis to a unit vector (3,)."""
+    """Return the shortest rotation from the z axis to a unit vector (3,)."""
     x, y, z = normal.tolist()
     if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
@@ -143,7 +143,7 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
 
 
 def _ring(polyline: Element) -> Floats:
-    """Return the points (n, 2) of a polyline without repetitions."""
+    """Return the points of a polyline without repetitions."""
     texts = [point.text or "" for point in polyline.findall("point")]
     points = np.array([parse_numbers(text, "<point>", 2) for text in texts]).reshape(-1, 2)
     follows = np.ones(len(points), np.bool_)
@@ -182,7 +182,7 @@ def _contains(ring: Floats, point: Floats) -> bool:
 
 
 def _wall(ring: Ints, above: int) -> Ints:
-    """Return the faces (2n, 3) between two rings of vertices.
+    """Return the faces between two rings of vertices.
 
     `ring` (n,) contains the vertices of the first ring. The vertices of the second ring have the
     same order and are `above` larger.

@@ -364,7 +364,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
-    """Return the points (n, 3) in a file and the cell size of its surfels, both in meters."""
+    """Return the points in a file and the cell size of its surfels, both in meters."""
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read_file(path).decode("utf-8", "replace").translate(separators).splitlines()
     if not any(line.partition("//")[0].strip() for line in lines):

@@ -188,7 +188,7 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
 
 
 def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats, Floats]:
-    """Return the frame (4, 4) of a sensor in the world, and its beam origins and directions (k, 3).
+    """Return the frame (4, 4) of a sensor in the world, and its beam origins and directions.
 
     For sites, the frame has the axes of the body, and its origin is the mean position of the sites.
     For a camera, the frame looks along x, with z pointing up in the image.
@@ -211,7 +211,7 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
 
 
 def _pixel_directions(model: Any, camera: int) -> Floats:
-    """Return the ray directions (pixels, 3) of a camera, row by row, with x forward and z up."""
+    """Return the ray directions of a camera, row by row, with x forward and z up."""
     width, height = model.cam_resolution[camera].tolist()
     sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
     row, column = np.divmod(np.arange(width * height), width)

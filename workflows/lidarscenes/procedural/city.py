@@ -341,7 +341,7 @@ class _CityBlocks:
         )
 
     def _towers(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return towers on the lots with the given indices (n,)."""
+        """Return towers on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         height = np.clip(lots.centrality[lot_indices] * rng.uniform(0.2, 1.15, n), 0, 0.999)
@@ -368,7 +368,7 @@ class _CityBlocks:
         )
 
     def _houses(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return houses on the lots with the given indices (n,)."""
+        """Return houses on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         kind = rng.integers(self._count["house"], size=n)
@@ -387,7 +387,7 @@ class _CityBlocks:
         )
 
     def _yard_trees(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return trees behind houses on the lots with the given indices (n,)."""
+        """Return trees behind houses on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         depth = rng.uniform(0.72, 0.95, n) * lots.size[lot_indices, 1]
@@ -408,7 +408,7 @@ class _CityBlocks:
         return self._trees(block, xy)
 
     def _trees(self, block: Ints, xy: Floats) -> AnyArray:
-        """Return trees at positions (n, 2) in blocks (n,)."""
+        """Return trees at positions in blocks."""
         rng = self._rng
         n = len(block)
         kind = rng.integers(self._count["tree"], size=n)

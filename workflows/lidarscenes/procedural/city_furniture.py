@@ -137,7 +137,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
 
 def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) -> Ints:
-    """Choose `count` distinct rows at random, with probabilities proportional to weights (n,).
+    """Choose `count` distinct rows at random, with probabilities proportional to weights.
 
     Raises LidarError if there are fewer rows.
     """
@@ -153,7 +153,7 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
 def _street_positions(
     size: Floats, spacing: float, inward: float, corner: float
 ) -> tuple[Floats, Floats]:
-    """Return positions (n, 2) along the edges of a block centered at the origin, and yaws (n,).
+    """Return positions along the edges of a block centered at the origin, and yaws.
 
     A car that faces the direction of its yaw has the block on its right.
     """
@@ -175,7 +175,7 @@ def _street_positions(
 
 
 def _yard_positions(size: Floats, rng: np.random.Generator) -> Floats:
-    """Return positions (n, 2) in a block centered at the origin, behind its street trees."""
+    """Return positions in a block centered at the origin, behind its street trees."""
     inner = size - 2 * (_TREE_INWARD_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)
     cells = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij"), axis=-1)

@@ -140,7 +140,7 @@ def place_instances(
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the points (k, 3) and radii (k,) of a stem from the root to the top, in meters."""
+    """Return the points and radii of a stem from the root to the top, in meters."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -155,7 +155,7 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the points (n, k, 3) and radii (n, k) of branches, in meters."""
+    """Return the points and radii (n, k) of branches, in meters."""
     n = species.branches
     share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
@@ -180,7 +180,7 @@ def _branches(
 
 
 def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the heights (n,) of branches as fractions of the crown, and their lengths (n,).
+    """Return the heights of branches as fractions of the crown, and their lengths.
 
     Branches are denser where they are long, so that they fill the crown evenly.
     """

@@ -50,7 +50,7 @@ _DIRECTIONS = 16
 
 
 def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
-    """Return True if a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
+    """Return True if a surface is within `CLEAR_M` of any of the local positions."""
     points = np.asarray(positions, np.float64).reshape(-1, 3)
     nearby = triangles_in_box(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
     if not len(nearby):
@@ -72,7 +72,7 @@ class Views:
 
     @property
     def hit(self) -> Bools:
-        """Mask (n,) of the rays that hit a surface at a distance of more than `HAND_M`."""
+        """Mask of the rays that hit a surface at a distance of more than `HAND_M`."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
@@ -101,7 +101,7 @@ class PlacementChecker:
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
     def cast_around(self, positions: ArrayLike) -> Views:
-        """Cast rays in all directions from local positions (k, 3)."""
+        """Cast rays in all directions from local positions."""
         points = np.asarray(positions, np.float64).reshape(-1, 3)
         directions = sphere_directions(RAYS)
         return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
@@ -229,7 +229,7 @@ class PlacementChecker:
         return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:
-        """Cast rays from local origins (n, 3) along unit directions (n, 3)."""
+        """Cast rays from local origins along unit directions."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -241,7 +241,7 @@ class PlacementChecker:
 
 
 def _is_level(views: Views) -> Bools:
-    """Return a mask (n,) of the rays that hit level surfaces."""
+    """Return a mask of the rays that hit level surfaces."""
     return np.asarray(np.abs(views.normals[:, 2]) > 0.99)
 
 
@@ -277,7 +277,7 @@ def _openness(scene: Scene) -> float:
 
 
 def sphere_directions(count: int) -> Floats:
-    """Return unit vectors (count, 3), evenly distributed over a sphere along a Fibonacci spiral."""
+    """Return unit vectors, evenly distributed over a sphere along a Fibonacci spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count
     angle = np.pi * (1 + np.sqrt(5)) * numbers

@@ -51,7 +51,7 @@ class RoadStations:
 
     @classmethod
     def at(cls, distances: Floats) -> RoadStations:
-        """Return stations at distances (k,), with values from after any steps."""
+        """Return stations at distances, with values from after any steps."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
@@ -212,7 +212,7 @@ class SampledSurface(NamedTuple):
     height_m: float  # height tolerance in meters
 
     def is_step(self, sag_m: float) -> Bools:
-        """Return a mask (n,) of the intervals with a step of the surface at their stop."""
+        """Return a mask of the intervals with a step of the surface at their stop."""
         count = len(self.intervals)
         if count < 2:
             return np.zeros(count, np.bool_)
@@ -292,7 +292,7 @@ def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> 
 
 
 def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats]:
-    """Return the numbers of parts (n,) into which to divide the intervals of each surface.
+    """Return the numbers of parts into which to divide the intervals of each surface.
 
     The numbers are not rounded. Triangles between two cross sections deviate from the surface for
     two reasons: the bend along the road, which decreases with the square of the distance, and the
@@ -346,15 +346,15 @@ class _Columns(NamedTuple):
         return cls(count, *(np.concatenate(arrays) for arrays in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest column value (r, k) in each interval (n,), as `_largest` does."""
+        """Return the largest column value (r, k) in each interval, as `_largest` does."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest cell value (q, k) in each interval (n,), as `_largest` does."""
+        """Return the largest cell value (q, k) in each interval, as `_largest` does."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:
-        """Return the largest magnitude (n,) of the values in each interval.
+        """Return the largest magnitude of the values in each interval.
 
         Row j of the values (m, k) contains k samples along the interval `intervals[j]`. The weights
         `ends` (3,) extrapolate the first three values to the start of the interval and, in reverse
@@ -370,7 +370,7 @@ class _Columns(NamedTuple):
 
 
 def has_extent(points: Floats, faces: Ints) -> Bools:
-    """Return a mask of the triangles (f, 3) that are not degenerate."""
+    """Return a mask of the triangles that are not degenerate."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     edges = np.stack([b - a, c - a, c - b])
@@ -379,7 +379,7 @@ def has_extent(points: Floats, faces: Ints) -> Bools:
 
 
 def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Floats, Floats]:
-    """Return the errors (n,) that bends cause in plan and in height, for undivided intervals."""
+    """Return the errors that bends cause in plan and in height, for undivided intervals."""
     # Half of the second differences (r, 3), a quarter of the error of an undivided interval.
     bends = [(v[:, 2:] + v[:, :-2]) / 2 - v[:, 1:-1] for v in (x, y, z)]
     along = [v[:, 2:] - v[:, :-2] for v in (x, y, z)]
@@ -400,7 +400,7 @@ def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Fl
 
 
 def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
-    """Return the height errors (n,) that the twist of cells causes."""
+    """Return the height errors that the twist of cells causes."""
     along = [v[:, 1:] - v[:, :-1] for v in (x, y, z)]
     across = [(v[:, 1:] + v[:, :-1]) / 2 for v in (x, y, z)]
     across = [v[columns.left] - v[columns.right] for v in across]

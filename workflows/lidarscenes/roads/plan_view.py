@@ -116,12 +116,12 @@ class PlanTable:
         self._bend_table = bends[np.argsort(bends[:, 0], kind="stable")]
 
     def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
-        """Return the largest curvatures in 1/m in intervals (k,) that are each within a piece."""
+        """Return the largest curvatures in 1/m in intervals that are each within a piece."""
         row_indices = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
         return np.asarray(self._bend_table[np.maximum(row_indices, 0), 1])
 
     def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
-        """Return points at distances (k,) in the table.
+        """Return points at distances in the table.
 
         `pieces` (k,) are the distances that select the pieces on which the points are evaluated.
         """
@@ -255,7 +255,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
 
 
 def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
-    """Return points on a cubic at distances (k,) in the table."""
+    """Return points on a cubic at distances in the table."""
     along = distances - cubic.start
     parameters = _parameters(cubic, along)
     u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
@@ -270,7 +270,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
 
 
 def _parameters(cubic: _Cubic, along: Floats) -> Floats:
-    """Return the parameters of a cubic at distances (k,) from its start.
+    """Return the parameters of a cubic at distances from its start.
 
     Beyond the end of the cubic, the parameters remain at the end.
     """

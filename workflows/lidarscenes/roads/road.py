@@ -133,7 +133,7 @@ class Road:
 
     @cached_property
     def breaks(self) -> Floats:
-        """Distances (b,) in meters at which polynomials of the road change."""
+        """Distances in meters at which polynomials of the road change."""
         profiles = (
             self.elevation, self.superelevation, self.lane_offset, *self.crossfalls.values()
         )  # fmt: skip
@@ -158,14 +158,14 @@ class Road:
         return heights
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) of kinks in cross sections between two distances."""
+        """Return the t coordinates of kinks in cross sections between two distances."""
         kinks = [np.zeros(1 if any(map(len, self.crossfalls.values())) else 0)]
         if self.shapes is not None:
             kinks.append(self.shapes.kinks(start, stop))
         return np.unique(np.concatenate(kinks))
 
     def points_across(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
-        """Return the ascending t coordinates (j,) at which cross sections need points.
+        """Return the ascending t coordinates at which cross sections need points.
 
         `t` (2,) are the lower and the upper limit. Straight lines between the points are within
         `height_m` of the cross sections between the distances `start` and `stop`.
@@ -206,7 +206,7 @@ class LateralShapes:
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at distances (k,) and t coordinates (..., k).
+        """Return the heights at distances and t coordinates (..., k).
 
         `pieces` (..., k) are the t coordinates that select the cubics.
         """
@@ -219,7 +219,7 @@ class LateralShapes:
         return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) at which cubics start.
+        """Return the t coordinates at which cubics start.
 
         Stations that determine the heights between the two distances are considered.
         """
@@ -227,7 +227,7 @@ class LateralShapes:
         return np.unique(starts[np.isfinite(starts)])
 
     def steps(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) at which heights step.
+        """Return the t coordinates at which heights step.
 
         Stations that determine the heights between the two distances are considered.
         """
@@ -260,7 +260,7 @@ class LateralShapes:
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
     def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at t coordinates (..., k) for stations with given indices (k,)."""
+        """Return the heights at t coordinates (..., k) for stations with given indices."""
         cubics = np.maximum(
             (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
         )
@@ -300,7 +300,7 @@ class RoadNetwork:
         return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
     def frames(self, roads: Sequence[Road], stations: Sequence[RoadStations]) -> RoadFrames:
-        """Return the frames of roads at stations (k,) on each road, concatenated."""
+        """Return the frames of roads at stations on each road, concatenated."""
         pairs = [*zip(roads, stations, strict=True)]
         if not pairs:
             return RoadFrames(*np.zeros((5, 0, 3)))

@@ -80,7 +80,7 @@ def painted_quads(
 
 
 def _quads(right: Ints, count: int) -> Ints:
-    """Return triangles (f, 3) between cross sections and the following ones.
+    """Return triangles between cross sections and the following ones.
 
     `right` contains the indices of the right points. The left points are `count` indices later.
     """
@@ -152,7 +152,7 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
 
 
 def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
-    """Express distances (d,) as fractional station indices."""
+    """Express distances as fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
     shares = (distances - s[stations]) / lengths
@@ -273,7 +273,7 @@ def _typed_line(
 def _dashes(
     start: float, stop: float, length: float, space: float, allowance: Allowance
 ) -> tuple[Floats, Floats]:
-    """Return the starts and stops (d,) of dashes, or of a single dash without gaps."""
+    """Return the starts and stops of dashes, or of a single dash without gaps."""
     if not start < stop:
         return np.zeros(0), np.zeros(0)
     if space <= 0 or length <= 0:

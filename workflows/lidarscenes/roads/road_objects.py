@@ -230,7 +230,7 @@ class ObjectBuilder:
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
     def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
-        """Return the corners (k, 4, 3) of a tunnel, clockwise from the lower left."""
+        """Return the corners of a tunnel, clockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -332,7 +332,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
 
 
 def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSurface:
-    """Return the surface between two lines of points (k, 2, 3) at samples."""
+    """Return the surface between two lines of points at samples."""
     columns = np.moveaxis(points, 1, 0)
     is_cell = np.ones(1, np.bool_)
     return SampledSurface(samples.intervals, columns, is_cell, HEIGHT_SHARE * sag_m)
@@ -525,7 +525,7 @@ def _flat_pieces(
 
 
 def _rectangle(size: Sequence[float]) -> Floats:
-    """Return the counterclockwise corners (4, 3) of a rectangle, starting at the rear right."""
+    """Return the counterclockwise corners of a rectangle, starting at the rear right."""
     half_length = size[0] / 2
     half_width = size[1] / 2
     return np.array(
@@ -539,7 +539,7 @@ def _rectangle(size: Sequence[float]) -> Floats:
 
 
 def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
-    """Return the surface between two lines of points (k, 3), with walls at steps (j,)."""
+    """Return the surface between two lines of points, with walls at steps."""
     count = len(first)
     points = np.concatenate([first, second])
     a = np.arange(count - 1)

@@ -161,7 +161,7 @@ class _Writer:
     def _corners(
         self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
-        """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
+        """Return the attributes of triangles with separate corners (k, 3, …)."""
         corners = rotate(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:

@@ -42,7 +42,7 @@ class Datagrams:
         return len(self.payloads)
 
     def without(self, dropped: Bools) -> Datagrams:
-        """Return the datagrams that are not lost. `dropped` (n,) is True for lost datagrams."""
+        """Return the datagrams that are not lost. `dropped` is True for lost datagrams."""
         if not dropped.any():
             return self
         return replace(self, payloads=self.payloads[~dropped], due_ns=self.due_ns[~dropped])
@@ -223,7 +223,7 @@ class PacketDecoder(ABC):
 
     @abstractmethod
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return the point columns (n,) of a sweep, including x, y and z in meters."""
+        """Return the point columns of a sweep, including x, y and z in meters."""
 
     @abstractmethod
     def time_ns(self, sweep: Any) -> float:

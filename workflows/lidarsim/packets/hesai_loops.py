@@ -25,7 +25,7 @@ def remainders() -> NDArray[np.uint32]:
 
 @compiled()
 def checksums(contents, table, sums):
-    """Write the CRC-32/MPEG-2 of each row of bytes `contents` (n, k) to `sums` (n,).
+    """Write the CRC-32/MPEG-2 of each row of bytes `contents` (n, k) to `sums`.
 
     `table` is the result of `remainders`.
     """

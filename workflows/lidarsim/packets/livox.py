@@ -224,7 +224,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions (n, c, 3) in the sensor frame in meters, or NaN without a return."""
+        """Return positions in the sensor frame in meters, or NaN without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]
@@ -235,7 +235,7 @@ class LivoxEncoder(PacketEncoder):
         return positions
 
     def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
-        """Write positions and reflectivities of shots to `points` (n, 96)."""
+        """Write positions and reflectivities of shots to `points`."""
         units = shots.columns[_POSITION][0] / kind.unit_m
         np.rint(units, out=units)
         limit = np.iinfo(np.dtype(kind.number)).max
@@ -282,7 +282,7 @@ class LivoxEncoder(PacketEncoder):
         return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
-        """Write the common header fields of packets (n,).
+        """Write the common header fields of packets.
 
         `stamps_ns` (n,) are the send times since the start of the survey. The clock of a sensor
         that is not synchronized starts at 0.
@@ -295,7 +295,7 @@ class LivoxEncoder(PacketEncoder):
 
 
 def _imu_axes(source: PacketSource) -> Floats:
-    """Return the rotation (3, 3) from the axes of the platform's IMU to the sensor's axes."""
+    """Return the rotation from the axes of the platform's IMU to the sensor's axes."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
     on_platform = matrices(np.array([source.instruments.imu.quaternion]))[0]
@@ -303,7 +303,7 @@ def _imu_axes(source: PacketSource) -> Floats:
 
 
 def _with_checksums(packets: Records) -> Bytes:
-    """Return packets as bytes (n, size) after computing their CRC-32 checksums."""
+    """Return packets as bytes after computing their CRC-32 checksums."""
     payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
     packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
     return payloads

@@ -470,7 +470,7 @@ class OusterEncoder(PacketEncoder):
         }
 
     def _lidar_pose(self) -> Floats:
-        """Return the pose (4, 4) of the head in the sensor frame, millimeters."""
+        """Return the pose of the head in the sensor frame, millimeters."""
         sin, cos = sin_cos(np.radians(self.source.sensor.head.zero_deg))  # type: ignore[attr-defined]
         pose = np.eye(4)
         pose[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -478,7 +478,7 @@ class OusterEncoder(PacketEncoder):
         return pose
 
     def _imu_pose(self) -> Floats:
-        """Return the pose (4, 4) of the IMU in the sensor frame in mm; identity without one."""
+        """Return the pose of the IMU in the sensor frame in mm; identity without one."""
         instruments = self.source.instruments
         if instruments is None or instruments.imu is None:
             return np.eye(4)
@@ -572,7 +572,7 @@ class OusterDecoder(PacketDecoder):
         return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
-        """Return the function that converts a scan to positions (rings, columns, 3) in meters."""
+        """Return the function that converts a scan to positions in meters."""
         if sensor not in self._tables:
             core = import_module("ouster.sdk.core")
             self._tables[sensor] = core.XYZLut(self._infos[sensor], False)

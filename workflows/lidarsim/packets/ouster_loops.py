@@ -83,7 +83,7 @@ def remainders() -> UInts64:
 
 @compiled()
 def checksums(words, tables, sums):
-    """Write the CRC-64 (ECMA-182) of each packet in `words` (n, k) to `sums` (n,).
+    """Write the CRC-64 (ECMA-182) of each packet in `words` (n, k) to `sums`.
 
     `words` are little-endian uint64. Eight bytes are processed at a time ("slicing by eight",
     Kounavis and Berry 2005) with the `tables` from `remainders`.

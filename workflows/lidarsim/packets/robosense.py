@@ -297,7 +297,7 @@ class RobosenseEncoder(PacketEncoder):
 
 
 def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
-    """Write times (n,) in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
+    """Write times in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
     micros = np.maximum(since_1970_ns + 500, 0) // 1000
     seconds, microseconds = np.divmod(micros, 1_000_000)
     if times.dtype == np.dtype(_SECONDS):
@@ -318,7 +318,7 @@ def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records (n,) as bytes (n, size)."""
+    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
 
 

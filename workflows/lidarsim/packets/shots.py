@@ -102,7 +102,7 @@ class Shots:
         shot = (image.plane * shape[1] + image.column) * shape[2] + lasers[image.row]
 
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
-            """Return point values (n,) as an array (r, n, c)."""
+            """Return point values as an array (r, n, c)."""
             filled = np.full(shape, missing, values.dtype)
             filled.reshape(-1)[shot] = values
             return filled
@@ -134,7 +134,7 @@ _OF_FIRINGS = tuple(
 
 
 def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bools:
-    """Return whether firings (n,) of a sweep are in packets that are lost."""
+    """Return whether firings of a sweep are in packets that are lost."""
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station

@@ -120,7 +120,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return timestamps in µs of packets whose first firings start at `first_ns` (n,)."""
+        """Return timestamps in µs of packets whose first firings start at `first_ns`."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:

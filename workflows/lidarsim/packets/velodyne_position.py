@@ -58,7 +58,7 @@ class PositionPackets:
         self._sentences: dict[int, bytes] = {}  # {second since 1970: sentence}
 
     def following(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
-        """Return the position packets that follow data packets sent at `due_ns` (n,).
+        """Return the position packets that follow data packets sent at `due_ns`.
 
         `stamps_ns` (n,) are the same times on the sensor's clock.
         """
@@ -150,5 +150,5 @@ def _angle(angle_deg: float, digits: int) -> str:
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records (n,) as bytes (n, size)."""
+    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)

@@ -54,7 +54,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _matrices(rays: RayList) -> Floats:
-    """Return matrices (n, 3, 4) that map the z axis to the rays.
+    """Return matrices that map the z axis to the rays.
 
     Their x axes are horizontal and point to the right of the rays, or to -y for vertical rays.
     """

@@ -23,7 +23,6 @@ On a worker, a casting task turns scans into columns as follows:
 If each ray can have at most one return (see `Setup.return_count_varies`), `SceneCaster` itself
 counts and thins out the hits in place of 3 and 4, and only the steps that aim beams act. On a CUDA
 device without steps, `DeviceColumns` replaces 3 to 6.
-without steps, `DeviceColumns` does 3 to 6.
 """
 
 from __future__ import annotations

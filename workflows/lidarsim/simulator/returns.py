@@ -30,7 +30,7 @@ SURFACE = CAUSES.index("surface")
 
 
 def select_rows(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
-    """Yield the selected rows of each column. A column that is None yields None."""
+    """Yield the selected rows of each column, or None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
             yield column.T.take(row_selection, axis=-1).T
@@ -76,7 +76,7 @@ class PulseReturns(NamedTuple):
 
     @classmethod
     def single_returns(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
-        """Return a table in which each ray (n,) has a single return without noise."""
+        """Return a table in which each ray has a single return without noise."""
         single = np.ones(len(ray), np.uint8)
         return cls(ray, distance, triangle, number=single, return_counts=single, reported=distance)
 

@@ -153,9 +153,9 @@ class Rig:
     def with_moved_instances(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
         """Return a rig in which the instances of the objects `owners` have moved to new poses.
 
-        `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations (k, 3,
-        3), as in `Scene.moved`. The trees are shared and modified, so this rig must
-        not be used afterwards, and no cast may be in progress.
+        `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations
+        (k, 3, 3), as in `Scene.moved`. The trees are shared and modified, so this rig must not be
+        used afterwards, and no cast may be in progress.
         """
         assert self.scene.instances is not None
         instance_indices, index = self.scene.instances.rows_of(owners)

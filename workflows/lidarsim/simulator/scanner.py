@@ -1,4 +1,4 @@
-"""`Scanner`, which simulates a sensor in a scene sweep by sweep."""
+"""The `Scanner` class, which simulates a sensor in a scene sweep by sweep."""
 
 from __future__ import annotations
 
@@ -566,7 +566,7 @@ def _trajectory_of(pose: Any) -> Trajectory:
 
 
 def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
-    """Return positions (k, 3), and rotations (k, 3, 3) or None if the poses are positions."""
+    """Return positions, and rotations or None if the poses are positions."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):

@@ -68,13 +68,13 @@ def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
 
 
 def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
-    """Plot the angles of directions (n, 3) in a vertical plane over times (n,)."""
+    """Plot the angles of directions in a vertical plane over times."""
     _, y, z = directions.T
     return _BeamPlot(times, np.degrees(np.arctan2(y, -z)), (f"time, {unit}", "angle, degrees"))
 
 
 def _plot_directions(directions: Floats) -> _BeamPlot:
-    """Plot the azimuths and elevations of directions (n, 3)."""
+    """Plot the azimuths and elevations of directions."""
     x, y, z = directions.T
     middle = np.degrees(np.arctan2(y[0], x[0]))  # avoids a jump at 180 degrees
     azimuth = np.degrees(np.arctan2(y, x))

@@ -83,7 +83,7 @@ def floor_and_cut_heights(
 
 
 def _relative_spread(heights: Floats) -> float:
-    """Return the interquartile range of heights (n,) divided by their median.
+    """Return the interquartile range of heights divided by their median.
 
     The result is 0 if there are no heights.
     """
@@ -181,7 +181,7 @@ def _clip_triangles(
 
 
 def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floats:
-    """Return the points (n, 3) where the edges between vertices cross a plane.
+    """Return the points where the edges between vertices cross a plane.
 
     `beyond` (v,) are the signed distances of all vertices from the plane.
     """

@@ -85,7 +85,7 @@ def column_values(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
 
 
 def normal_colors(normals: AnyArray) -> Bytes:
-    """Return the colors (n, 3) of unit normals (n, 3), gray for NaN.
+    """Return the colors of unit normals, gray for NaN.
 
     Points that are not on a surface have the normal NaN.
     """
@@ -144,7 +144,7 @@ def make_coloring(
 
 
 def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Coloring:
-    """Return a color for each label (k,), in the order of the legend."""
+    """Return a color for each label, in the order of the legend."""
     count = max(len(names), int(labels.max(initial=0)) + 1)
     colors = object_colors(min(count, MAX_COLORS))
     gray = len(colors)
@@ -184,7 +184,7 @@ def _number_coloring(
     percentiles: tuple[float, float],
     chosen_limits: tuple[float, float] | None,
 ) -> Coloring:
-    """Return a scale for values (n,) between two percentiles or between given limits."""
+    """Return a scale for values between two percentiles or between given limits."""
     finite = np.isfinite(values)
     lower = 0.0
     middle = 0.5
@@ -226,7 +226,7 @@ def _number_coloring(
 def _scale_painter(
     limits: _Range, divisor: float, logarithmic: bool, scale: Floats
 ) -> Callable[[AnyArray], Floats]:
-    """Return a function that maps values (n,) to colors (n, 3) of a scale (256, 3).
+    """Return a function that maps values to colors of a scale (256, 3).
 
     The values are divided by `divisor` to get the unit of the limits.
     """

@@ -35,7 +35,7 @@ class Cutaway:
 
     @classmethod
     def from_sensors(cls, surface: RenderMesh, sensors: Floats, eye: Floats) -> Cutaway:
-        """Determine the surfaces that hide sensors at positions (p, 3) from a camera at `eye`."""
+        """Determine the surfaces that hide sensors at positions from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
         inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
@@ -51,7 +51,7 @@ class Cutaway:
         return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
     def is_removed(self, points: Floats, triangle: Ints) -> Bools:
-        """Return a mask (n,) of the hits at points (n, 3) on triangles (n,) that are removed."""
+        """Return a mask of the hits at points on triangles that are removed."""
         owner = self.surface.scene.face_object[triangle]
         lower = self.core[owner, 0]
         upper = self.core[owner, 1]
@@ -67,7 +67,7 @@ class Cutaway:
 
 
 def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Return a cutaway that lets a camera see the surroundings of sensors at positions (p, 3).
+    """Return a cutaway that lets a camera see the surroundings of sensors at positions.
 
     Returns None if the sensors are outdoors, or if the camera sees enough without a cutaway.
     """
@@ -130,7 +130,7 @@ def cast_with_cutaway(
 def is_blocked(
     surface: RenderMesh, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Return a mask of the rays (n, 3) that hit a surface within `reach` meters.
+    """Return a mask of the rays that hit a surface within `reach` meters.
 
     Removed surfaces do not block rays.
     """

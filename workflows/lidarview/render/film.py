@@ -83,7 +83,7 @@ class _FilmPoints:
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Discard all points except those in a mask (n,)."""
+        """Discard all points except those in a mask."""
         self.positions = self.positions[chosen]
         self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]
@@ -188,7 +188,7 @@ def _draw_points(
 
 
 def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
-    """Draw the positions (k, 3) of the platform as a line that ends in a disc."""
+    """Draw the positions of the platform as a line that ends in a disc."""
     pen = ImageDraw.Draw(frame)
     pixels, _ = camera.project(positions)
     line = [(float(x), float(y)) for x, y in pixels if max(abs(x), abs(y)) < _MAX_PIXEL]
@@ -198,7 +198,7 @@ def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> N
 
 
 def _shape(corners: AnyFloats, color: Floats) -> _Shape:
-    """Prepare triangles with corners (f, 3, 3) for ray casting."""
+    """Prepare triangles with corners for ray casting."""
     normals = normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, color)
@@ -207,7 +207,7 @@ def _shape(corners: AnyFloats, color: Floats) -> _Shape:
 def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces, and return the RGBA image (height, width, 4) and the depth (height, width).
+    """Draw surfaces, and return the RGBA image and the depth.
 
     The depth is in meters.
     """

@@ -105,7 +105,7 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square meter on triangles (f,), given the hits on each triangle.
+    """Return the hits per square meter on triangles, given the hits on each triangle.
 
     If most triangles are so small that they have at most one hit, neighbors share their hits: each
     triangle passes a third of its hits to each corner, and each corner distributes them by area.
@@ -131,7 +131,7 @@ def _rounds(hit_counts: Floats) -> int:
 
 
 def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Floats:
-    """Distribute hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
+    """Distribute hits over the triangles that share a corner, in proportion to area."""
     corner_hits = np.zeros(vertices)
     corner_areas = np.zeros(vertices)
     for corner in faces.T:
@@ -146,7 +146,7 @@ def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Fl
 
 
 def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale for densities on areas (f,).
+    """Choose the ends of a logarithmic scale for densities on areas.
 
     Few hits are on surfaces below the scale, and little area is above it.
     """
@@ -177,7 +177,7 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
 def _divide(
     pieces: Floats32, hit: Bools, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, Floats]:
-    """Divide triangles with hits (f,) as long as the grid cells contain enough points.
+    """Divide triangles with hits as long as the grid cells contain enough points.
 
     Returns the pieces, their owners, their areas, and their points per square meter, which are NaN
     for undivided triangles.
@@ -224,7 +224,7 @@ def _divide(
 
 
 class _WeightGrid:
-    """Sums of the weights (n,) of positions (n, 3) in the cells of a grid."""
+    """Sums of the weights of positions in the cells of a grid."""
 
     def __init__(self, positions: Floats32, weights: Floats, width: float, lower: Floats32) -> None:
         self._width = width
@@ -234,7 +234,7 @@ class _WeightGrid:
         self._sums = np.bincount(cells, weights)
 
     def interpolate(self, positions: Floats32) -> Floats:
-        """Return sums (n,) at positions (n, 3), interpolated between the eight nearest cells."""
+        """Return sums at positions, interpolated between the eight nearest cells."""
         offsets = (positions - self._lower) / self._width - 0.5
         total = np.zeros(len(positions))
         cells = np.floor(offsets).astype(np.int64)
@@ -248,7 +248,7 @@ class _WeightGrid:
 
 
 def _keys(cells: Ints) -> Ints:
-    """Return a unique number (n,) for each cell (n, 3)."""
+    """Return a unique number for each cell (n, 3)."""
     cells = cells + 1  # so that neighbors of the lowest cell are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 

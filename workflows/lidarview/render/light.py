@@ -42,7 +42,7 @@ class LightMap:
     def brightness(
         self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
     ) -> Floats32:
-        """Return the brightness (n,) of points by Lambert's law and the visible part of the sky.
+        """Return the brightness of points by Lambert's law and the visible part of the sky.
 
         `pixels` (n, 2) are the pixel coordinates of the points, and `position` and `normal` (n, 3)
         their positions and normals. `ground` (n,) marks points on the ground, which keep their
@@ -54,7 +54,7 @@ class LightMap:
         return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
 
     def _openness_at(self, pixels: Floats, position: Floats32, normal: Floats32) -> Floats32:
-        """Interpolate the openness (n,) between nearby grid points on the same surface."""
+        """Interpolate the openness between nearby grid points on the same surface."""
         rows, columns = self.openness.shape
         tolerance = plane_tolerance(self.camera, position, STRIDE)
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
@@ -79,7 +79,7 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return how well points (n, 3) match the surface at other points, from 0 to 0.4.
+    """Return how well points match the surface at other points, from 0 to 0.4.
 
     `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
     surface lie within `tolerance` (n,) meters of each other's plane.
@@ -90,7 +90,7 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance (n,) in meters for points on a plane that are `stride` pixels apart."""
+    """Return the tolerance in meters for points on a plane that are `stride` pixels apart."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)

@@ -144,19 +144,19 @@ def _firings_per_second(sensor: Sensor) -> float:
 
 
 def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
-    """Return the azimuths and elevations (n,) of the rays in firings."""
+    """Return the azimuths and elevations of the rays in firings."""
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
     return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
 
 
 def _times_s(sensor: Sensor, firings: Ints) -> Floats:
-    """Return the times (n,) of the rays in firings, relative to the start of the sensor."""
+    """Return the times of the rays in firings, relative to the start of the sensor."""
     times_ns = sensor.times_ns(firings).reshape(-1).astype(np.float64)
     return (times_ns - sensor.start_ns) / 1e9
 
 
 def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
-    """Return the rows and columns (n,) of the cells that contain directions."""
+    """Return the rows and columns of the cells that contain directions."""
     rows = ((elevations_deg + 90) / CELL_DEG).astype(np.int64)
     return rows, ((azimuths_deg + 180) / CELL_DEG).astype(np.int64)
 
@@ -265,7 +265,7 @@ def _draw_rays(
     scale: _TimeScale,
     area: float,
 ) -> None:
-    """Draw rays as dots with an area, colored by their times (n,)."""
+    """Draw rays as dots with an area, colored by their times."""
     axes.scatter(
         *angles_deg,
         s=area * page.unit**2,

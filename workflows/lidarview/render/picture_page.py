@@ -250,7 +250,7 @@ class Page:
     def draw_lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
     ) -> None:
-        """Draw the visible parts of line segments (n, 2, 3) in the color of sensors."""
+        """Draw the visible parts of line segments in the color of sensors."""
         runs = shot.visible_segments(segments, shot.project_visible)
         axes.add_collection(
             LineCollection(
@@ -405,7 +405,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a color bar with colors (n, 3) and a title in the right margin."""
+        """Draw a color bar with colors and a title in the right margin."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)

@@ -108,7 +108,7 @@ def _sensor_label(shot: SurfaceView) -> str:
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
-    """Select some of the rays (n, 2, 3) that end in the picture."""
+    """Select some of the rays that end in the picture."""
     slack = 1e-3 * shot.stage.size
     lowest, highest = shot.stage.bounds
     ray_ends = sample_rays[:, 1]
@@ -190,7 +190,7 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
 
 
 def _object_colors(scene: Scene, kinds: Ints) -> Floats:
-    """Return the colors (objects, 3) of a scene's objects, one color for each group.
+    """Return the colors of a scene's objects, one color for each group.
 
     Floors and halls are gray, so that the objects inside stand out.
     """
@@ -209,7 +209,7 @@ def _object_colors(scene: Scene, kinds: Ints) -> Floats:
 def draw_points(
     image: Floats32, shot: SurfaceView, points: Floats, colors: Floats, solid: bool = False
 ) -> Floats32:
-    """Draw points (n, 3) as discs over an image.
+    """Draw points as discs over an image.
 
     Only points on the visible surface of their pixel are drawn; all other points are hidden, or on
     a wall that has been removed. The points are lit like the surface. If `solid` is set, larger
@@ -244,7 +244,7 @@ def draw_points(
 
 
 def draw_discs(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> Floats32:
-    """Draw discs at pixels (n, 2) in RGBA colors (n, 4) from 0 to 1.
+    """Draw discs at pixels (n, 2) in RGBA colors from 0 to 1.
 
     `radius` is in half pixels. If discs overlap, the nearest center determines the color of a
     pixel.

@@ -55,5 +55,5 @@ def object_colors(count: int) -> Floats:
 
 
 def apply_colormap(name: str, fraction: ArrayLike) -> Floats:
-    """Return the colors (n, 3) of a Matplotlib colormap at fractions (n,) from 0 to 1."""
+    """Return the colors of a Matplotlib colormap at fractions from 0 to 1."""
     return np.asarray(matplotlib.colormaps[name](np.asarray(fraction)), dtype=np.float64)[..., :3]

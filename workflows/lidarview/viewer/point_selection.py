@@ -207,7 +207,7 @@ class PointFilter:
         )
 
     def mask(self, points: Points, row_selection: Ints | slice) -> Bools:
-        """Return a mask (n,) of the selected rows with finite positions that pass the filter."""
+        """Return a mask of the selected rows with finite positions that pass the filter."""
         x, y, z = (points.values(axis, row_selection) for axis in AXES)
         is_kept = np.asarray(np.isfinite(x + y + z))
         for name, lower, upper in self.limits:
@@ -259,7 +259,7 @@ class BrowserCamera:
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
-        """Project points (n, 3) to image coordinates from -1 to 1.
+        """Project points to image coordinates from -1 to 1.
 
         Returns the coordinates (n, 2), and a mask (n,) of the points inside the image.
         """
@@ -268,11 +268,11 @@ class BrowserCamera:
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
     def _clip(self, points: AnyFloats) -> AnyFloats:
-        """Return the clip coordinates (4, n) of points (n, 3)."""
+        """Return the clip coordinates of points."""
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:
-        """Return the image tile (n,) of each point (n, 3), or -1 for points outside the image."""
+        """Return the image tile of each point (n, 3), or -1 for points outside the image."""
         projected, inside = self.project(points)
         x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
         column = (x_share * _TILE_COLUMNS).astype(np.int64)
@@ -287,7 +287,7 @@ class BrowserCamera:
 
 
 def box_corners(box: Floats) -> Floats:
-    """Return the corners (8, 3) of a box (2, 3)."""
+    """Return the corners of a box (2, 3)."""
     return np.array(list(itertools.product(*box.T)))
 
 
@@ -305,7 +305,7 @@ def even_shares(counts: AnyArray, max_points: int) -> Floats:
 
 
 def read_positions(points: Points, row_selection: Ints | slice) -> Floats:
-    """Return the positions (n, 3) at selected rows, float64, in world coordinates."""
+    """Return the positions at selected rows, float64, in world coordinates."""
     # The matrix product in a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 

@@ -91,7 +91,7 @@ def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[
 
 
 def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
-    """Return the RGBA colors (n, 4) of ranges (n,), clipped to the limits."""
+    """Return the RGBA colors of ranges, clipped to the limits."""
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
     colors = np.full((len(ranges), 4), 255, np.uint8)

@@ -161,7 +161,7 @@ class _FilmSource:
     top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
-        """Return the local positions (n, 3) of a sample of the points below `top`."""
+        """Return the local positions of a sample of the points below `top`."""
         rows, _ = self.finder.find(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
@@ -169,7 +169,7 @@ class _FilmSource:
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return local positions (n, 3) and RGBA colors (n, 4) of a sample of the points.
+        """Return local positions and RGBA colors of a sample of the points.
 
         The colors span the height of `box`, which has shape (2, 3).
         """

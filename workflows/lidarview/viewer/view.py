@@ -718,7 +718,7 @@ def _read_limits(text: str) -> tuple[float, float]:
 
 
 def _add_counts(counts: Counter[int], values: AnyArray) -> None:
-    """Add the number of occurrences of each value (n,) to the counts."""
+    """Add the number of occurrences of each value to the counts."""
     labels, numbers = np.unique(values, return_counts=True)
     counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
 

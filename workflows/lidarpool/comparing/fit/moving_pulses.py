@@ -346,7 +346,7 @@ def _pulses_of_sweep(
 
 
 def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
-    """Return the positions (k, 3) and rotations (k, 3, 3) of the sensor when points were fired."""
+    """Return the positions and rotations of the sensor when points were fired."""
     poses = fired.firing_poses
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)

@@ -313,7 +313,7 @@ class _CreepRays:
         )
 
     def _sweep_motion(self, change: Floats) -> _SweepMotion:
-        """Fit the motion of a sweep to the changes of its ranges (k,)."""
+        """Fit the motion of a sweep to the changes of its ranges."""
         returned = np.isfinite(change)
         design = self.design[returned] / self.sigma[returned, None]
         values = change[returned] / self.sigma[returned]

@@ -41,7 +41,7 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
 
 
 def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> ClippedMesh | None:
-    """Clip triangles (f, 3) to the inside of all planes, or return None if none is cut."""
+    """Clip triangles to the inside of all planes, or return None if none is cut."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
@@ -72,7 +72,7 @@ class _Part(NamedTuple):
 
 
 def _outside(vertices: Floats, planes: Floats) -> Bools:
-    """Return for each vertex (v, 3) and plane (6, 4) whether the vertex is outside the plane."""
+    """Return whether each vertex is outside each plane."""
     x, y, z = vertices.T[:, :, None]
     a, b, c, offset = planes.T
     return np.asarray(a * x + b * y + c * z > offset)
@@ -101,7 +101,7 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the point where an edge crosses a plane, from corners with their signed heights.
+    """Return the point where an edge crosses a plane, given its corners with signed heights.
 
     The corners are sorted so that both triangles that share the edge get the same point.
     """

@@ -37,7 +37,7 @@ class FiringClock:
     subrays: int = 1  # number of sub-rays per ray
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of sub-rays (n,) in nanoseconds.
+        """Return the firing times of sub-rays in nanoseconds.
 
         Sub-ray k belongs to ray ``start + k // subrays``.
         """
@@ -76,7 +76,7 @@ class Firings:
         return cls(sensor, numbers, specs[0])
 
     def times(self, ray: Integers) -> Ints:
-        """Return the firing times of rays (n,) in nanoseconds since the start of the survey.
+        """Return the firing times of rays in nanoseconds since the start of the survey.
 
         Rays are numbered from 0 at the first firing.
         """
@@ -172,7 +172,7 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays (n,) of a pattern, in the scene frame.
+        """Return origins and directions of rays of a pattern, in the scene frame.
 
         Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`). Both
         arrays have shape (n, 3), but the origins have shape (1, 3) if all rays share one.
@@ -272,7 +272,7 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Multiply rotations (k, 3, 3) by rotations about z with cosines and sines `spins` (2, k)."""
+    """Multiply rotations by rotations about z, given the cosines and sines of the angles."""
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):

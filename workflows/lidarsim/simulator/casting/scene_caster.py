@@ -105,8 +105,7 @@ class SceneCaster:
         Trees of the static bodies, and shapes of the actors.
     range_m
         Largest range of the sensors in meters. In a scene of hundreds of kilometers, bodies far
-        beyond this range are omitted. Call `ensure_trees` before
-        each scan.
+        beyond this range are omitted. Call `ensure_trees` before each scan.
     unseen
         (objects,): True for objects that rays pass through. `bodies` does not contain the static
         objects among them. None if all objects are visible.
@@ -151,7 +150,7 @@ class SceneCaster:
         self._instances = instances
 
     def ensure_trees(self, positions: Floats) -> None:
-        """Build any missing trees of bodies within range of sensors at positions (p, 3)."""
+        """Build any missing trees of bodies within range of sensors at positions."""
         self._static.ensure_trees(positions, self._range_m)
 
     @property
@@ -274,7 +273,7 @@ class SceneCaster:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Return whether points are visible from origins (n, 3) in the scene frame.
+        """Return whether points are visible from origins in the scene frame.
 
         `towards` (n, 3) are vectors from the origins to the points, and `distance` (n,) their
         lengths in meters. `times` (n,) determine the poses of actors, in nanoseconds since the
@@ -384,7 +383,7 @@ def casters_of_sensors(
         return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
-        """Return the bodies of the scene without the static objects in a mask (objects,)."""
+        """Return the bodies of the scene without the static objects in a mask."""
         objects = static_key(scene, unseen)
         key = media, objects
         if key not in static_bodies:
@@ -442,7 +441,7 @@ def _clearance_m(scene: Scene) -> float:
 
 
 def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
-    """Return the first and then every n-th row of groups that have `counts` (g,) hits."""
+    """Return the first and then every n-th row of groups that have `counts` hits."""
     starts = np.cumsum(counts) - counts
     number_in_group = np.arange(int(counts.sum())) - np.repeat(starts, counts)
     return np.flatnonzero(number_in_group % keep_every == 0)

@@ -81,7 +81,7 @@ class _Trees(NamedTuple):
         return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
-        """Return the triangles of hits (k,) in the numbering of the scene."""
+        """Return the triangles of hits in the numbering of the scene."""
         triangle = hits.triangle
         if self.origins:
             triangle = triangle.copy()
@@ -166,7 +166,7 @@ class StaticBodies:
         return not self._may_cut and self.trees.caster.on_device
 
     def ensure_trees(self, positions: Floats, range_m: float) -> None:
-        """Build trees of all bodies within range of sensors at positions (p, 3), if needed.
+        """Build trees of all bodies within range of sensors at positions, if needed.
 
         Casts in progress can continue to use the trees of an earlier region.
         """
@@ -189,7 +189,7 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move(self, instances: Instances, instance_indices: Indices) -> None:
-        """Move instances, given by their rows (m,), to their transforms in `instances`.
+        """Move instances, given by their rows, to their transforms in `instances`.
 
         No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
         that sensors can reach, as a body that falls forever does, or if it was clipped.

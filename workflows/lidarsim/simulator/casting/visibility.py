@@ -41,7 +41,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
 
 
 def static_key(scene: Scene, unseen: Bools | None) -> bytes:
-    """Return a key that is equal for masks (objects,) with the same unseen static objects.
+    """Return a key that is equal for masks with the same unseen static objects.
 
     The key is empty if all static objects are visible.
     """

@@ -1,4 +1,4 @@
-"""Compiled loops that sample the particles and the fog that beams meet, see particles.py."""
+"""Compiled loops that sample the particles and the fog that beams meet (particles.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 

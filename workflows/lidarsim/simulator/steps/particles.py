@@ -1,8 +1,8 @@
-"""Hits in the air: drops, flakes, fog and dust in front of surfaces.
+"""Hits on rain, snow, fog and dust in front of surfaces.
 
 The particles that a beam meets depend only on the random numbers of its pulse. Only particles that
-the sensor may detect are sampled: their number from a Poisson distribution, and their ranges and
-diameters as quantiles.
+the sensor may detect are sampled. Their number is drawn from a Poisson distribution, and their
+ranges and diameters are drawn as quantiles.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class WeatherStep(PulseStep):
         )
 
     def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether points at distances (n,) along rays are inside water or glass."""
+        """Return whether points at distances along rays are inside water or glass."""
         row_indices = self._refracting(hits)
         surface_ray = hits.ray[row_indices]
         surface_distance = hits.distance[row_indices]
@@ -297,7 +297,7 @@ def room_for_hits(size: int) -> SampledHits:
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,) in meters."""
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` in meters."""
     from . import particle_loops  # imported here: numba takes half a second
 
     beams = len(reach) // subrays

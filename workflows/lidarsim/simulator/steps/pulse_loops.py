@@ -1,4 +1,7 @@
-"""Functions shared by the compiled loops over pulses. Each loop is compiled on first use."""
+"""Functions shared by the compiled loops over pulses.
+
+Each loop is compiled on first use.
+"""
 
 # mypy: disable-error-code="no-untyped-def"
 

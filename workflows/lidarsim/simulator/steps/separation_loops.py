@@ -1,4 +1,4 @@
-"""Compiled loops that make, detect and select the returns of hits, see separation.py."""
+"""Compiled loops that create, detect and select returns (separation.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -436,7 +436,7 @@ def _keep_reported(begin, stop, mode, scratch, output):
 
 @compiled()
 def mark_reported(ray, energy, mode, shown):
-    """Mark in `shown` (n,) which returns, sorted by ray, a mode reports."""
+    """Mark in `shown` which returns, sorted by ray, a mode reports."""
     begin = 0
     while begin < len(ray):
         stop = begin + 1

@@ -1,4 +1,4 @@
-"""Spray: clumps of drops that vehicles leave behind on wet ground.
+"""Spray, which consists of clumps of drops that vehicles leave behind on wet ground.
 
 Every tenth of a second, each vehicle leaves a box of spray that is as wide and high as the vehicle,
 and as long as the distance that it has driven. A box stays in place while its drops fall to the
@@ -228,7 +228,7 @@ class SprayStep(PulseStep):
     def _boxes_of(
         self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, pose_ns: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the boxes that actors leave at `created_ns` (b,), and the actors' speeds in m/s.
+        """Return the boxes that actors leave at `created_ns`, and the actors' speeds in m/s.
 
         Each row of the boxes (b, 12) is a center and three vectors, half of the box's sides, in
         meters in the scene frame. A box starts at the rear of the actor. Along the actor's x axis,

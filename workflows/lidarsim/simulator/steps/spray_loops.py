@@ -1,4 +1,4 @@
-"""Compiled loops over pulses that cross boxes of spray, see spray.py."""
+"""Compiled loops over pulses that cross boxes of spray (spray.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -41,7 +41,10 @@ class SprayBoxes(NamedTuple):
 
 
 class BoxCrossings(NamedTuple):
-    """BoxCrossings of beams and boxes. The crossings of a beam are consecutive."""
+    """Crossings of beams and boxes.
+
+    The crossings of a beam are consecutive.
+    """
 
     beam: Ints  # (k,): number of the beam in the batch
     # (3, k): ranges in meters at which the beam enters and leaves the box, and the density of the
@@ -60,7 +63,7 @@ class ClumpTables(NamedTuple):
 
 @noinline
 def _ball_radii(boxes):
-    """Return the radii in meters of the bounding spheres of boxes (b, 12)."""
+    """Return the radii in meters of the bounding spheres of boxes."""
     radii = np.zeros(len(boxes))
     for b in range(len(boxes)):
         for side in range(3, 12):

@@ -1,4 +1,4 @@
-"""Waveforms: the light of a pulse that a receiver records over time, and the returns in it.
+"""Waveforms, which record the light of a pulse over time, and the returns found in them.
 
 Pulse and receiver response are Gaussian, so a waveform is a sum of Gaussians, one for each hit of a
 sub-ray. Each is as wide as the pulse appears to the receiver, which is the system waveform (Wagner
@@ -81,7 +81,7 @@ class Digitizer:
         return 2 / LIGHT_M_NS / self.sample_ns
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
-        """Return the heights of returns (n,) with the given energies and widths.
+        """Return the heights of returns with the given energies and widths.
 
         `width` is the full width at half maximum in ns. A return as wide as the system waveform is
         as high as its energy. A width of 0 means that the width is unknown; it is then assumed to
