@@ -68,7 +68,7 @@ class PcapWriter:
         self._file.write(content.data)
 
     def _frames(self, group: Datagrams) -> Bytes:
-        """Return the frames of datagrams including their file headers, as an array (n, bytes)."""
+        """Return the frames of datagrams including their file headers, with one row per frame."""
         count, size = group.payloads.shape
         frames = np.zeros((count, _PAYLOAD_OFFSET + size), np.uint8)
         frames[:, _PAYLOAD_OFFSET:] = group.payloads

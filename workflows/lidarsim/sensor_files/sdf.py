@@ -1,4 +1,4 @@
-"""Gazebo <gpu_lidar> sensors (.sdf), which must be regular grids.
+"""Gazebo <gpu_lidar> sensors (.sdf), whose rays must form regular grids.
 
 See http://sdformat.org/spec?ver=1.9&elem=sensor. Azimuths increase counterclockwise from x, and
 elevations are measured above the xy plane. Both are evenly spaced, in radians, including both ends.
