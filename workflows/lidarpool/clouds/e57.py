@@ -101,7 +101,10 @@ class E57(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans of an E57 file. Points are in the scanner frame, with a pose per scan."""
+        """Open the scans of an E57 file.
+
+        Points are in the scanner frame, and each scan has a pose.
+        """
         return _open_e57(source)
 
 
@@ -333,7 +336,7 @@ def _full_color(header: Any, highest: float) -> float:
 
 
 def _scale(headers: Sequence[Any]) -> _Scale:
-    """Return how to convert the intensities of all scans to the same scale.
+    """Determine the common scale to which the intensities of all scans are converted.
 
     Intensities are used as stored unless all scans that have them declare limits.
     """

@@ -62,7 +62,10 @@ def summarize_flight_lines(survey: Survey) -> dict[str, float] | None:
 
 
 def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
-    """Return when a sensor starts and stops firing in a survey of `steps` steps, in seconds."""
+    """Return the times in seconds at which a sensor starts and stops firing in a survey.
+
+    `steps` is the number of steps in the survey.
+    """
     _, firings = sensor.firings(steps - 1)
     return sensor.start_ns / 1e9, sensor.begins_ns(np.array([firings])).item() / 1e9
 

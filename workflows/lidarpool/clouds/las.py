@@ -1,4 +1,7 @@
-"""Read and write LAS and LAZ with laspy. Written files are version 1.4, point formats 6 to 10."""
+"""Read and write LAS and LAZ files with laspy.
+
+Written files have version 1.4 and point formats 6 to 10.
+"""
 
 from __future__ import annotations
 

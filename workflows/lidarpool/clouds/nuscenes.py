@@ -325,7 +325,7 @@ def _actor_categories(sweeps: Sweeps) -> list[str]:
 
 
 def _spelled_alike(name: str) -> str:
-    """Normalize a name, so that names that differ only in case or underscores are equal."""
+    """Normalize a name so that names are equal if they differ only in case or underscores."""
     return name.casefold().replace("_", " ")
 
 

@@ -41,7 +41,7 @@ _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
-    """The recording has several sensors or topics, and none was chosen.
+    """Raised if a recording has several sensors or topics, and none was chosen.
 
     `contents` is a sentence that lists them, and `option` is the option that chooses one of them.
     """
