@@ -81,7 +81,10 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Document:
-    """The elements of a file by ID; each geometry is read once."""
+    """The elements of a file by ID.
+
+    Each geometry is read only once.
+    """
 
     def __init__(
         self, root: Element, allowance: Allowance, paint: _Effects | None, options: ReadOptions
@@ -176,9 +179,10 @@ class _Document:
     def _read_geometry(
         self, geometry: Element, bound: tuple[tuple[str, Element], ...]
     ) -> list[SceneMesh]:
-        """Return the mesh of all primitives, which differ only in their materials, or nothing.
+        """Return the mesh of all primitives in a list, which is empty without triangles.
 
-        `bound` are the material symbols and the elements that they refer to.
+        The primitives differ only in their materials. `bound` maps material symbols to the elements
+        that they refer to.
         """
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
@@ -314,7 +318,10 @@ class _Document:
 
 
 class _Effects:
-    """The diffuse colors of effects; each image is read once."""
+    """The diffuse colors of effects.
+
+    Each image is read only once.
+    """
 
     def __init__(self, path: Path, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -454,7 +461,7 @@ def _tag(element: Element) -> str:
 
 
 def _step(element: Element) -> Floats:
-    """Return the matrix (4, 4) of a transform element.
+    """Return the matrix of a transform element.
 
     Raises ValueError if it has the wrong number of values.
     """
@@ -472,7 +479,7 @@ def _rotate(numbers: Floats) -> Floats:
 
 
 def _look_at(numbers: Floats) -> Floats:
-    """Return the matrix for a camera position, a target, and an up vector, given as (9,)."""
+    """Return the matrix for a camera position, a target, and an up vector (nine numbers)."""
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / norm(eye - target)
     x = np.cross(up, z) / norm(np.cross(up, z))

@@ -1,4 +1,4 @@
-"""Convert SDFormat shapes to meshes: primitives, polylines, height maps, and roads."""
+"""Convert SDFormat primitives, polylines, height maps, and roads to meshes."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _plane(shape: Element) -> SceneMesh | None:
 
 
 def _from_z(normal: Floats) -> Floats:
-    """Return the shortest rotation from the z axis to a unit vector (3,)."""
+    """Return the shortest rotation from the z axis to a unit vector."""
     x, y, z = normal.tolist()
     if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
@@ -153,7 +153,7 @@ def _ring(polyline: Element) -> Floats:
 
 
 def _area(ring: Floats) -> float:
-    """Return the signed area of a ring (n, 2), positive if it is counterclockwise."""
+    """Return the signed area of a ring, which is positive if the ring is counterclockwise."""
     x, y = (ring - ring[0]).T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 
@@ -173,7 +173,7 @@ def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
 
 
 def _contains(ring: Floats, point: Floats) -> bool:
-    """Return True if a point (2,) is inside a ring (n, 2)."""
+    """Return whether a point is inside a ring."""
     a = ring - point
     b = np.roll(a, -1, axis=0)
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)

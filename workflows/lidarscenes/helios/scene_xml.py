@@ -39,7 +39,7 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 @dataclass
 class HeliosPart:
-    """A mesh file in a scene with its placement: rotation, scale, and translation."""
+    """A mesh file in a scene with its rotation, scale, and translation."""
 
     assets: Assets
     file: Path
@@ -220,7 +220,10 @@ class HeliosScene:
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """Return the entries of `materials` for all objects, or for their faces if these differ."""
+        """Return the entries of `materials` for all objects.
+
+        Objects whose faces differ have an entry for each of their materials.
+        """
         spectra = partial(self._reflectance, wavelength_nm)
         kinds = [part.material_fields(spectra) for part in self.parts]
         if not any(kind for part_kinds in kinds for kind in part_kinds.values()):

@@ -15,16 +15,16 @@ from .plants import SCALES, SPECIES, all_trees, place_instances
 
 MAX_CARS = 50_000
 
-# Along the edges of a block, in meters: distance between positions, inward offset from the edge,
-# and free space at corners.
+# Distance between positions along the edges of a block, inward offset from the edge, and free space
+# at corners, in meters.
 _TREE_APART_M = 7.0
 _TREE_INWARD_M = 1.3
 _TREE_CORNER_M = 5.0
 _CAR_APART_M = 6.5
 _CAR_INWARD_M = -1.3
 _CAR_CORNER_M = 8.0
-_CAR_SHIFT_M = 0.5  # maximum, along the street
-_CURB_ON_RIGHT = 0.9  # share of cars with the curb on their right
+_CAR_SHIFT_M = 0.5  # maximum shift along the street
+_CURB_ON_RIGHT = 0.9  # fraction of cars with the curb on their right
 _STREET_REACH_M = 3.5  # maximum crown radius at streets, which keeps the center of the road free
 # Yards and parks have at most one tree per cell, in its central part.
 _YARD_M = 6.0
@@ -108,7 +108,7 @@ def _tree_sites(
 
 
 def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
-    """Place cars along the curbs of blocks (b, 2, 2), which are given by their centers and sizes.
+    """Place cars along the curbs of blocks, which are given by their centers and sizes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Find the floor below a position, where a sensor stands, and the ceiling above it."""
+"""Find the floor below the position of a sensor, and the ceiling above it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.scene.scene import Scene
 
-# Maximum thickness of a floor slab. Sensors stand inside thicker objects, such as a hall.
+# Maximum thickness of a floor slab. Sensors can be inside thicker objects, such as a hall.
 SLAB_M = 0.5
 FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 

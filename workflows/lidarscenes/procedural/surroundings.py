@@ -14,13 +14,13 @@ from raybeam import RayCaster, available_backends
 
 from .floor import triangles_in_box
 
-RAYS = 1000  # rays from each position, and from outside
+RAYS = 1000  # number of rays from each position, and from outside
 HAND_M = 0.1  # closer hits are ignored
 CLEAR_M = 0.5  # required clearance around a sensor
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
-# Shares of rays. Of the downward rays from 1, 2, and 3 m above a patch of ground 5 m wide, a share
-# of 0.4 hits the patch.
+# Fractions of rays. Of the downward rays from 1, 2, and 3 m above a patch of ground 5 m wide, a
+# fraction of 0.4 hits the patch.
 _GROUND = 0.4
 _SKY = 0.3
 _ENCLOSED = 0.95
@@ -32,19 +32,21 @@ _LEAVES = 0.4  # maximum openness of leaves
 # Limits for a room, which is a closed body with a floor and upright walls inside.
 _MIN_ROOM_WIDTH_M = 2.0
 _MAX_ROOM_HEIGHT_M = 15.0
-_WHOLE = 0.9  # a body that spans this share of each side is the whole scene
-# A room spans at least this share of the scene along each axis. Smaller bodies are objects in it.
+_WHOLE = 0.9  # a body that spans this fraction of each side is the whole scene
+# A room spans at least this fraction of the scene along each axis. Smaller bodies are objects in
+# it.
 _SPANS = 1 / 3
-# Limits for the z of directions: more than 10 degrees above the horizon, within 60 degrees of
-# straight up, and within 30 degrees of straight down. The shares are of rays that hit a cover.
+# Limits for the z component of directions more than 10 degrees above the horizon, within 60 degrees
+# of straight up, and within 30 degrees of straight down. The fractions apply to the rays that hit a
+# cover.
 _RAISED = 0.17
 _UPWARD = 0.5
 _DOWNWARD = -0.87
 _COVERED = 0.9
 _WIDELY_COVERED = 0.95
-# Minimum share of directions with surfaces inside a body. A flat surface covers at most half.
+# Minimum fraction of directions with surfaces inside a body. A flat surface covers at most half.
 _AROUND = 0.6
-# Distances and number of directions in which free positions are searched for.
+# Distances, and number of directions, at which free positions are searched for.
 _STEPS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 _DIRECTIONS = 16
 
@@ -140,7 +142,7 @@ class PlacementChecker:
         return not self._is_room(views)
 
     def is_inside_body(self, position: ArrayLike) -> bool:
-        """Return whether a local position (3,) is inside a closed body that is not a room.
+        """Return whether a local position is inside a closed body that is not a room.
 
         A body that stands on the ground may lack a bottom.
         """

@@ -1,4 +1,4 @@
-"""Convert lanes to strips of triangles: lane sections, borders, heights, and curbs.
+"""Convert lanes to strips of triangles, with their borders, heights, and curbs.
 
 `section_surfaces` measures the surface of each lane section at samples, and then places the
 stations of its triangles according to the measured curvatures.
@@ -35,7 +35,7 @@ from .cubics import NO_CUBICS, Cubics
 from .elements import MAX_SHOWN, UnreadElements, read_number
 from .road import Road, RoadFrames, RoadNetwork
 
-_ACROSS_SHARE = 0.3  # share of the height tolerance that is used for curved cross sections
+_ACROSS_SHARE = 0.3  # fraction of the height tolerance that is used for curved cross sections
 _CURB_M = 1e-3  # minimum height of a curb
 _MIN_COLUMNS = 2  # minimum number of point columns in a section with lanes
 _BYTES_PER_POINT = 400  # peak memory per point of a lane
@@ -85,7 +85,7 @@ class Lane:
         return len(self.inner_heights) > 0
 
     def width(self, stations: RoadStations, inner_t: Floats, middle_t: Floats) -> Floats:
-        """Return the width in meters, which may be negative if the file says so.
+        """Return the width in meters, which is negative where the file defines a negative width.
 
         `inner_t` and `middle_t` (k,) are the t coordinates of the inner border and of the center
         lane.
@@ -208,11 +208,11 @@ class LaneSection:
             return kinks
 
         def values(stations: RoadStations) -> Floats:
-            """Return widths and borders (v, k)."""
+            """Return widths and borders. Shape (v, k)."""
             borders, widths = self._borders_and_widths(road, stations)
             return np.stack([*widths.values(), *borders.values()])
 
-        # Pairs of a width or border and a level that it may cross
+        # Pairs of a width or border and a level that it may cross.
         lanes = len(self.all_lanes)
         levels = np.concatenate([np.zeros(lanes), np.tile(kinks, lanes + 1)])
         crossing = np.concatenate(
@@ -331,7 +331,7 @@ class Strip(NamedTuple):
 
     @property
     def faces(self) -> Ints:
-        """Triangles (f, 3), with normals that point up or, for a curb, away from the road."""
+        """Triangles with normals that point up or, for a curb, away from the road. Shape (f, 3)."""
         faces = grid_faces(*self.t.shape)
         if len(self.steps):
             # There is a wall where heights step, but not where only widths step.
@@ -346,7 +346,7 @@ class Strip(NamedTuple):
 
 @lru_cache(maxsize=256)
 def grid_faces(columns: int, stations: int) -> Ints:
-    """Return two triangles for each cell of a grid with columns * stations points, shape (f, 3)."""
+    """Return two triangles for each cell of a grid with columns * stations points."""
     corners = np.arange(columns * stations).reshape(columns, stations)
     a = corners[:-1, :-1]
     b = corners[:-1, 1:]
@@ -395,7 +395,7 @@ class SectionSurface:
         self._allowance = allowance
         self.borders = section.borders(road, self.stations)
         self._lines = self._lines_across()
-        # Points (c, k, 3) of all borders, from right to left, if cross sections are straight
+        # Points (c, k, 3) of all borders, from right to left, if cross sections are straight.
         self._border_points: Floats | None = None
         if not road.curved_across:
             right = [self.borders[lane.number] for lane in section.lanes[-1][::-1]]

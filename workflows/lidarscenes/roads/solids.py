@@ -1,4 +1,4 @@
-"""Build the solids of objects and signals: boxes, cylinders, prisms, and painted strips."""
+"""Build boxes, cylinders, prisms, and painted strips for objects and signals."""
 
 from __future__ import annotations
 
@@ -112,9 +112,9 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
 
 
 def extrude_sections(sections: Floats, material: str, *, capped: bool = True) -> Piece:
-    """Return the surface through cross sections (k, c, 3), each of which is a ring of corners.
+    """Return the surface through cross sections, each of which is a ring of corners.
 
-    The ends are closed if `capped` is set.
+    The cross sections have shape (k, c, 3). The ends are closed if `capped` is set.
     """
     count, corners, _ = sections.shape
     numbers = np.arange(count * corners).reshape(count, corners)
@@ -156,7 +156,7 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
 
 
 def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
-    """Return alternate stripes across the longest side of a convex, level outline (n, 3)."""
+    """Return alternate stripes across the longest side of a convex, level outline."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring
     longest = int(norm(sides).argmax())

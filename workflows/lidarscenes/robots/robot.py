@@ -1,4 +1,4 @@
-"""Define robots: links, the joints between links, and the poses of links over time."""
+"""Define robots with links, the joints between links, and the poses of links over time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lidarsim.scene.transform import rotation_about
 from lidarsim.schema.checks import as_array, check_fits, check_list
 from lidarsim.words import name_hint, plural
 
-_LATE_S = 1e-3  # some beams of the last firing are fired slightly after the survey's end
+_LATE_S = 1e-3  # some beams of the last firing are fired slightly after the end of the survey
 MOVING = ("revolute", "continuous", "prismatic")
 HELD = ("fixed", "floating", "planar")
 
@@ -114,7 +114,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Text with the numbers of links and triangles, and the movable joints."""
+        """Text with the numbers of links and triangles, and with the movable joints."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
@@ -312,7 +312,7 @@ class Robot:
         return {joint.name: joint for joint in self.joints.values() if joint.moves}
 
     def _add_missing(self, table: dict[str, Floats], count: int) -> None:
-        """Add the values of joints that are missing in a table: mimicked or at rest."""
+        """Add the values of joints that are missing in a table, which are mimicked or at rest."""
         joints = self._moving_joints()
         for name in joints:
             chain = [joints[name]]
@@ -557,7 +557,10 @@ class _LinkMotion(NamedTuple):
 
 
 def _product(left_matrices: Floats, right_matrices: Floats) -> Floats:
-    """Return the products of matrices and (3, m, k), where k may be 1."""
+    """Return the products of 3 x 3 matrices and 3 x m matrices.
+
+    The shapes are (3, 3, k) and (3, m, k), where k may be 1.
+    """
     return np.asarray(
         (
             left_matrices[:, 0, None] * right_matrices[0]
