@@ -15,7 +15,7 @@ from .shot import SIZE
 from .theme import apply_colormap
 
 COLORS = "viridis"
-MAX_FIRINGS = 8  # firings that are drawn for sensors with several channels
+MAX_FIRINGS = 8  # number of firings that are drawn for sensors with several channels
 
 
 class _BeamPlot(NamedTuple):
@@ -29,9 +29,9 @@ class _BeamPlot(NamedTuple):
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, colored by time.
 
-    A sensor with several channels shows `MAX_FIRINGS` firings, a sensor with a single channel one
-    frame. A sensor that looks down shows two mirror cycles: its rays lie in a plane, so their angle
-    is plotted over time.
+    For a sensor with several channels, `MAX_FIRINGS` firings are drawn, and for a sensor with a
+    single channel one frame. For a sensor that looks down, two mirror cycles are drawn. Its rays
+    lie in a plane, so their angle is plotted over time.
     """
     page = Page(size)
     firings_per_revolution = round(getattr(sensor.head, "firings_per_turn", 1000))

@@ -12,19 +12,18 @@ from .surface import RenderMesh, dot, golden_spiral
 
 MAX_SENSORS = 8  # number of sensors whose surroundings are tested
 MAX_LAYERS = 12  # number of removed surfaces on a ray; walls have two faces, and roofs have beams
-ENCLOSED = 0.7  # minimum share of horizontal rays that hit the scene if sensors are indoors
-HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller share of the sensors' hits
+ENCLOSED = 0.7  # minimum fraction of horizontal rays that hit the scene if sensors are indoors
+HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller fraction of the sensors' hits
 
 
 @dataclass(frozen=True, eq=False)
 class Cutaway:
     """The rule that selects which surfaces are removed.
 
-    A hit is removed if three conditions hold: its object surrounds the sensors in plan view, the
-    hit is in the outer shell of the object, and its plane has the camera on one side and most
-    sensors on the other. Both faces of the walls in front and the roof are therefore removed, while
-    the walls at the back, the floor, and objects inside are kept, regardless of the winding and
-    grouping of triangles.
+    A hit is removed if its object surrounds the sensors in plan view, the hit is in the outer shell
+    of the object, and its plane has the camera on one side and most sensors on the other. Both
+    faces of the walls in front and the roof are therefore removed, while the walls at the back, the
+    floor, and objects inside are kept, regardless of the winding and grouping of triangles.
     """
 
     surface: RenderMesh
@@ -42,7 +41,7 @@ class Cutaway:
         width = np.where(np.isfinite(core).all(axis=1), core[:, 1] - core[:, 0], 0.0)
         core[:, 0, :2] += 0.06 * width[:, :2]
         core[:, 1, :2] -= 0.06 * width[:, :2]
-        # The roof and objects below it: everything above the middle between sensors and top.
+        # The roof and objects below it are everything above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
         # Hills are not walls. An object below the sensors that only faces up is ground.
         facing = np.full(len(core), np.inf)
@@ -89,7 +88,7 @@ def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | N
 
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Return origins and directions (p * count, 3) of rays from sensors between two elevations."""
+    """Return origins and directions of rays from sensors between two elevations."""
     rays = golden_spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 

@@ -29,18 +29,20 @@ FOCAL_PX = 922.0  # focal length in pixels, for a field of view of 55 degrees
 _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
-_HEADING_SHARE = 0.12  # the heading is averaged over this share of the film before and after
-# A circling camera: its distance as a multiple of the size, and the tangent of its elevation.
+# The heading is averaged over this fraction of the film before and after each frame.
+_HEADING_SHARE = 0.12
+# Distance of a circling camera as a multiple of the size, and tangent of its elevation.
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
-# As multiples of the focus distance: closer surfaces are omitted, and distant surfaces fade.
+# Distances below which surfaces are omitted, and at which they fade, as multiples of the focus
+# distance.
 _MIN_FOCUS = 0.3
 _HAZE_FOCUS = 6.0
 # Brightness of old points, and the number of frames in which new points fade to it.
 _OLD_BRIGHTNESS = 0.42
 _FADE_FRAMES = 3.0
 _POINT_RADIUS = 2.3  # half pixels
-_NOISE = 0.02  # distance of a point from its surface, as a share of its range
+_NOISE = 0.02  # distance of a point from its surface, as a fraction of its range
 
 
 class _Shape(NamedTuple):
@@ -97,9 +99,9 @@ class Film:
     """
 
     moments_ns: Floats  # (k,) times of the frames
-    # New points (n, 3) in each frame, and their RGBA colors (n, 4) from 0 to 1
+    # New points (n, 3) in each frame, and their RGBA colors (n, 4) from 0 to 1.
     new_points: Iterable[tuple[Floats, Floats]]
-    keep_share: float  # share of the points that later frames show as well
+    keep_share: float  # fraction of the points that later frames show as well
     scene_triangles: AnyFloats  # (f, 3, 3) corners of the scene's triangles
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
@@ -234,7 +236,7 @@ def _draw_surfaces(
 
 
 def _edges(inverse_depth: Floats) -> Floats:
-    """Return the strength (height, width, 1) of the edges between surfaces.
+    """Return the strength of the edges between surfaces. Shape (height, width, 1).
 
     The inverse depth of a plane is linear in the image. Beyond an edge, it falls below this line.
     """

@@ -107,7 +107,7 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
     """Return the hits per square meter on triangles, given the hits on each triangle.
 
-    If most triangles are so small that they have at most one hit, neighbors share their hits: each
+    If most triangles are so small that they have at most one hit, neighbors share their hits. Each
     triangle passes a third of its hits to each corner, and each corner distributes them by area.
     This is repeated until a density is estimated from a dozen hits. The total number of hits is
     preserved.
@@ -141,7 +141,7 @@ def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Fl
         corner_hits, corner_areas, out=np.zeros_like(corner_hits), where=corner_areas > 0
     )
     shared = area * density[faces].sum(axis=1)
-    # Triangles without area have no density; they keep their hits.
+    # Triangles without area have no density and keep their hits.
     return np.where(area > 0, shared, hit_counts)
 
 
@@ -162,7 +162,7 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
 
 
 def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
-    """Return colors (..., 3) for densities (...,).
+    """Return colors for densities.
 
     Surfaces that only share the hits of their neighbors fade to gray at low densities. Surfaces
     with hits, marked by the mask `hit` (...,), never do.
@@ -248,13 +248,13 @@ class _WeightGrid:
 
 
 def _keys(cells: Ints) -> Ints:
-    """Return a unique number for each cell (n, 3)."""
+    """Return a unique number for each cell."""
     cells = cells + 1  # so that neighbors of the lowest cell are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
 def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
-    """Return the index and the length of the longest edge of each piece, shape (k,)."""
+    """Return the index and the length of the longest edge of each piece. Shape (k,)."""
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 

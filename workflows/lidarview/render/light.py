@@ -21,7 +21,7 @@ ROTATIONS = (
     0.02,
 )  # rotation of the sky and sun lights between neighboring grid points, in radians
 SUN_RADIUS_RAD = 0.045  # ten times the real radius, for soft shadows
-SUN_SHARE = 0.4  # share of the sun in the light on open horizontal ground
+SUN_SHARE = 0.4  # fraction of the light on open horizontal ground that comes from the sun
 THIN_OPENNESS = 0.5  # openness of surfaces that are too thin to contain a grid point
 # Brightness of a surface that faces the light.
 AMBIENT = 0.24
@@ -35,7 +35,7 @@ class LightMap:
 
     camera: Camera
     sun: Floats  # (3,) unit vector toward the sun
-    openness: Floats32  # (rows, columns) unblocked share of the light, from 0 to 1
+    openness: Floats32  # (rows, columns) unblocked fraction of the light, from 0 to 1
     position: Floats32  # (rows, columns, 3) meters; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
 
@@ -97,7 +97,7 @@ def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32
 
 
 def _sun_direction(camera: Camera) -> Floats:
-    """Return the direction (3,) of the sun.
+    """Return the direction of the sun.
 
     The sun is behind the camera on the left, so shadows fall to the right.
     """
@@ -149,7 +149,7 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return the number, 0 to 3, of each grid point with a surface in its block of two by two.
+    """Return the number (0 to 3) of each grid point with a surface in its block of two by two.
 
     `has_surface` has shape (rows, columns).
     """
@@ -158,7 +158,7 @@ def _quarters(has_surface: Bools) -> Ints:
 
 
 def _rotated(direction: Floats, rotation: float) -> Floats:
-    """Return a direction (3,) in four rotations about z, `rotation` radians apart."""
+    """Return a direction in four rotations about z, `rotation` radians apart."""
     x, y, z = direction
     angles = rotation * np.arange(4)
     cos = np.cos(angles)

@@ -24,7 +24,7 @@ from .light import STRIDE, LightMap, make_light_map, plane_tolerance, surface_si
 from .stage import PlotBox
 from .surface import RenderMesh, normalize, separate_objects
 
-SIZE = (1600, 1000)  # pixels of a finished picture
+SIZE = (1600, 1000)  # width and height of a finished picture in pixels
 # Frame of the scene. The title is above, and the legend or color bar is on the right.
 FRAME = (0.08, 0.115, 0.79, 0.91)
 # Values in place of a triangle index.
@@ -32,9 +32,9 @@ SKY = -1
 GROUND = -2
 # Offsets of the samples in an edge pixel from its center, in pixels.
 _EDGE_OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-STEPS = 700  # points along a line at which visibility is tested
-# Shares of the scene's diagonal: the gap between touching objects, and the distance at which rays
-# start in front of the pieces of a triangle.
+STEPS = 700  # number of points along a line at which visibility is tested
+# Gap between touching objects, and distance at which rays start in front of the pieces of a
+# triangle, as fractions of the scene's diagonal.
 _OBJECT_GAP = 5e-6
 _PIECE_GAP = 1e-6
 
@@ -50,7 +50,7 @@ class RaySamples:
     distance: Floats32  # (n,) in meters, infinite for the sky
     position: Floats32  # (n, 3) in meters, NaN for the sky
     normal: Floats32  # (n, 3) unit length, NaN for the sky
-    light: Floats32  # (n,) brightness, 1 on open ground
+    light: Floats32  # (n,) brightness, which is 1 on open ground
     weights: Floats32  # (n, 3) weights of the triangle's corners
 
     def scatter(self, which: Ints, count: int) -> RaySamples:
@@ -103,9 +103,9 @@ class SurfaceView:
     models: str  # sensor models, for a second caption
     stage: PlotBox
     camera: Camera
-    pixel_samples: RaySamples  # one through each pixel center
+    pixel_samples: RaySamples  # one sample through each pixel center
     edges: Ints  # (e,) pixels that show the edge of a surface
-    edge_samples: RaySamples  # several for each edge pixel, in the order of `edges`
+    edge_samples: RaySamples  # several samples for each edge pixel, in the order of `edges`
 
     @property
     def scene(self) -> Scene:
@@ -114,7 +114,7 @@ class SurfaceView:
 
     @property
     def depth(self) -> Floats32:
-        """Distance (height, width) from the camera to the surface in meters.
+        """Distance from the camera to the surface in meters. Shape (height, width).
 
         Pixels without a surface have an infinite distance.
         """
@@ -301,7 +301,7 @@ class _OpenScene(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """Remark on the displayed part for a caption; empty if the whole scene is shown."""
+        """Remark on the displayed part for a caption, or an empty string for the whole scene."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)

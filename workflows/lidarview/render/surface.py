@@ -104,7 +104,7 @@ def _shared_corners(scene: Scene, objects: Integers) -> Ints:
 
 
 def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Return the dot products (...,) of vectors (..., 3)."""
+    """Return the dot products of vectors."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 

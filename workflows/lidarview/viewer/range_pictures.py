@@ -15,7 +15,7 @@ _IMAGE_WIDTH = 1024  # maximum number of columns
 
 _IMAGE_ROWS = 128  # number of rows unless rows are channels
 
-_COLUMN_SHARE = 0.9  # number of columns as a share of the sensor's azimuth steps
+_COLUMN_SHARE = 0.9  # number of columns as a fraction of the sensor's azimuth steps
 
 # A sensor with fewer or more channels gets elevation steps as rows.
 _MIN_CHANNELS = 4
@@ -100,7 +100,7 @@ def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def surround_object(sensors: Floats, bounds: Floats) -> bool:
-    """Return True if there are several sensors, all beside or above the bounds of an object.
+    """Return whether there are several sensors, all of which are beside or above an object.
 
     `sensors` has shape (n, 3) and `bounds` (2, 3).
     """
