@@ -72,7 +72,7 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def unavailable_reason(cls) -> str:
-        """Return why this backend cannot be used and the remedy, or "" if it can be used."""
+        """Return the reason why this backend is unavailable, with a remedy, or ""."""
 
     @classmethod
     def versions(cls) -> str:

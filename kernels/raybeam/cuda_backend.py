@@ -74,7 +74,7 @@ class CudaBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
+        """Return the reason why CuPy or CUDA is unavailable, with a remedy, or ""."""
         if importlib.util.find_spec("cupy") is None:
             command = install_command("cupy-cuda12x")
             return f"CuPy is not installed; run {command} (or cupy-cuda13x)"
@@ -391,7 +391,7 @@ class CudaBackend(Backend):
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
     def _motion_tables(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
-        """Return arguments of `make_rays`: delays, velocities, and whether the lidar moves."""
+        """Return the delays, the velocities, and whether the lidar moves, for `make_rays`."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:

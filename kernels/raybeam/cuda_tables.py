@@ -117,7 +117,7 @@ def _concatenate(tables: list[AnyArray]) -> AnyArray:
 
 
 def _node_rows(tree: WideTree) -> Floats32:
-    """Return the nodes of a tree as rows of 32 numbers: boxes, children and padding."""
+    """Return the nodes of a tree as rows of 32 numbers, with boxes, children and padding."""
     table = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
     table[:, 0:3] = tree.lower
     table[:, 3:6] = tree.upper

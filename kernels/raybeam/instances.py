@@ -276,7 +276,7 @@ def _matrix(number: int, transform: ArrayLike | None) -> Floats:
 
 
 def _matrices(numbers: Integers, values: AnyArray) -> Floats:
-    """Return transforms (k, ...) of the instances `numbers` as float64 (k, 3, 4).
+    """Return transforms of the instances `numbers` as a float64 array of shape (k, 3, 4).
 
     Raises ValueError if the shape, the type or the last row is invalid.
     """

@@ -166,7 +166,7 @@ def _has_area(corners: Floats) -> Bools:
 
 
 def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
-    """Return faces as int64 (f, 3).
+    """Return faces as an int64 array.
 
     Raises ValueError if the shape is wrong, a vertex index is invalid, or there are too many faces.
     """

@@ -378,7 +378,7 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
 
 @inlined
 def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray `k` of rays (6, n), given by their address, intersects a box at a pose."""
+    """Return whether ray `k` of a table, given by its address, intersects a box at a pose."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)

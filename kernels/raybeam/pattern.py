@@ -129,7 +129,10 @@ class Pattern:
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams in meters, read-only, contiguous when transposed; or None."""
+        """Origins of the beams in meters, or None.
+
+        The array is read-only, and its transpose is contiguous.
+        """
         return None if self._origins is None else self._origins.T
 
     @cached_property

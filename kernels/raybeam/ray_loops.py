@@ -338,7 +338,7 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 
 @noinline
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins of a tile's rays.
+    """Add vectors of a table to the origins of a tile's rays.
 
     Row `field` of the tile contains the column of the table for each ray.
     """

@@ -1,4 +1,4 @@
-"""Scans: the rays of a pattern with their poses, and the selection of the hits to store."""
+"""Scans, which combine a pattern with poses, and the selection of the hits to store."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class TileBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return why numba cannot be used and the remedy, or "" if it can be used."""
+        """Return the reason why numba is unavailable, with a remedy, or ""."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed; run {install_command('numba')}"
         return ""

@@ -571,7 +571,10 @@ def _key_of_task() -> str:
 
 
 def _producer() -> str:
-    """Return the ID of a producer: the key of the current task, or a random ID outside of tasks."""
+    """Return the ID of a producer.
+
+    The ID is the key of the current task, or a random ID outside of tasks.
+    """
     return _key_of_task() or uuid.uuid4().hex
 
 

@@ -1,4 +1,4 @@
-"""The pool: all workers of a cluster, which can be divided into partitions."""
+"""The pool of all workers of a cluster, which can be divided into partitions."""
 
 from __future__ import annotations
 

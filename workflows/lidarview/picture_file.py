@@ -79,9 +79,8 @@ class PlannedPath:
     corners: Floats  # (w, 2) from start to target, local, in meters
     length_m: float
     shortest_m: float  # length of the shortest path, infinite if discs block the target
-    clearance_m: (
-        float  # distance to the nearest disc, negative inside a disc and infinite without discs
-    )
+    # Distance to the nearest disc, which is negative inside a disc and infinite without discs.
+    clearance_m: float
     trials: Sequence[Floats] = ()  # (w, 2) corners of each trial's path, without its ends
 
     @property

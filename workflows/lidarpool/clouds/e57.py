@@ -257,7 +257,7 @@ def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
 
 
 def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
-    """Read the supported fields of a scan as {name: array with shape (n,)}.
+    """Read the supported fields of a scan as {name: values}.
 
     This does not use the reading function of pye57, because its types are too small for some
     values: 8 bits for colors and 16 bits for row numbers.
@@ -292,7 +292,7 @@ def _states(kind: str) -> list[str]:
 
 
 def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
-    """Return the positions in a scan as Cartesian coordinates of shape (n, 3)."""
+    """Return the positions in a scan as Cartesian coordinates."""
     first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
     if kind == "cartesian":
         return np.stack([first, second, third], axis=1)
@@ -390,7 +390,7 @@ def _stated_name(header: Any) -> str:
 
 
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the pose of a scan with shape (4, 4), or None if it has none, and notes about it.
+    """Return the pose matrix of a scan, or None if it has no pose, and notes about the pose.
 
     Raises ValueError if the pose is not finite.
     """

@@ -613,6 +613,6 @@ class _DataSet:
 
 
 def _pose_of(row: _Row) -> Floats:
-    """Return the pose in a row with a rotation and a translation, with shape (4, 4)."""
+    """Return the pose matrix for a row with a rotation and a translation."""
     w, x, y, z = row["rotation"]
     return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))

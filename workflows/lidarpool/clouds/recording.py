@@ -273,7 +273,7 @@ class Recording:
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
-        """Timestamps of the sweeps in nanoseconds, float64 of shape (count,), or None."""
+        """Timestamps of the sweeps in nanoseconds, float64, or None. Shape (count,)."""
         if self.read_stamps is None:
             return None
         with reading(self.name):
@@ -305,7 +305,7 @@ class Recording:
         return Rings.from_sweeps(self.name, [*sweeps.values()]), times
 
     def rings_of(self, sweep: Sweep) -> Ints | None:
-        """Return the ring of each point in a sweep without a ring column, with shape (n,).
+        """Return the ring of each point in a sweep without a ring column.
 
         Rings are numbered from the lowest ring. Points without a ring or without a return have the
         value -1. Returns None if the rings are unknown, or if there is a ring column.

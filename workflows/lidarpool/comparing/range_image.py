@@ -49,9 +49,8 @@ class RangeImages:
     hidden_shares: tuple[float, float]  # fractions of points that share a cell with a used point
     notes: tuple[str, ...]
     cell_rows: Ints  # (k,): row of each cell, or of each ray that has a return
-    compared: (
-        Floats  # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown
-    )
+    # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown.
+    compared: Floats
     paired_by: str = "cells"  # "cells" or "rays"
 
     @property

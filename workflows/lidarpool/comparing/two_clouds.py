@@ -565,7 +565,7 @@ def _residual_figures(values: Floats) -> dict[str, Any]:
 
 
 def _no_return_figures(counts: Any) -> dict[str, Any]:
-    """Return how well A predicts the cells of B that have no return.
+    """Score A's prediction of the cells of B that have no return.
 
     `counts` contains the number of cells in each state of `CELLS`.
     """

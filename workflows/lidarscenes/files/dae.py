@@ -301,7 +301,7 @@ class _Document:
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:
-        """Return the numbers (count, stride) in a <source>."""
+        """Return the numbers in a <source>. Shape (count, stride)."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError(f"{_tag(source)} has no <accessor>")
@@ -331,7 +331,7 @@ class _Effects:
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or the color (1, 1, 3) of an effect, or None if it has none."""
+        """Return the image or the color of an effect, or None if it has neither."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None

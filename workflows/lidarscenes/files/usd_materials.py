@@ -150,7 +150,7 @@ class UsdMaterials:
         )
 
     def colors(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Colors | None:
-        """Return the colors that a material gives to triangles, or None."""
+        """Return the colors of triangles with a material, or None."""
         if not self.colored:
             return None
         material = self._materials[number]
@@ -171,7 +171,7 @@ class UsdMaterials:
         return None
 
     def cutout(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Cutout | None:
-        """Return the mask that a material gives to triangles, or None if they are opaque."""
+        """Return the mask of triangles with a material, or None if they are opaque."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
         with self.notes.without_mask(material["name"]):

@@ -97,7 +97,7 @@ class HeliosPart:
 
     @property
     def is_ground(self) -> bool:
-        """Whether platforms and other parts can stand on the part."""
+        """Whether the part is ground for platforms and other parts."""
         if self.surfels is not None and self.library is None:
             return True
         grounds = (values.get("isGround", "").lower() for values in self.materials.values())

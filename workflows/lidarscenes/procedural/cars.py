@@ -66,7 +66,7 @@ MODELS = (
 
 
 def car(model: CarModel) -> SceneMesh:
-    """Return a car that stands on z = 0, centered at the origin.
+    """Return a car with its wheels at z = 0, centered at the origin.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from lidarsim.scene.shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles of an object that stands on z = 0, in local coordinates in meters.
+    """Triangles of an object whose base is at z = 0, in local coordinates in meters.
 
     `vertices` are float64 (v, 3), and `faces` int64 (f, 3), counterclockwise as seen from outside.
     """

@@ -73,7 +73,7 @@ SPECIES = (
 
 
 def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
-    """Return a tree that stands at the origin.
+    """Return a tree with its base at the origin.
 
     Parameters
     ----------

@@ -119,7 +119,7 @@ CLASSES = {
 
 @cache
 def material_color(material: str) -> Bytes:
-    """Return the sRGB color (1, 1, 3) of a material."""
+    """Return the sRGB color of a material. Shape (1, 1, 3)."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 

@@ -32,7 +32,7 @@ _PTP = 1
 
 @dataclass(frozen=True)
 class Ports:
-    """UDP ports of a device type: ports of the sensor, and default ports of the host."""
+    """UDP ports of a device type on the sensor, and default ports on the host."""
 
     points: int
     imu: int

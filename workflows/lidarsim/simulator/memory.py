@@ -65,7 +65,7 @@ PATTERN_RAY = 48  # bytes per ray in a period of the head, including its pattern
 
 
 def rig_bytes(scene: Scene, survey: Survey) -> int:
-    """Estimate the memory of a rig in bytes: the scene, its trees, and the stored ray patterns."""
+    """Estimate the memory in bytes of a rig's scene, trees, and stored ray patterns."""
     # Sensors for which different static objects are visible have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles

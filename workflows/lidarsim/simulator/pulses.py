@@ -193,7 +193,9 @@ class PulseCaster:
         return returns
 
     def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> ScannedReturns:
-        """Cast rays that have at most one return each; the caster counts and thins out the hits.
+        """Cast rays that have at most one return each.
+
+        The caster counts and thins out the hits.
 
         Energies are computed here only if steps deflect beams before casting (`Role.AIMS`), and
         only for kept returns. Otherwise `BatchPoints` computes them from the reported directions.

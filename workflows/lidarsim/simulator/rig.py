@@ -130,7 +130,10 @@ class Rig:
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
-        """Return a rig in which the actors follow new trajectories; trees are shared."""
+        """Return a rig in which the actors follow new trajectories.
+
+        Both rigs share their trees.
+        """
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
         rig._actor_trajectories = ActorTrajectories.from_actors(actors)

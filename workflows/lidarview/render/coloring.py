@@ -226,7 +226,7 @@ def _number_coloring(
 def _scale_painter(
     limits: _Range, divisor: float, logarithmic: bool, scale: Floats
 ) -> Callable[[AnyArray], Floats]:
-    """Return a function that maps values to colors of a scale (256, 3).
+    """Return a function that maps values to the colors of a scale.
 
     The values are divided by `divisor` to get the unit of the limits.
     """

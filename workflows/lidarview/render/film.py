@@ -112,7 +112,7 @@ class Film:
     range_m: float = 1.0  # typical range of the platform's points
 
     def frames(self) -> Iterator[Bytes]:
-        """Yield the frames, uint8 arrays of shape (height, width, 3).
+        """Yield the frames as uint8 arrays of shape (height, width, 3).
 
         New points are brighter than old points. Old points in front of all surfaces are omitted,
         because they show where an actor was in an earlier frame.

@@ -79,7 +79,7 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return how well points match the surface at other points, from 0 to 0.4.
+    """Return the similarity of points to the surface at other points, from 0 to 0.4.
 
     `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
     surface lie within `tolerance` (n,) meters of each other's plane.

@@ -359,7 +359,7 @@ def _header_of(data: bytes) -> _Header:
 
 
 def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
-    """Return the poses of sweeps relative to the root of the frame tree, with shape (n, 4, 4).
+    """Return the poses of sweeps relative to the root of the frame tree.
 
     Parameters
     ----------
@@ -370,7 +370,8 @@ def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
 
     Returns
     -------
-    None if the bag does not contain poses for the times of all sweeps.
+    Matrices of shape (n, 4, 4), or None if the bag does not contain poses for the times of all
+    sweeps.
     """
     frames = {header.frame.lstrip("/") for header in headers}
     if len(frames) != 1:

@@ -70,7 +70,7 @@ class RigidMotion(NamedTuple):
 
 
 def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
-    """Rotate points of shape (…, 3) about the z axis by angles of shape (…)."""
+    """Rotate points about the z axis by angles."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)

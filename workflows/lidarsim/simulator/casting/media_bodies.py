@@ -1,4 +1,4 @@
-"""Bodies that contain a medium: closed surfaces of water, glass or leaves."""
+"""Bodies that contain a medium, which are closed surfaces of water, glass or leaves."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class MediaBodies:
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:
-    """Return whether a surface is closed: each edge joins two consistently wound triangles."""
+    """Return whether each edge of a surface joins two consistently wound triangles."""
     vertex_rows, corners = np.unique(faces, return_inverse=True)
     # With flat shading, triangles share positions but not vertices.
     _, vertex_position = np.unique(vertices[vertex_rows], axis=0, return_inverse=True)

@@ -156,7 +156,7 @@ class CastPoses:
         )
 
     def platform_velocities(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities in m/s that the platform's motion gives to the origins of rays.
+        """Return the velocities of ray origins in m/s due to the motion of the platform.
 
         `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
         Origins and velocities are in the scene frame. The velocities are zero if the platform is

@@ -1,4 +1,4 @@
-"""Cast rays against a whole scene: its faces, its instances and its moving actors.
+"""Cast rays against the faces, the instances and the moving actors of a scene.
 
 Each ray is transformed into the frame of an actor at the firing time of the ray, so trees are never
 rebuilt (`raybeam.moving`).
@@ -414,7 +414,9 @@ def move_instances(
     instances: Instances,
     instance_indices: Indices,
 ) -> None:
-    """Move instances to their transforms in `instances`; no scan may be in progress.
+    """Move instances to their transforms in `instances`.
+
+    No scan may be in progress.
 
     Parameters
     ----------

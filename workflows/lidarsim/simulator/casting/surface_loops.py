@@ -22,7 +22,7 @@ within_water = inlined(within_water_of_arrays)
 
 
 class TriangleNumbers(NamedTuple):
-    """Numbering of triangles: the scene's faces, then instances, then actors."""
+    """Numbering of the triangles of the scene's faces, followed by instances and actors."""
 
     instance_starts: Ints  # (i + 1,): first triangle of each instance, then of the actors
     # (f + a + 1,): objects of the triangles of faces and actors; the last is -1, for `NO_SURFACE`

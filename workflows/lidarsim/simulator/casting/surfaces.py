@@ -1,4 +1,4 @@
-"""Surfaces of a scene: normals, colors, and the light that materials reflect."""
+"""Surfaces of a scene with their normals, colors, and the light that their materials reflect."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class SceneSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> tuple[Incidence, Ints32]:
-        """Return how rays meet triangles, and the kinds of the triangles' surfaces.
+        """Return the incidence of rays on triangles, and the kinds of the triangles' surfaces.
 
         `directions` (n, 3) are in the scene frame. `times` (n,) determine the poses of actors, in
         nanoseconds. `Incidence.back`, the energy received from 10 m, is valid for surfaces that are

@@ -500,7 +500,10 @@ class BatchPoints:
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """Rate of change of the range in m/s with noise; NaN for returns added by the receiver."""
+        """Rate of change of the range in m/s with noise.
+
+        The rate is NaN for returns that the receiver added.
+        """
         returns = self.pulse_returns
         velocity = returns.velocity
         if velocity is None:

@@ -237,7 +237,9 @@ class CastStep(PulseStep):
         return Memory(casting=casting, counting=75 * sizes.return_count + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch's sub-rays; the argument `returns` is not used.
+        """Return the hits of a batch's sub-rays.
+
+        The argument `returns` is not used.
 
         A pass casts light and determines what happens to it at the hits:
 

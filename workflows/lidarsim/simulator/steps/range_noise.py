@@ -72,7 +72,7 @@ def noisy_ranges(
 
 
 def range_walk(noise: Noise, energy: Floats) -> Floats:
-    """Return how much closer returns appear than a return at the threshold, in meters.
+    """Return the range walk of returns in meters, relative to a return at the threshold.
 
     A Gaussian pulse whose height is ``energy / threshold`` times a fixed threshold crosses the
     threshold √(2 ln(energy / threshold)) standard deviations before its maximum.

@@ -394,7 +394,9 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
 
 @noinline
 def _mark(energy, begin, stop, mode, shown):
-    """Mark which returns of a pulse a mode reports, preferring near returns of equal strength.
+    """Mark the returns of a pulse that a mode reports.
+
+    Among returns of equal strength, the closest one is preferred.
 
     "Dual" reports the strongest and the last return. If the strongest return is the last, it also
     reports the second strongest. "Two strongest" reports the strongest and the second strongest.

@@ -165,7 +165,7 @@ class SprayStep(PulseStep):
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> BoxCrossings:
-        """Return where the central rays of beams cross boxes.
+        """Return the crossings of the central rays of beams with boxes.
 
         `reach_m` (beams,) is the range in meters at which each beam ends. The crossings of a beam
         are consecutive, sorted by vehicle and then by the time at which the vehicle leaves the box.

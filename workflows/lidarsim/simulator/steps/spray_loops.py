@@ -74,9 +74,10 @@ def _ball_radii(boxes):
 
 @inlined
 def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
-    """Return where a ray enters and leaves a box, in meters, ascending only if it meets the box.
+    """Return the distances at which a ray enters and leaves a box, in meters.
 
-    `to_middle` is the vector from the ray's origin to the center of the box.
+    The distances are ascending only if the ray meets the box. `to_middle` is the vector from the
+    ray's origin to the center of the box.
     """
     p, q, r = to_middle
     u, v, w = direction

@@ -658,7 +658,7 @@ def scratch_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return which of `count` peaks a hit at a given time belongs to."""
+    """Return the peak, out of `count` peaks, that a hit at a given time belongs to."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
