@@ -19,7 +19,7 @@ from .compiled import compiled, inlined, noinline
 
 CELL_RAYS = 64  # rays per cell
 CELLS_PER_WIDE_CELL = 16  # cells per wide cell
-# Margin around boxes, in addition to 2e-6 of the distance; exceeds all rounding errors.
+# Margin around boxes, in addition to 2e-6 of the distance. The margin exceeds all rounding errors.
 PADS_M = 1e-3
 # Columns of the table of cells: axis of the cone around the directions, and cosine and sine of its
 # half angle; center and radius, in meters, of the sphere around the origins; first and last time;

@@ -28,7 +28,8 @@ from .tree import LEAF_BITS, PAD, WideTree, build_instance_tree, build_tree, joi
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-# Pairs per block; the arrays of a step take about 6 MiB, and smaller blocks need more calls.
+# Number of pairs per block. The arrays of a step take about 6 MiB, and smaller blocks need more
+# calls.
 _BLOCK = 1 << 15
 _SHIFT = 32  # position of the instance in the keys of hits (`_Best`)
 _SLACK = 2.0**-20  # margin of distance limits in float32, much more than their rounding errors

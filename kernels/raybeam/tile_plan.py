@@ -17,7 +17,7 @@ from .pattern_rays import compute_rays
 from .scan import Scan
 from .tile_sizes import SUBTILES, VECTOR_RAYS, lanes_per_beam
 
-# Limit for all tiles of a column; longer firings are divided into consecutive rays.
+# Limit for all tiles of a column. Longer firings are divided into consecutive rays.
 _MAX_LANES = 1 << 20
 # Rings are not shifted in scans with fewer firings than this multiple of the largest shift, because
 # too many tiles would be incomplete.

@@ -29,7 +29,7 @@ def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
 def path_length(points: Floats) -> float:
     """Return the length of the polyline through points in the plane."""
     steps = np.diff(points, axis=0)
-    # The order of additions in np.sum varies between machines; Python's sum is reproducible.
+    # The order of additions in np.sum varies between machines, but Python's sum is reproducible.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 

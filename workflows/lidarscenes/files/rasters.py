@@ -97,7 +97,7 @@ class RasterOptions:
         Rectangle | None,
         about("part of a raster to read, as [x0, y0, x1, y1] with the minimum and maximum x and y"),
     ] = None
-    # Coordinate system of the mesh, `world.epsg` in scenarios; None chooses one for the file.
+    # Coordinate system of the mesh (`world.epsg` in scenarios), or None to choose a suitable one.
     epsg: EpsgCode | None = None
 
     def __post_init__(self) -> None:

@@ -51,7 +51,7 @@ _WORK_MODES = (_SAMPLING, 2, 9)  # sampling, idle, ready
 _APPLICATION = 1  # firmware type
 _VERSION = bytes((1, 0, 0, 0))
 
-# {parameter that can be set: length}; parameters without effect on packets are only stored.
+# {parameter that can be set: length}. Parameters without effect on packets are only stored.
 _LENGTHS: dict[int, int] = {
     Key.DATA_TYPE: 1,
     Key.PATTERN: 1,

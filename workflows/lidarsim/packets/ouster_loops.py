@@ -12,7 +12,7 @@ from raybeam.compiled import compiled
 
 from ..numerics.arrays import UInts64
 
-# Layouts of a pixel in 32-bit words, lowest bits first; sizes in bits are in brackets.
+# Layouts of a pixel in 32-bit words, with the lowest bits first and sizes in bits in brackets.
 SINGLE, DUAL, LOW_RATE = range(3)
 # SINGLE    range [up to 20] | reflectivity [8], 8 unused, signal [16] | near infrared [16]
 # DUAL      range [19], reflectivity [8 from 24] | the same for the second return

@@ -39,7 +39,7 @@ class RayList:
         int64 array (n,) of firing times in nanoseconds since the start of the list, or None if
         unknown.
     channels
-        int64 array (n,) with the channel of each ray; 0 is the lowest channel.
+        int64 array (n,) with the channel of each ray, where 0 is the lowest channel.
     origins
         float64 array (n, 3) of ray origins in meters, or None if all rays start at the sensor's
         center.

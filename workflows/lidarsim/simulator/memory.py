@@ -31,11 +31,11 @@ MB = 1_000_000
 # peak, and at most 16 % above it. tests/lidarsim/test_memory.py repeats a part of the measurement.
 # The steps estimate their memory on the same basis.
 RAY = 28  # bytes per ray for its hit
-# Bytes per ray that is not cast repeatedly: while it is computed, and afterwards.
+# Bytes per ray that is not cast repeatedly, while it is computed and afterwards.
 COMPUTED_RAY = 92
 COMPUTED_RAY_RETAINED = 32
 RAY_AMONG_BODIES = 70  # bytes per ray in a scene with instances or actors
-# Bytes per pose of a firing: while it is computed, and afterwards.
+# Bytes per pose of a firing, while it is computed and afterwards.
 POSE = 140
 POSE_RETAINED = 100
 RETURNS = 1.5  # returns per pulse if all or two are reported; 1.1 to 1.6 in generated woods
@@ -91,7 +91,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
 
     The estimate assumes that all rays hit, and that all scans come from the sensor that needs the
     most memory. Columns computed by user functions count like built-in columns. Set `on_device` if
-    a CUDA device casts the rays; device memory, about 300 MB, is not included.
+    a CUDA device casts the rays. Device memory, about 300 MB, is not included.
     """
     setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
     on_device = on_device and not any(map(steps_of, setups))

@@ -63,7 +63,8 @@ class PulseReturns(NamedTuple):
     # Full width at half maximum of the pulse in ns, and its height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
-    # Recorded waveform (`columns.waveforms.record`); `BatchPoints` adds `location_ps` and `toward`.
+    # Recorded waveform (`columns.waveforms.record`), to which `BatchPoints` adds `location_ps` and
+    # `toward`.
     waveform: Records | None = None
     number: Bytes | None = None  # number among the reported returns of the pulse, starting at 1
     return_counts: Bytes | None = None  # number of reported returns of the pulse

@@ -318,7 +318,7 @@ class Rig:
 
         `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
         increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
-        from the platform frame to the scene frame; they are not checked here. The result is a
+        from the platform frame to the scene frame. They are not checked here. The result is a
         float32 array of shape (k, firings, channels) with the range of the nearest reported return
         in meters, or inf if there is no return.
         """

@@ -84,7 +84,7 @@ class ActorSurfaces:
         """Transform points on actors to the actors' undeformed meshes, in place.
 
         `points` (n, 3) are in the scene frame. Points on actors are replaced by the corresponding
-        points in the actors' frames; other points do not change. `triangle` (n,) are the triangles
+        points in the actors' frames. Other points do not change. `triangle` (n,) are the triangles
         of all points, `triangle_indices` (n,) are the rows of the stored triangles, and `times`
         (n,) are in nanoseconds.
         """

@@ -216,7 +216,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
         A run consists of consecutive rows with the same trajectory and time, which therefore have
         the same pose. The poses have shape (12, m), as in `table`. Rows with a negative number have
-        no trajectory; they get run -1 and do not interrupt a run.
+        no trajectory. They get run -1 and do not interrupt a run.
         """
         from . import surface_loops
 

@@ -2,7 +2,7 @@
 
 Ray casters compute in single precision relative to the size of the scene. Ground planes that extend
 to ± 200 km would make a cast 140 times slower. Within the box, the clipped triangles cover the same
-points; the relative error of new corners is about 1e-16 of the triangle's size.
+points, and the error of new corners is about 1e-16 of the triangle's size.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ClippedMesh(NamedTuple):
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
     """Return the six planes that bound a box.
 
-    `region` has the lower and upper corner. Each row of the result has a normal and an offset; a
-    point p is inside the box if ``normal @ p <= offset`` for all rows. If `transform` (3, 4) maps a
-    mesh frame to the frame of the box, the planes are in the mesh frame.
+    `region` has the lower and upper corner. Each row of the result has a normal and an offset, and
+    a point p is inside the box if ``normal @ p <= offset`` for all rows. If `transform` (3, 4) maps
+    a mesh frame to the frame of the box, the planes are in the mesh frame.
     """
     matrix = np.eye(3, 4) if transform is None else transform
     lower, upper = region

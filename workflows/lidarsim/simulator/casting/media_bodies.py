@@ -84,7 +84,8 @@ class MediaBodies:
             a, b, c = positions[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[kind] else 1)
             normals /= np.maximum(norm(normals)[:, None], 1e-300)
-            # Least squares: move each vertex so that all its triangles are `by_m` further out.
+            # Move each vertex so that all its triangles are `by_m` farther out, in the
+            # least-squares sense.
             squares = np.zeros((len(positions), 3, 3))
             sums = np.zeros((len(positions), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])

@@ -287,8 +287,9 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
     """Return the rotation vectors in radians between pairs of nearly equal rotations.
 
-    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each is half the
-    sum of the cross products of corresponding axes; its length is the sine of the rotation angle.
+    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each vector is half
+    the sum of the cross products of corresponding axes, and its length is the sine of the rotation
+    angle.
     """
     vectors = np.empty((3, len(earlier))).T
     for axis in range(3):

@@ -144,7 +144,7 @@ class SceneCaster:
     def update_instances(self, surfaces: SceneSurfaces, instances: Instances) -> None:
         """Update the surfaces and instances after instances of the scene have moved.
 
-        This does not update the trees; use the function `move_instances` for that.
+        The trees are not updated. To update them, use the function `move_instances`.
         """
         self._surfaces = surfaces
         self._instances = instances
@@ -163,9 +163,9 @@ class SceneCaster:
 
         The table is an int64 array (bodies, 2). A hit on triangle t of body i increments counter
         ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the scene,
-        if any, with one counter per triangle; then each instance, with a single counter; and
-        finally all actors as one body, whose triangles are numbered after the faces of the scene.
-        Bodies that the caster omits have no row.
+        if any, with one counter per triangle, followed by each instance with a single counter, and
+        finally by all actors as one body, whose triangles are numbered after the faces of the
+        scene. Bodies that the caster omits have no row.
         """
         instance_count = 0 if self._instances is None else len(self._instances)
         table = [[0, 1]] * bool(self._face_count) + [
@@ -216,8 +216,8 @@ class SceneCaster:
         The arguments are those of `RayCaster.scan`. If there are actors, `poses` must have a clock.
         `window` has the start and stop of the pattern rows to cast, by default all rows. Hits are
         accepted at distances from `t_min` to `t_max` in meters. Of each group of rays, every
-        `keep_every`-th hit is returned; `groups` has the first ray of each group. The origins and
-        directions of all rays are written to `out` (6, n). Without actors, `out` can also have
+        `keep_every`-th hit is returned. `groups` contains the first ray of each group. The origins
+        and directions of all rays are written to `out` (6, n). Without actors, `out` can also have
         shape (3, n) and then receives only directions.
 
         Returns

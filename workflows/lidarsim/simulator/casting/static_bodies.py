@@ -310,9 +310,9 @@ def _parts_in(
 ) -> Iterator[tuple[int, ClippedMesh | None]]:
     """Yield the rows of visible instances within a region, with the clipped mesh or None.
 
-    `is_seen` (n,) states which instances are visible; None means all. Parts with an opacity mask
-    are not clipped, because rounding their texture coordinates to single precision would shift the
-    mask.
+    `is_seen` (n,) is a mask of the visible instances, or None if all are visible. Parts with an
+    opacity mask are not clipped, because rounding their texture coordinates to single precision
+    would shift the mask.
     """
     if region is None:
         instance_indices = (

@@ -25,7 +25,7 @@ class StoredTriangles:
 
     Triangles are numbered in this order: the faces of the scene, the triangles of each instance,
     and the triangles of each actor. Stored triangles are the faces of the scene, the distinct
-    meshes of actors, and the distinct mesh parts of instances; instances of the same part share its
+    meshes of actors, and the distinct mesh parts of instances. Instances of the same part share its
     stored triangles. The objects of actors are numbered after the static objects.
     """
 
@@ -49,7 +49,7 @@ class StoredTriangles:
         owners = np.arange(
             self.static_objects, self.static_objects + len(actor_sizes), dtype=np.int32
         )
-        # Objects that the triangles of faces and actors belong to; the last entry is for no
+        # Objects that the triangles of faces and actors belong to. The last entry is for no
         # triangle.
         objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(objects)

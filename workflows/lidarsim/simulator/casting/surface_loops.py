@@ -307,8 +307,8 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
     `row_indices` (k,) are rows of the hits, `reflected` (k,) is True for light that the surface
     reflects and False for light that it transmits, and `shares` (k,) are the shares of light that
     the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits` an
-    `OnwardLimits`. Surfaces of refracting media do not divide light here; `LightInMedia.cross` does
-    that.
+    `OnwardLimits`. Surfaces of refracting media do not divide light here, because
+    `LightInMedia.cross` does that.
 
     The function overwrites `row_indices` and `reflected` with the light that is bright enough,
     writes its share of the energy to `onward_share`, and returns the number of remaining rows. The

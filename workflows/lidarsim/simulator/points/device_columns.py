@@ -152,7 +152,7 @@ class DeviceColumns:
             column for column in _DEVICE_COLUMNS if column.name in stored & computable
         ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
-        # Whether NumPy computes the energies of hits on actors; the device computes all others.
+        # Whether NumPy computes the energies of hits on actors. The device computes all others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
         bodies, _ = surfaces.triangles.bodies()
         seen = {caster: VisibleBodies(caster, bodies) for caster in dict.fromkeys(casters)}

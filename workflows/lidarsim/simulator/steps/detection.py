@@ -49,8 +49,8 @@ def detected(
     random numbers.
 
     The signal with normally distributed noise must exceed a threshold. If the energy equals the
-    threshold, half of the returns are detected; at 1.4 times this energy, 97.7 %; and at a fifth of
-    it, 3 in 100,000.
+    threshold, half of the returns are detected. At 1.4 times this energy, 97.7 % are detected, and
+    at a fifth of it, 3 in 100,000.
     """
     detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
     if noise.detection_range_m is not None:

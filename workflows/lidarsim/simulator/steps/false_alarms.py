@@ -70,8 +70,8 @@ def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> 
     """Sample false alarms of rays whose receivers are open for `gate_s` seconds.
 
     False alarms occur at a constant rate. Each is a maximum of the receiver noise above the
-    threshold; maxima of normally distributed narrowband noise follow a Rayleigh distribution
-    (Rice 1944).
+    threshold. Maxima of normally distributed narrowband noise follow a Rayleigh distribution (Rice
+    1944).
     """
     ray_indices = np.arange(len(ray))
     since_s = np.zeros(len(ray))

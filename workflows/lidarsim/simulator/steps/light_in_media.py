@@ -192,7 +192,7 @@ class Media:
         self.grids = surfaces.grids
         self.instances = surfaces.triangles.instances
         owners = surfaces.triangle_kinds.material_kinds.object
-        # (kinds + 1,): whether the leaves are in voxel grids; the last entry is for kind -1.
+        # (kinds + 1,): whether the leaves are in voxel grids. The last entry is for kind -1.
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
         # The last entry, for kind -1 (no surface), is 0.
@@ -489,8 +489,8 @@ class LightInMedia:
     ) -> LightInGrids:
         """Follow light through voxel grids, and return the passage with updated densities.
 
-        The light starts at `starts` (n, 3) and travels `length` (n,) meters. `density` (n,
-        MAX_MEDIA) is the optical depth per meter; for a grid, it is given for a leaf area density
+        The light starts at `starts` (n, 3) and travels `length` (n,) meters. `density`
+        (n, MAX_MEDIA) is the optical depth per meter. For a grid, it applies to a leaf area density
         of 1 m²/m³.
         """
         grids = self.media.grids

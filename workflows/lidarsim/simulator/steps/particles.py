@@ -159,9 +159,9 @@ class WeatherStep(PulseStep):
         """Sample hits on particles and fog in the air in front of surfaces.
 
         `beams` are the number of the first beam and one past the last, as in `keys`. `hits` are the
-        surface hits of these beams; each beam has `subrays` sub-rays. The result is sorted by ray,
-        where rays are sub-rays numbered from the first sub-ray of the first beam. It is None if
-        neither particles nor fog can be detected.
+        surface hits of these beams, each of which has `subrays` sub-rays. The result is sorted by
+        ray, where rays are sub-rays numbered from the first sub-ray of the first beam. It is None
+        if neither particles nor fog can be detected.
         """
         first, stop = beams
         count = (stop - first) * subrays
@@ -423,7 +423,7 @@ def highest_probabilities(signals: Floats) -> Floats:
     """Return cumulative probabilities that each signal is the highest of the first n.
 
     `signals` (k,) are descending, with noise of standard deviation 1. Row n of the result (k + 1,
-    k) is for the first n signals; row 0 is 1.
+    k) is for the first n signals, and row 0 is 1.
     """
     count = len(signals)
     probabilities = np.ones((count + 1, count))

@@ -454,8 +454,8 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
 
     `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
     `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
-    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0;
-    beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
+    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0,
+    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
     """
     subrays = receiver.subrays
     size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)

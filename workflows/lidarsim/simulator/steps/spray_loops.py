@@ -32,7 +32,8 @@ class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
     boxes: Floats  # (b, 12): center and half of the sides as vectors, in the scene frame, meters
-    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box was created.
+    # (b, 2): first and last time of each box. The last time is `lasts_ns` after the box was
+    # created.
     presence_ns: Floats
     # (b,): density when the box is created, as a multiple of `Survey.spray_g_m3`.
     density: Floats
@@ -166,8 +167,8 @@ def _column(ranges, guide, part_m, distance):
     """Return the first column at the given distance or farther.
 
     `ranges` are the ascending ranges of the columns in meters. The search starts at the column that
-    `guide` has for the distance (`_guide`); `part_m` is the length of a guide part. A search by
-    numba would take long to compile.
+    `guide` has for the distance (`_guide`), where `part_m` is the length of a guide part. A search
+    by numba would take long to compile.
     """
     column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
     while column < len(ranges) and ranges[column] < distance:

@@ -279,8 +279,8 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
 
     `rays` is a `RayCells`, `triangles` a `RetroTriangles` in the frame of the rays, `limits` a
     `StrayLimits`, and `strongest` a `StrayLight`. The light comes from the point on the triangles
-    that is nearest to a ray by angle. Only the triangles nearest to a ray are compared with it;
-    their number is the length of `chosen`, which is scratch memory.
+    that is nearest to a ray by angle. Only the triangles nearest to a ray are compared with it.
+    Their number is the length of `chosen`, which is scratch memory.
     """
     center = triangles.center
     origins = rays.origins

@@ -50,7 +50,7 @@ class WaveMarks(NamedTuple):
     starts: Bools
     starts_surface: Bools  # False if the surface of the previous hit continues at the hit
     searched: Bools  # whether the hit is `solid` in a waveform that is too wide for the closed form
-    # Always True; before a search, `continue_surfaces` treats each hit as a return.
+    # Always True, because `continue_surfaces` treats each hit as a return before a search.
     all_start: Bools
 
 
@@ -250,7 +250,7 @@ def _peaks(wave, stops, peaks):
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
     """Write the residual and derivatives of a sum of Gaussians, and return the sum of squares.
 
-    `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
+    `x` and `y` are `GaussianScratch.x` and `.y`. `gaussians`, `residual` and `slopes` are arrays of
     a `FitScratch`.
     """
     for s in range(sample_count):
@@ -509,7 +509,7 @@ def _gaussians(wave, scratch, stops, peaks):
     """
     minima = scratch.minima
     count = _find_minima(wave, scratch)
-    # Each piece is fitted separately; `begin` is its first Gaussian, and `first` its first sample.
+    # Each piece is fitted separately. `begin` is its first Gaussian, and `first` its first sample.
     begin = 0
     first = 0
     while begin < count:
@@ -707,10 +707,10 @@ def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noq
     """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
     `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.SubrayNeighbors`, and
-    `output` a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in
-    range. A return starts at each mark in `starts`, unless the hit continues a surface; these marks
-    are cleared. Hits of a return form one Gaussian with their mean and variance. Returns the number
-    of returns.
+    `output` a `WaveReturnArrays`. `sigma_m` is the standard deviation of the system waveform in
+    range. A return starts at each mark in `starts`, unless the hit continues a surface, in which
+    case the mark is cleared. Hits of a return form one Gaussian with their mean and variance.
+    Returns the number of returns.
 
     Arrays are read from their tuples only once, because numba counts references at each access.
     """
