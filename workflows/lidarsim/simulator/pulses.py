@@ -7,8 +7,8 @@ On a worker, a casting task turns scans into columns as follows:
 3. `PulseCaster.scan` makes a `PulseBatch` for a part of the beams at a time, and passes
    `PulseReturns` through the steps in the order of `step_list.py`:
 
-   a. Steps aim the beams. b. `CastStep` finds the hits of all sub-rays. `CastStep.apply` lists its
-   passes. From here on,
+   a. Steps aim the beams.
+   b. `CastStep` finds the hits of all sub-rays. `CastStep.apply` lists its passes. From here on,
       `PulseReturns` has one row per hit.
    c. Steps add light that rain, spray and dirt scatter, as further hits.
    d. `SeparationStep` or `WaveformStep` combines hits into returns. The docstring of

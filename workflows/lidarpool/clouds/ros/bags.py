@@ -82,8 +82,8 @@ class Rosbag2(CloudFormat):
     - `ouster`: 48 bytes. Ring 0 is the highest beam, the range is in mm, t is in ns since the start
       of the sweep, and the intensity is the signal.
     - `hesai` and `robosense`: 26 bytes. The intensity is the reflectivity, timestamp is in seconds
-    since 1970, and rings have the manufacturer's numbers. - `livox`: 26 bytes, with timestamp in ns
-    since 1970. `/NAME/livox` or `/livox` contains the
+      since 1970, and rings have the manufacturer's numbers.
+    - `livox`: 26 bytes, with timestamp in ns since 1970. `/NAME/livox` or `/livox` contains the
       same points as CustomMsg messages.
 
     Integer intensities are 255 for intensities of 1 and above. Depending on the columns of the
