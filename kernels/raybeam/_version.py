@@ -1,3 +1,3 @@
-"""The version of the distribution, which the build reads."""
+"""Version of the package, which the build backend reads from this file."""
 
 __version__ = "0.3.0"

@@ -24,7 +24,9 @@ class BackendUnavailable(RuntimeError):  # noqa: N818 - describes a state, not a
 
 @dataclass(frozen=True)
 class ClosestHits:
-    """Closest hits of a chunk of rays, in ray order and without rays that miss.
+    """Closest hits of a chunk of rays, in ray order.
+
+    Rays that miss have no row.
 
     Attributes
     ----------
@@ -61,7 +63,7 @@ class Backend(ABC):
     """
 
     name: ClassVar[str]
-    # Maximum number of rays per call of `closest_hits`, which limits the memory. How rays are
+    # Maximum number of rays per call to `closest_hits`, which bounds memory use. How rays are
     # divided into chunks does not affect the results.
     chunk: ClassVar[int]
 
@@ -70,11 +72,11 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def unavailable_reason(cls) -> str:
-        """Return why this backend cannot be used and the remedy, or "" if it can be used."""
+        """Return the reason why this backend is unavailable, with a remedy, or ""."""
 
     @classmethod
     def versions(cls) -> str:
-        """Return the versions, besides NumPy's, that affect the bits of the results, or ""."""
+        """Return the versions, except NumPy's, that affect the bits of the results, or ""."""
         return ""
 
     @classmethod  # noqa: B027 - most backends have nothing to limit

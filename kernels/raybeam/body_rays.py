@@ -89,7 +89,7 @@ class TimedBodies(NamedTuple):
     limits: tuple[float, float]
 
 
-# Number of times that a box in `TimedBodies` covers; intersect.cu has the same value.
+# Number of times that a box in `TimedBodies` covers, which must match the value in intersect.cu.
 TIMES_PER_BOX = 32
 
 

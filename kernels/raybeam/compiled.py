@@ -47,8 +47,8 @@ def _has_cache() -> bool:
 
 
 _log = logging.getLogger(__name__)
-# Times for all loops together. The first `lidarpool check` on a machine took 24 s of CPU time and
-# the next one 4 s, or 30 s and 5 s if the machine was busy.
+# Total times for all loops. The first `lidarpool check` on a machine took 24 s of CPU time and the
+# next one 4 s, or 30 s and 5 s on a busy machine.
 COMPILING = "compiling the ray-casting loops, which takes about 20 s the first time"
 COMPILING_EACH_TIME = (
     "compiling the ray-casting loops, which takes about 20 s in each process. To cache the "
@@ -202,8 +202,8 @@ def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
     """Return compiled code from the cache on disk, or None if there is none.
 
     `FunctionCache.load_overload` would first import everything that numba needs for compiling,
-    including `scipy.linalg`, which takes more than half of the time to load all loops. numba
-    imports it anyway if it compiles.
+    including `scipy.linalg`, which accounts for more than half of the time needed to load all
+    loops. When numba does compile, it imports these modules anyway.
     """
     rtsys.initialize(target_context)  # compiled code may allocate memory
     code = cache._load_overload(signature, target_context)
@@ -257,8 +257,8 @@ def called_by_address(signature: Any) -> Callable[[Any], Any]:
     return make
 
 
-# Argument type of functions with `called_by_address`: a number or an address. A tuple, so that
-# ``4 * INT64`` stands for four arguments.
+# Argument type of functions decorated with `called_by_address`, which take numbers and addresses.
+# It is a tuple, so that ``4 * INT64`` denotes four arguments.
 INT64 = (types.int64,) if njit is not None else ()
 _called_by_address: list[Any] = []  # keeps code alive whose address is compiled into other code
 

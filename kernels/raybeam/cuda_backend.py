@@ -51,7 +51,7 @@ class _CastChunk(NamedTuple):
 
 
 class CudaBackend(Backend):
-    """Traversal in intersect.cu, with one thread per ray.
+    """Backend that traverses the trees in intersect.cu, with one thread per ray.
 
     Only the stored hits are copied to the host.
 
@@ -61,8 +61,8 @@ class CudaBackend(Backend):
     are complete, so that threads with other streams can use them. Each call switches to the
     caster's device and back.
 
-    NumPy builds the trees (cuda_tables.py). A builder on the device needed as much code as the
-    traversal and saved each worker two seconds per million triangles, once.
+    NumPy builds the trees (cuda_tables.py). A builder on the device would need as much code as the
+    traversal and would save each worker only two seconds per million triangles at startup.
     """
 
     name: ClassVar[str] = "cuda"
@@ -74,7 +74,7 @@ class CudaBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
+        """Return the reason why CuPy or CUDA is unavailable, with a remedy, or ""."""
         if importlib.util.find_spec("cupy") is None:
             command = install_command("cupy-cuda12x")
             return f"CuPy is not installed; run {command} (or cupy-cuda13x)"
@@ -193,7 +193,8 @@ class CudaBackend(Backend):
     def _ray_table(self, rays: Rays) -> tuple[Any, Any]:
         """Copy rays to the device.
 
-        Return their origins, (3, n) or (3, 1) if all rays share one, and their directions (3, n).
+        Return the origins with shape (3, n), or (3, 1) if all rays share an origin, and the
+        directions with shape (3, n).
         """
         tables = (np.ascontiguousarray(table.T) for table in (rays.origins, rays.directions))
         origins, directions = map(self._cupy.asarray, tables)
@@ -321,7 +322,7 @@ class CudaBackend(Backend):
     def _apply_external_hits(
         self, hits: tuple[Any, Any, Any], start: int, n: int, external_hits: ExternalHits | None
     ) -> tuple[Any, ...]:
-        """Replace hits of a chunk of n rays that are more distant than external hits.
+        """Replace the hits of a chunk of n rays where an external hit is closer.
 
         Return the arguments of the kernel `pack` that describe the external hits.
         """
@@ -390,7 +391,7 @@ class CudaBackend(Backend):
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
     def _motion_tables(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
-        """Return arguments of `make_rays`: delays, velocities, and whether the lidar moves."""
+        """Return the delays, the velocities, and whether the lidar moves, for `make_rays`."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:
@@ -400,10 +401,10 @@ class CudaBackend(Backend):
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _pattern_on_device(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Return the directions and origins of a pattern on the device, (3, n) each.
+        """Return the directions and origins of a pattern on the device.
 
-        The arrays are copied on first use. If the pattern has no origins, the directions are
-        returned in their place, and the kernel does not read them.
+        The arrays have shape (3, n) and are copied on first use. If the pattern has no origins, the
+        directions are returned in their place, and the kernel does not read them.
         """
         copies = _patterns.setdefault(pattern, {})
         tables = copies.get(self._device.id)
@@ -538,20 +539,20 @@ def _one_behind(items: Iterable[T]) -> Iterator[T]:
 
 
 def _split_rays(rays: Any) -> tuple[Any, Any]:
-    """Split rays (6, n) into origins and directions, (3, n) each."""
+    """Split a table of rays into origins and directions."""
     return rays[:3], rays[3:]
 
 
 def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:
-    """Return kernel arguments: origins and directions, each followed by its number of columns."""
+    """Return the origins and directions as kernel arguments, each followed by its column count."""
     origins, directions = table
     return origins, np.int64(origins.shape[1]), directions, np.int64(directions.shape[1])
 
 
 def _select_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
-    """Return the origins and directions, (3, k) each, of rays in a table.
+    """Return the origins and directions of selected rays in a table.
 
-    The first column of the table belongs to ray `start`.
+    The first column of the table belongs to ray `start`. The results have shape (3, k).
     """
     origins, directions = (column.take(ray - start, axis=1) for column in table)
     return origins, directions

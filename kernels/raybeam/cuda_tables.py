@@ -20,7 +20,9 @@ _FLOOR = 1e-35  # more than the error of products of tiny edges that underflow i
 
 @dataclass(frozen=True)
 class MeshTables:
-    """Tables of the meshes. The comment at the top of intersect.cu describes their columns.
+    """Tables of the meshes.
+
+    The comment at the top of intersect.cu describes the columns.
 
     Attributes
     ----------
@@ -115,7 +117,7 @@ def _concatenate(tables: list[AnyArray]) -> AnyArray:
 
 
 def _node_rows(tree: WideTree) -> Floats32:
-    """Return the nodes of a tree as rows of 32 numbers: boxes, children and padding."""
+    """Return the nodes of a tree as rows of 32 numbers, with boxes, children and padding."""
     table = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
     table[:, 0:3] = tree.lower
     table[:, 3:6] = tree.upper

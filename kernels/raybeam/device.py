@@ -45,9 +45,10 @@ class DeviceHits:
         return len(self.ray)
 
     def rays(self) -> tuple[Any, Any]:
-        """Compute the origins in meters and the unit directions of the rays, float64 (3, k) each.
+        """Compute the origins in meters and the unit directions of the rays.
 
-        The arrays are on the device. They are bit-identical to the result of `pattern_rays`.
+        The arrays are float64 (3, k) and on the device. They are bit-identical to the result of
+        `pattern_rays`.
         """
         return self.make_rays(self.ray)
 
@@ -148,7 +149,7 @@ _pinned = _Pinned()
 
 
 def pinned_array(cupy: Any, count: int, dtype: DTypeLike) -> AnyArray:
-    """Return an array (count,) in page-locked memory, to which the device can write directly.
+    """Return an array in page-locked memory, to which the device can write directly.
 
     The memory returns to CuPy's pool when the last view of the array is released. If `PINNED_BYTES`
     are in use, the array is in ordinary memory instead. Copies to ordinary memory are slower, but
@@ -186,7 +187,7 @@ class PendingCopy:
         self._source = array  # must stay alive while the device reads it
 
     def values(self) -> AnyArray:
-        """Wait until the copy is complete and return the values (n,)."""
+        """Wait until the copy is complete and return the values."""
         self._copied.synchronize()
         return self._values
 

@@ -25,10 +25,11 @@ from .opacity import Opacity
 from .poses import determinants
 from .tree import PAD
 
-# Limit for all meshes together. Positions in a tree have 31 bits, of which a leaf takes 3.
+# Maximum number of triangles in all meshes. A tree node refers to triangles with 31 bits, of which
+# 3 hold the size of a leaf.
 MAX_TRIANGLES = 2**28 - 1
-# A transform counts as singular if its determinant, relative to the lengths of its columns, is
-# less.
+# A transform counts as singular if its determinant, divided by the lengths of its columns, is less
+# than this value.
 _FLAT = 1e-9
 
 
@@ -168,21 +169,24 @@ class LocalScene:
         return np.stack([first, np.ones_like(first)], axis=1)
 
     def with_transforms(self, transforms: Floats) -> LocalScene:
-        """Return a copy of the scene with new transforms of shape (n, 3, 4).
+        """Return a copy of the scene with new transforms.
 
-        The scene must be nested, and the transforms must already have been validated.
+        The scene must be nested. The transforms have shape (n, 3, 4) and must already have been
+        validated.
         """
         assert self.mesh_frames is not None
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return the tally row of each hit, given its instance (k,) and triangle (k,)."""
+        """Return the tally row of each hit, given its instance and triangle."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
     def to_mesh_coordinates(
         self, instance: Indices, origins: Floats, directions: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Transform each ray to the mesh coordinates of its instance (m,), in a nested scene.
+        """Transform each ray to the mesh coordinates of its instance.
+
+        The scene must be nested.
 
         Parameters
         ----------
@@ -216,7 +220,7 @@ def single_mesh_scene(mesh: LocalMesh) -> LocalScene:
 
 
 def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
-    """Validate instances, and return their scene and their transforms (n, 3, 4).
+    """Validate instances, and return their scene and their transforms.
 
     Raises
     ------
@@ -245,9 +249,10 @@ def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
 
 
 def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
-    """Return the transforms of the instances `numbers` (k,) as float64 (k, 3, 4).
+    """Return the transforms of the instances `numbers` as a float64 array.
 
-    Raises ValueError with the index of the instance if a transform is invalid.
+    The result has shape (k, 3, 4). Raises ValueError with the index of the instance if a transform
+    is invalid.
     """
     values = np.asarray(transforms)
     if values.ndim != 3 or len(values) != len(numbers):
@@ -261,7 +266,7 @@ def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
 
 
 def _matrix(number: int, transform: ArrayLike | None) -> Floats:
-    """Return a transform as float64 (3, 4), or the identity for None.
+    """Return a transform as a (3, 4) float64 matrix, or the identity for None.
 
     Raises ValueError if the shape or type is invalid.
     """
@@ -271,7 +276,7 @@ def _matrix(number: int, transform: ArrayLike | None) -> Floats:
 
 
 def _matrices(numbers: Integers, values: AnyArray) -> Floats:
-    """Return transforms (k, ...) of the instances `numbers` as float64 (k, 3, 4).
+    """Return transforms of the instances `numbers` as a float64 array of shape (k, 3, 4).
 
     Raises ValueError if the shape, the type or the last row is invalid.
     """
@@ -351,9 +356,10 @@ def _nested_scene(
 
 
 def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFrame, Floats]:
-    """Return the local coordinates of a scene, and the local boxes (n, 2, 3) of its instances.
+    """Return the local coordinates of a scene, and the local boxes of its instances.
 
-    The boxes have the centers ``center + shift`` and the half side lengths `half`, (n, 3) each.
+    The boxes have the centers ``center + shift`` and the half side lengths `half`, with shape (n,
+    3). The returned boxes have shape (n, 2, 3).
     """
     lower = (center + shift - half).min(axis=0)
     upper = (center + shift + half).max(axis=0)
@@ -366,12 +372,12 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFram
 
 
 def _multiply(matrices: Floats, vectors: Floats) -> Floats:
-    """Multiply matrices (n, 3, 3) and vectors (n, 3), with the same bits on every machine."""
+    """Multiply matrices and vectors, with the same bits on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
 def _invert(matrices: Floats) -> Floats:
-    """Return the inverses of matrices (n, 3, 3), with the same bits on every machine."""
+    """Return the inverses of 3 x 3 matrices, with the same bits on every machine."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
     # The rows are cross products of columns. `numpy.cross` takes four times as long for few
     # matrices.

@@ -21,7 +21,7 @@ _ABANDONED_S = 3600.0  # older temporary files are considered abandoned
 
 
 class LoopFiles(IndexDataCacheFile):
-    """Cache files of a loop: an index (.nbi) and a file with compiled code (.nbc) per signature.
+    """Cache files of a loop, which are an index (.nbi) and a code file (.nbc) per signature.
 
     numba's own cache files have no checksums. Unpickling a damaged file can raise any exception,
     and if a process is killed after it has written the index but before it has written the code,
@@ -72,7 +72,7 @@ class LoopFiles(IndexDataCacheFile):
         self._save_index(entries)
 
     def _load_index(self) -> dict[Any, tuple[str, bytes]]:
-        """Return the entries of the index, or no entries if it is missing, damaged or outdated."""
+        """Return the entries of the index, or {} if it is missing, damaged or outdated."""
         content = self._content(self._index_name)
         if content is None:
             return {}

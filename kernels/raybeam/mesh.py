@@ -50,7 +50,7 @@ class LocalFrame:
     upper: Floats
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points (n, 3) from meters to local coordinates."""
+        """Convert points from meters to local coordinates."""
         return (points - self.center) * self.scale
 
     @property
@@ -62,10 +62,10 @@ class LocalFrame:
 def clip_to_box(
     lower: Floats, upper: Floats, origins: Floats, directions: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the distances at which rays enter and leave a box, (n,) each, in local units.
+    """Return the distances at which rays enter and leave a box.
 
-    A ray intersects the box if ``entry <= leave``. The entry distance is 0 if the ray starts
-    inside.
+    The distances have shape (n,) and are in local units. A ray intersects the box if ``entry <=
+    leave``. The entry distance is 0 if the ray starts inside the box.
 
     Parameters
     ----------
@@ -152,21 +152,21 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
 
 
 def center_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Return the center (3,) and the scale of the frame for a bounding box in meters."""
+    """Return the center and the scale of the frame for a bounding box in meters."""
     center = lower / 2 + upper / 2
     half = float(np.maximum(upper - center, center - lower).max())
     return center, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
 
 
 def _has_area(corners: Floats) -> Bools:
-    """Return a mask (k,) of the triangles with nonzero area."""
+    """Return a mask of the triangles with nonzero area."""
     edges = corners[:, 1:] - corners[:, :1]
     x, y, z = np.cross(edges[:, 0], edges[:, 1]).astype(np.bool_).T
     return x | y | z
 
 
 def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
-    """Return faces as int64 (f, 3).
+    """Return faces as an int64 array.
 
     Raises ValueError if the shape is wrong, a vertex index is invalid, or there are too many faces.
     """
@@ -176,7 +176,7 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
             "faces must be an integer array (vertex indices) with shape (f, 3) and f > 0, but has "
             f"dtype {rows.dtype} and shape {rows.shape}."
         )
-    if len(rows) >= 2**28:  # Positions in the tree have 31 bits, of which a leaf takes 3.
+    if len(rows) >= 2**28:  # see `instances.py`: 31 bits, of which a leaf takes 3
         raise ValueError(f"The mesh has {len(rows):,} triangles, but the limit is {2**28 - 1:,}.")
     invalid = np.flatnonzero(((rows < 0) | (rows >= vertex_count)).any(axis=1))
     if len(invalid):

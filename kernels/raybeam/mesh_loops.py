@@ -76,7 +76,7 @@ def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     casts, origins, directions, triangle_row, instance, u, v
 ):
-    """Write the barycentric weights `u` and `v` (m,) of the second and third vertex of hits.
+    """Write the barycentric weights `u` and `v` of the second and third vertex of hits.
 
     The rays (m, 3) are in local scene coordinates. `origins` is (1, 3) if all rays share an origin.
     `triangle_row` is the row of each hit in the corners of all meshes, as `cast_rays` writes it if

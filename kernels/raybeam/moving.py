@@ -5,8 +5,8 @@ cells of `CELL_RAYS` rays. First, the cone and the plane around the directions o
 compared with the bounding sphere of each body along its path. Then the rays of the remaining cells
 are compared with the bounding box of the body at its pose when the cell is fired. Finally, the
 remaining rays are transformed to the frame of the body at their own firing times and cast at its
-shape, at close bodies first. The comparisons are compiled loops (moving_loops.py). They are
-conservative, so they do not affect the hits.
+shape, starting with the closest bodies. The comparisons are compiled loops (moving_loops.py). They
+are conservative, so they do not affect the hits.
 
 On a CUDA device, each ray is compared with boxes around the paths of the bodies, and the device
 holds the poses of all bodies at all ray times.
@@ -77,7 +77,7 @@ class MovingBodies:
 
     @property
     def on_device(self) -> Bools:
-        """Mask (b,) of the bodies whose shapes are on a CUDA device."""
+        """Mask of the bodies whose shapes are on a CUDA device. Shape (b,)."""
         return np.array([shape.on_device for shape in self.shapes], np.bool_)[self.shape]
 
     @cached_property
@@ -96,7 +96,7 @@ class MovingBodies:
         return np.asarray(np.sqrt((self.box_half_sizes**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
-        """Return whether each body (m,) is present at its time (m,)."""
+        """Return whether each body is present at its time."""
         first, last = self.presence[body].T
         return np.asarray((first <= times) & (times <= last))
 
@@ -170,7 +170,7 @@ def _exclusive_limit(scan: Scan) -> float:
 def _hits_on_device(
     moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
 ) -> Iterator[BodyHits]:
-    """Yield the closest hits of consecutive rays on bodies (b,) whose shapes are on a device."""
+    """Yield the closest hits of consecutive rays on bodies whose shapes are on a device."""
     if not len(bodies):
         return
     limits = (scan.t_min, scan.t_max)
@@ -230,10 +230,11 @@ def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple
 
 
 def _bounding_boxes(moving: MovingBodies, shape: Indices, poses: Floats) -> Floats:
-    """Return the bounding boxes of shapes at poses (12, m), as lower and upper corners (2, 3, m).
+    """Return the bounding boxes of shapes at poses.
 
-    The boxes are aligned with the axes of the scene and include a margin for rounding errors, in
-    meters.
+    The poses have shape (12, m), and the boxes have shape (2, 3, m) and contain the lower and upper
+    corners in meters. The boxes are aligned with the axes of the scene and include a margin for
+    rounding errors.
     """
     from .moving_loops import PADS_M
 
@@ -330,7 +331,7 @@ class _RayPairs(NamedTuple):
 
 
 class _Chunk:
-    """Consecutive rays (6, n) of a scan, their firing times (n,), and their closest hits (n,)."""
+    """Consecutive rays of a scan, with their firing times and their closest hits."""
 
     def __init__(
         self,
@@ -356,7 +357,7 @@ class _Chunk:
             self._cast_near_cells(present)
 
     def _cast_near_cells(self, bodies: Ints) -> None:
-        """Cast cells at bodies (b,) that they may hit, at the closest bodies first.
+        """Cast cells at the bodies that they may hit, starting with the closest bodies.
 
         The hits on close bodies shorten the rays for the following bodies.
         """
@@ -378,7 +379,7 @@ class _Chunk:
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
     def _sample_bodies(self, bodies: Ints, cells: Floats) -> BodySamples:
-        """Sample the boxes of bodies (b,) at regular time steps while cells (c, 15) are fired."""
+        """Sample the boxes of bodies at regular time steps while cells are fired."""
         loops = self._loops
         moving = self._moving
         spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
@@ -398,7 +399,7 @@ class _Chunk:
         return samples
 
     def _sampled_boxes(self, bodies: Ints, times: Floats) -> Floats:
-        """Return the boxes (b, s, 12) of bodies (b,) at times (b, s), as in `BodySamples`."""
+        """Return the boxes of bodies at times of shape (b, s), as in `BodySamples`."""
         moving = self._moving
         body = np.repeat(bodies, times.shape[1])
         table = moving.poses(body, times.ravel())
@@ -412,7 +413,7 @@ class _Chunk:
         return boxes
 
     def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast each cell (m,) at its body (m,), and record closer hits.
+        """Cast each cell at its body, and record closer hits.
 
         `spans` (2, m) contains the first and last time of each cell in seconds.
         """
@@ -496,10 +497,10 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return the rotation matrices (m, 3, 3) of poses (12, m)."""
+    """Return the rotation matrices of poses."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 
 def _rotate(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors (m, 3) or (1, 3) by matrices (m, 3, 3), with a fixed order of operations."""
+    """Rotate vectors by matrices, with a fixed order of operations."""
     return (rotations * vectors[:, None, :]).sum(axis=2)

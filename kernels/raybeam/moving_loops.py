@@ -19,7 +19,7 @@ from .compiled import compiled, inlined, noinline
 
 CELL_RAYS = 64  # rays per cell
 CELLS_PER_WIDE_CELL = 16  # cells per wide cell
-# Margin around boxes, in addition to 2e-6 of the distance; exceeds all rounding errors.
+# Margin around boxes, in addition to 2e-6 of the distance. The margin exceeds all rounding errors.
 PADS_M = 1e-3
 # Columns of the table of cells: axis of the cone around the directions, and cosine and sine of its
 # half angle; center and radius, in meters, of the sphere around the origins; first and last time;
@@ -100,9 +100,9 @@ NEAREST_HITS = named_tuple_type(NearestHits, _f64_1, _i64_1, _i32_1, _i32_1)
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
 def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Return the table (c, 15) of cells of `size` consecutive rays each.
+    """Return the table of cells with `size` consecutive rays each.
 
-    The constants `AXIS` to `MAX_SINE` are the indices of its columns.
+    The table has shape (c, 15). The constants `AXIS` to `MAX_SINE` are its column indices.
     """
     count = -(-len(times) // size)
     cells = np.empty((count, 15))
@@ -220,7 +220,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
 # The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write pairs (2, k) of a cell and a body that it may hit, and return their number k."""
+    """Write the pairs of a cell and a body that it may hit, and return the number of pairs."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers are used because reference counting of array views takes longer than the comparisons.
@@ -378,7 +378,7 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
 
 @inlined
 def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray `k` of rays (6, n), given by their address, intersects a box at a pose."""
+    """Return whether ray `k` of a table, given by its address, intersects a box at a pose."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)

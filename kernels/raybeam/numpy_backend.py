@@ -6,7 +6,7 @@ inner child form new blocks, and pairs with a leaf are tested against its triang
 processed last in, first out. If a block is too large, the pairs whose boxes are closest to the
 origins of their rays are processed first. This bounds the memory for any scene, and early hits
 discard more distant pairs. Sorting the children of each node would save a sixth of the box tests,
-but the blocks would be smaller, which takes twice as long.
+but the blocks would be smaller, and the traversal would take twice as long.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from .tree import LEAF_BITS, PAD, WideTree, build_instance_tree, build_tree, joi
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-# Pairs per block; the arrays of a step take about 6 MiB, and smaller blocks need more calls.
+# Number of pairs per block. The arrays of a step take about 6 MiB, and smaller blocks need more
+# calls.
 _BLOCK = 1 << 15
 _SHIFT = 32  # position of the instance in the keys of hits (`_Best`)
 _SLACK = 2.0**-20  # margin of distance limits in float32, much more than their rounding errors
@@ -126,7 +127,7 @@ class _Packet:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of a ray and a node, and the distances at which the rays enter the nodes, (m,) each."""
+    """Pairs of a ray and a node, with the distances at which the rays enter the nodes."""
 
     ray: Indices
     node: Indices
@@ -208,7 +209,7 @@ class _Nodes:
 
 
 class NumpyBackend(Backend):
-    """Traversal of a bounding volume hierarchy by blocks of rays on a single thread."""
+    """Backend that traverses a bounding volume hierarchy with blocks of rays on a single thread."""
 
     name: ClassVar[str] = "numpy"
     chunk: ClassVar[int] = 1 << 16
@@ -275,7 +276,7 @@ class NumpyBackend(Backend):
         )
 
     def _walk(self, query: _Query, rays: _Packet, root: Indices) -> None:
-        """Traverse the trees of meshes from these roots, and record closer hits."""
+        """Traverse the trees of meshes from the given roots, and record closer hits."""
         self._nodes.walk(rays, root, lambda leaves: self._test(query, rays, leaves))
 
     def _visit(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
@@ -358,7 +359,7 @@ def _rounds(leaves: _Pairs) -> list[Indices]:
 
 
 def _write_closer(best: _Best, rays: _Packet, row: Indices, hits: _Best) -> None:
-    """Record the hits (m,) of rays `row` of a packet that are closer, and reduce the limits."""
+    """Record the hits that are closer than those recorded so far, and reduce the limits."""
     ray = row if rays.visit is None else rays.visit.ray[row]
     order = np.lexsort((hits.key, hits.t, ray))
     order = order[np.diff(ray[order], prepend=-1) != 0]  # only the closest hit of each ray
@@ -385,7 +386,7 @@ def _packet(
     t_max: Floats | float,
     visit: _Visit | None = None,
 ) -> _Packet:
-    """Prepare rays (n, 3) in local coordinates of the scene or a mesh for traversal."""
+    """Prepare rays in local coordinates of the scene or a mesh for traversal."""
     # The start is clipped, because float64 cannot represent it accurately if the ray is too far
     # away.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)

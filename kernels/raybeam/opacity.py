@@ -110,7 +110,7 @@ class MaskTables:
         c: Floats,
         det: Floats,
     ) -> Bools:
-        """Return whether the surface is opaque at each hit (m,).
+        """Return whether the surface is opaque at each hit.
 
         Parameters
         ----------

@@ -91,10 +91,11 @@ class Pattern:
     def with_sub_rays(
         self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
-        """Return a copy with sub-rays, for all beams or for the beams `beam_indices` (m,).
+        """Return a copy with sub-rays, for all beams or for selected beams.
 
-        Beam indices beyond the last row wrap around. `offsets` (m, 2) contains the angles across
-        and up, in radians, that are added to the angles of the sub-rays of each beam.
+        `beam_indices` (m,) selects the beams, and indices beyond the last row wrap around.
+        `offsets` (m, 2) contains the angles across and up, in radians, that are added to the angles
+        of the sub-rays of each beam.
         """
         # Estimating takes as long as casting 5,000 rays, so do it once for all copies.
         _ = self.step
@@ -128,7 +129,10 @@ class Pattern:
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams in meters, read-only, contiguous when transposed; or None."""
+        """Origins of the beams in meters, or None.
+
+        The array is read-only, and its transpose is contiguous.
+        """
         return None if self._origins is None else self._origins.T
 
     @cached_property

@@ -118,10 +118,11 @@ def compute_rays_numpy(
 
 
 def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
-    """Return the directions and the origins, (3, m) each, of rays in the sensor frame.
+    """Return the directions and the origins of rays in the sensor frame.
 
-    `row` (m,) contains pattern rows, which may be beyond the end of the pattern. The origins are
-    relative to the sensor position, in meters. They are None if all are zero.
+    `row` (m,) contains pattern rows, which may be beyond the end of the pattern. The results have
+    shape (3, m). The origins are relative to the sensor position, in meters, or None if all are
+    zero.
     """
     row = row - row // len(pattern) * len(pattern)  # takes half as long as the % operator
     beam = row // pattern.subrays_per_beam

@@ -247,7 +247,7 @@ def _find_best_partners(lower: Floats32, upper: Floats32, best: Indices) -> None
 
 
 def _half_area(size: Floats32) -> Floats32:
-    """Return half the surface area of boxes with side lengths (3, n)."""
+    """Return half the surface area of boxes, given their side lengths."""
     x, y, z = size
     return x * y + y * z + z * x
 

@@ -64,7 +64,10 @@ class Poses:
         return len(self.positions)
 
     def per_ray(self, ray: Ints, out: Floats) -> RayPoses:
-        """Return the pose of each ray (m,), using `out` as memory, float64 (18, m)."""
+        """Return the pose of each ray, using `out` as memory.
+
+        `out` is float64 (18, m).
+        """
         pose = ray // self.rays_per_pose
         delay = np.zeros(1)
         rates = None
@@ -116,7 +119,7 @@ class RayPoses:
     rates: Floats | None
 
     def rotate(self, vectors: Floats) -> Floats:
-        """Rotate vectors (3, m) from the sensor frame to the mesh frame.
+        """Rotate vectors from the sensor frame to the mesh frame.
 
         The order of operations is fixed. The last bit of ``matrices @ vectors`` would depend on the
         BLAS library.
@@ -139,7 +142,7 @@ class RayPoses:
         return crosses
 
     def translate(self, positions: Floats) -> Floats:
-        """Move positions, (3, m) or (3, 1), by the velocity during the delay of each ray."""
+        """Move positions by the velocity during the delay of each ray."""
         if self.velocities is None:
             return positions
         pairs = zip(positions, self.velocities, strict=True)
@@ -190,7 +193,7 @@ def check_poses(
 
 
 def _broadcast_rows(table: Floats, count: int) -> Floats:
-    """Repeat a table (1, ...) along the first axis if it does not have `count` rows."""
+    """Repeat a table with a single row along the first axis unless it has `count` rows."""
     return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
 
@@ -212,7 +215,7 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:
-    """Return rotations (k, 3, 3) as float64.
+    """Return rotations as float64 matrices.
 
     Raises ValueError if a matrix is not orthonormal or contains a reflection.
     """
@@ -244,13 +247,13 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
 
 
 def determinants(matrix_rows: Floats) -> Floats:
-    """Return the determinants (k,) of matrices with shape (3, 3, k)."""
+    """Return the determinants of k matrices with shape (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix_rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 
 def component_major(table: AnyArray) -> Floats:
-    """Return a table (k, ...) as float64 with each component contiguous over the k rows."""
+    """Return a table as float64 with each component contiguous over the rows."""
     # `numpy.moveaxis` would take as long as casting 100 rays.
     components_first = table.transpose(*range(1, table.ndim), 0)
     contiguous = np.ascontiguousarray(components_first, dtype=np.float64)

@@ -338,7 +338,7 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 
 @noinline
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins of a tile's rays.
+    """Add vectors of a table to the origins of a tile's rays.
 
     Row `field` of the tile contains the column of the table for each ray.
     """
@@ -433,7 +433,7 @@ def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 @noinline
 def _write_output(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
-    """Write vectors of a tile to an output array (3, total) for all rays of a cast.
+    """Write vectors of a tile to an output array for all rays of a cast.
 
     `address` is the output for the first ray of the call, and `count` is the number of rays in the
     call.
@@ -536,7 +536,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write the directions (3, m) of rays (m,), and their origins unless `origins` is (3, 0)."""
+    """Write the directions of rays, and their origins unless `origins` has shape (3, 0)."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -570,9 +570,10 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
 def compute_rays_compiled(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats | None, Floats]:
-    """Return the origins and directions of rays (m,), float64 (3, m) each.
+    """Return the origins and directions of rays.
 
-    The arguments are as in `pattern_rays.compute_rays`. The origins are None if all rays share one.
+    The arguments are as in `pattern_rays.compute_rays`. The results are float64 (3, m). The origins
+    are None if all rays share an origin.
     """
     cast = memory.CastRecord(np.zeros(1, memory.CAST))
     record = cast.record

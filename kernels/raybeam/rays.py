@@ -70,9 +70,10 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
 
 
 def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
-    """Return validated origins, (n, 3), or (1, 3) if all rays share one.
+    """Return validated origins.
 
-    Raises ValueError if the shape is wrong or a value is not finite.
+    The result has shape (n, 3), or (1, 3) if all rays share an origin. Raises ValueError if the
+    shape is wrong or a value is not finite.
     """
     rows = as_real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
@@ -100,10 +101,10 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 
 
 def unit_directions(directions: ArrayLike) -> Floats:
-    """Return directions as new float64 unit vectors (n, 3).
+    """Return directions as a new array of float64 unit vectors.
 
-    The transposed array is contiguous. Each row of the result depends only on the same row of the
-    input, so that batches can be split anywhere.
+    The array has shape (n, 3), and its transpose is contiguous. Each row of the result depends only
+    on the same row of the input, so that batches can be split anywhere.
 
     Raises ValueError if a direction is zero or not finite.
     """
@@ -120,7 +121,10 @@ def unit_directions(directions: ArrayLike) -> Floats:
 
 
 def _normalized(table: Floats) -> Floats:
-    """Return directions (n, 3) as unit vectors. If all are unit vectors, return the same array."""
+    """Return directions as unit vectors.
+
+    If all directions already are unit vectors, the same array is returned.
+    """
     x, y, z = table.T
     # `einsum` and `norm` may use fused multiply-adds, so that the last bit would depend on the
     # machine.
@@ -139,9 +143,9 @@ def _normalized(table: Floats) -> Floats:
 
 
 def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
-    """Return an array of real numbers with shape (n, *shape), copied only if necessary.
+    """Return real numbers as an array with rows of a given shape, copied only if necessary.
 
-    An array with the shape `shape` counts as a single row.
+    The result has shape (n, *shape). An array with the shape `shape` counts as a single row.
     """
     rows = np.asarray(values)
     if rows.shape == shape:
@@ -156,7 +160,7 @@ def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) ->
 
 
 def are_finite(block: Floats) -> Bools:
-    """Return a mask (n,) of the rows (n, 3) that contain only finite numbers."""
+    """Return a mask of the rows that contain only finite numbers."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
@@ -184,7 +188,7 @@ def check_rows(
 
 
 def _are_units(columns: Floats) -> bool:
-    """Return whether all vectors (3, n) are finite unit vectors."""
+    """Return whether all vectors are finite unit vectors."""
     x, y, z = columns
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squared = x * x

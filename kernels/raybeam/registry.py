@@ -25,7 +25,7 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_versions(name: str) -> str:
-    """Return the versions, besides NumPy's, that affect the bits of a backend's results.
+    """Return the versions that affect the bits of a backend's results, except NumPy's.
 
     Two processes with the same versions, and with the same version of NumPy, return bit-identical
     hits.

@@ -127,7 +127,7 @@ def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Float
 def _split_nodes(
     level: _Level, node: Indices, axis: Indices, split: Indices
 ) -> tuple[Indices, _Level]:
-    """Return the children (k, 2) of each node, and the next level."""
+    """Return the two children of each node, and the next level."""
     right = np.zeros(int(max(order.max() for order in level.orders)) + 1, np.bool_)
     for k, order in enumerate(level.orders):
         split_on_axis = (axis == k)[node]

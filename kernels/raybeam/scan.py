@@ -1,4 +1,4 @@
-"""Scans: the rays of a pattern with their poses, and the selection of the hits to store."""
+"""Scans, which combine a pattern with poses, and the selection of the hits to store."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ class HitCollector(HitGroups):
         return row_indices
 
     def count_triangles(self, tally_indices: Integers) -> None:
-        """Add the hits of a chunk to the tally, given their tally rows (m,).
+        """Add the hits of a chunk to the tally, given their tally rows.
 
         Without a tally, the call has no effect.
         """

@@ -23,7 +23,7 @@ class SubRays:
         meters. None if the sub-rays start at the beam origin.
     axis
         float64 (3,): axis in the sensor frame about which "across" points counterclockwise and
-        toward which "up" points. None if any two axes perpendicular to the beam can be used.
+        toward which "up" points. None if any two perpendicular axes across the beam can be used.
     """
 
     angles: Floats
@@ -71,7 +71,7 @@ class SubRays:
 def sub_ray_directions(
     sub_rays: SubRays, beam_directions: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
-    """Return the directions (3, m) of sub-rays, and their origins relative to the beam origins.
+    """Return the directions of sub-rays, and their origins relative to the beam origins.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def sub_ray_directions(
 
 
 def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Return two axes (3, n) each that are perpendicular to unit directions (3, n).
+    """Return two axes that are perpendicular to each other and to unit directions.
 
     The method of Duff et al. (2017) works for all directions.
     """
@@ -120,7 +120,7 @@ def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
 
 
 def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Return two axes perpendicular to unit directions (3, n), oriented by an axis (3,).
+    """Return two axes that are perpendicular to unit directions and oriented by an axis.
 
     The first one points counterclockwise about the axis and the second one upward along it. For
     directions parallel to the axis, they are the axes of `perpendicular_axes`.

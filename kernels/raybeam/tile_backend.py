@@ -31,7 +31,7 @@ _MAX_PLANS = 16  # cached tile plans
 
 
 class TileBackend(Backend):
-    """Traversal by tiles of rays in float32, followed by the watertight test in float64.
+    """Backend that traverses trees with tiles of rays in float32 and decides hits in float64.
 
     The margins of the float32 tests exceed all rounding errors, so the hits have the same bits as
     those of the numpy backend.
@@ -42,7 +42,7 @@ class TileBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return why numba cannot be used and the remedy, or "" if it can be used."""
+        """Return the reason why numba is unavailable, with a remedy, or ""."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed; run {install_command('numba')}"
         return ""

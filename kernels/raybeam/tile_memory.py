@@ -1,4 +1,4 @@
-"""Scratch memory of a tile of rays: fixed fields, followed by tables with a number per ray.
+"""Scratch memory of a tile of rays, with fixed fields followed by tables of one number per ray.
 
 A tile has `SUBTILES` subtiles, each of which has one or more vectors of eight rays. A row of a
 table contains a number for each ray of the tile, in the order of the subtiles.

@@ -17,7 +17,7 @@ from .pattern_rays import compute_rays
 from .scan import Scan
 from .tile_sizes import SUBTILES, VECTOR_RAYS, lanes_per_beam
 
-# Limit for all tiles of a column; longer firings are divided into consecutive rays.
+# Limit for all tiles of a column. Longer firings are divided into consecutive rays.
 _MAX_LANES = 1 << 20
 # Rings are not shifted in scans with fewer firings than this multiple of the largest shift, because
 # too many tiles would be incomplete.
@@ -61,7 +61,7 @@ def plan_consecutive(subrays: int) -> TilePlan:
 
 
 def _sub_ray_lanes(beams: Ints, subrays: int) -> Ints:
-    """Return the indices of the sub-rays of beams (..., n).
+    """Return the indices of the sub-rays of beams.
 
     The sub-rays of each beam are padded to whole vectors.
     """
@@ -91,9 +91,9 @@ def plan_tiles(scan: Scan) -> TilePlan:
 
 
 def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
-    """Determine how rings neighbor each other, from the directions (n, 3) of two firings.
+    """Determine which rings are neighbors from the directions of two firings.
 
-    The firings must be consecutive.
+    The directions have shape (n, 3), and the firings must be consecutive.
 
     Returns
     -------

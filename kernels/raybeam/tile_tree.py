@@ -59,7 +59,7 @@ class TileTree:
 
 
 def build_tile_tree(corners: Floats) -> TileTree:
-    """Build the tree of triangles (k, 3, 3) in local coordinates."""
+    """Build the tree of triangles in local coordinates."""
     tree = build_tree(corners, WIDTH, _LEAF_SIZE, _TRIANGLE_COST)
     is_leaf = tree.child < 0
     codes = ~tree.child[is_leaf]
@@ -76,9 +76,9 @@ def build_tile_tree(corners: Floats) -> TileTree:
 
 
 def build_instance_nodes(boxes: Floats) -> tuple[Floats32, int]:
-    """Build the nodes of a tree over boxes (n, 2, 3), whose leaves contain the index of one box.
+    """Build the nodes of a tree over boxes, with the index of a single box in each leaf.
 
-    Also return the maximum number of pending nodes.
+    The boxes have shape (n, 2, 3). Also return the maximum number of pending nodes.
     """
     tree = build_instance_tree(boxes, WIDTH)
     return _nodes(tree, tree.child), _stack(tree)

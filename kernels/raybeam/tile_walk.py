@@ -42,7 +42,7 @@ _MET = field_index("met")
 
 @inlined
 def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
-    """Write entry `k` of a list: the depth, the code, and the mask of subtiles."""
+    """Write entry `k` of a list, with its depth, code, and mask of subtiles."""
     stack[ENTRY * k] = near
     codes[ENTRY * k + 1] = np.int32(code)
     codes[ENTRY * k + 2] = np.int32(mask)

@@ -80,7 +80,7 @@ def build_tree(
 
 
 def build_instance_tree(boxes: Floats, width: int) -> WideTree:
-    """Build a tree over the boxes (n, 2, 3) of instances, with a single box per leaf.
+    """Build a tree over the boxes of instances, with a single box per leaf.
 
     Leaves contain the index of an instance instead of a position in `order`.
     """

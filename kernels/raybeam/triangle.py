@@ -36,7 +36,7 @@ class ShearedRays:
         Local origin along kx, ky and kz.
     sx, sy, sz
         Shear: the direction components along kx and ky, divided by the component along kz, and the
-        reciprocal of the latter.
+        reciprocal of the component along kz.
     """
 
     kx: Indices
@@ -51,7 +51,7 @@ class ShearedRays:
 
 
 class PlaneHits(NamedTuple):
-    """Intersections of rays with the planes of triangles, (m,) each.
+    """Intersections of rays with the planes of triangles.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class PlaneHits(NamedTuple):
 
 
 def shear_rays(origins: Floats, directions: Floats) -> ShearedRays:
-    """Prepare rays with local origins (n, 3) and unit directions (n, 3) for the test."""
+    """Prepare rays with local origins and unit directions for the test."""
     kz = np.argmax(np.abs(directions), axis=1)
     kx = (kz + 1) % 3
     ky = (kz + 2) % 3
@@ -118,7 +118,7 @@ def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indice
 def _sheared_corners(
     rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
 ) -> tuple[list[Floats], list[Floats], list[Floats]]:
-    """Return the coordinates of the three vertices of triangles (m,) relative to rays (m,).
+    """Return the coordinates of the three vertices of each triangle relative to its ray.
 
     The result is three lists with one array (m,) per vertex: sheared x and y, and z along kz.
     """

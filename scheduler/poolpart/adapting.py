@@ -200,7 +200,7 @@ class AdaptivePartitions(SchedulerPlugin):
         return waiting
 
     def missing_slots(self, name: str, waiting: float, limit: float) -> float:
-        """Return how many slots a partition lacks, as a negative number if slots are unused.
+        """Return the number of slots that a partition lacks, which is negative if slots are unused.
 
         Tasks that are bound to a worker, or that have seceded there, occupy slots of that worker.
         All other tasks can run on any worker of the partition, including a new one.

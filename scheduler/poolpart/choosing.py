@@ -174,7 +174,7 @@ class WorkerChooser(SchedulerPlugin):
 
 
 def invalidate_groups(scheduler: Any) -> None:
-    """Tell the rule, if it is installed, that a worker has changed its declared resources."""
+    """Notify the rule, if it is installed, that a worker has changed its declared resources."""
     choice: WorkerChooser | None = scheduler.plugins.get(NAME)
     if choice is not None:
         choice.invalidate_groups()

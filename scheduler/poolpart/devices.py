@@ -28,10 +28,10 @@ def own_device() -> int | None:
     """Return the index of the CUDA device for this task's worker, or None if the worker has no GPU.
 
     The index refers to the devices that are visible to the worker. Workers are distributed evenly
-    over the devices: each worker is assigned the device with the fewest workers of its partition.
-    Ties are resolved in favor of the device with the fewest workers of the whole cluster, and then
-    in favor of the lowest index. A worker keeps its device until it exits, so all of its tasks
-    receive the same index, and only the first call takes time.
+    over the devices, because each worker is assigned the device with the fewest workers of its
+    partition. Ties are resolved in favor of the device with the fewest workers of the whole
+    cluster, and then in favor of the lowest index. A worker keeps its device until it exits, so all
+    of its tasks receive the same index, and only the first call takes time.
 
     Raises
     ------

@@ -63,7 +63,7 @@ async def _run_operation(
 ) -> tuple[Any, str]:
     """Call a function with the steward.
 
-    Returns the result of the function and "", or None and the message of a PoolError.
+    The result is the return value and "", or None and the message of a PoolError.
     """
     # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:
@@ -376,8 +376,8 @@ async def _move(
 ) -> list[str]:
     """Move workers to the given partitions, or out of all partitions if the target is None.
 
-    Returns the names of the workers. A worker whose tasks do not finish in time stays in its
-    partition.
+    The result contains the names of the workers. A worker whose tasks do not finish in time stays
+    in its partition.
 
     Raises
     ------

@@ -36,10 +36,10 @@ class Feature:
         """Clean up after the last partition with a rule was dissolved."""
 
     def begin_counting(self, statistics: Any) -> None:
-        """Handle that the scheduler begins to count tasks in a `TaskStatistics`."""
+        """Start the feature's part in counting when the scheduler begins to count tasks."""
 
     def end_counting(self, statistics: Any) -> None:
-        """Handle that the scheduler stops counting tasks."""
+        """End the feature's part in counting when the scheduler stops counting tasks."""
 
 
 FEATURES: list[Feature] = []  # filled when `poolpart` is imported

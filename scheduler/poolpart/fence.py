@@ -1,6 +1,6 @@
 """Fences, which keep other tasks off the workers of exclusive partitions.
 
-A Dask resource only works in one direction: tasks that request it run on workers that have it, but
+A Dask resource only works in one direction. Tasks that request it run on workers that have it, but
 all other tasks can run there as well. A fence adds the other direction. Only tasks that take a slot
 of the partition run on its workers. All other tasks run on the rest of the cluster, regardless of
 when and by which client they were submitted. This includes tasks without annotations, collections,

@@ -1,4 +1,4 @@
-"""Tasks for the items of a pipe or an iterable, the implementation of `Partition.for_each`."""
+"""Implementation of `Partition.for_each`, which runs a task for each item of a pipe or iterable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps: results of a function for many items, with several items per task and few tasks in flight.
+"""Maps of a function over many items, with several items per task and few tasks in flight.
 
 A map over the results of another map is a single map with two stages. Each task of the first stage
 is followed by a task of the second stage, which fetches the result of the first directly from its
@@ -52,7 +52,7 @@ Row = tuple[Call, ...]  # calls of an item by stage
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items of a task: the index of the first item, and the calls of each item by stage."""
+    """Items of a task, with the index of the first item and the calls of each item by stage."""
 
     first: int
     rows: Sequence[Row]
@@ -188,7 +188,7 @@ class ChunkSize:
         return round(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
 
     def chunks(self, items: int, seconds: float, nbytes: int) -> int:
-        """Return how many chunks with `items` items take `seconds` or have a size of `nbytes`.
+        """Return the number of chunks of `items` items that take `seconds` or have `nbytes` bytes.
 
         The smaller of both numbers is returned, or 0 if no item has been processed yet.
         """
@@ -553,7 +553,7 @@ class Results(Iterator[Any]):
         self._lead.review(self._sizes()[1])
 
     def _busy_s(self, seconds: Sequence[float]) -> dict[str, float]:
-        """Return how long a task occupied its slots, divided by their number, by partition."""
+        """Return the time that a task took by partition, divided by the number of slots."""
         busy_s: dict[str, float] = {}
         for stage, stage_s, slots in zip(self._stages, seconds, self._slots, strict=True):
             busy_s[stage.partition] = busy_s.get(stage.partition, 0.0) + stage_s / max(1, slots)

@@ -1,4 +1,4 @@
-"""A partition: the workers that declare a Dask resource, and methods to run tasks on them."""
+"""Partitions, which run tasks on the workers that declare a Dask resource."""
 
 from __future__ import annotations
 

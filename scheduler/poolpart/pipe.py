@@ -112,9 +112,9 @@ class Pipe:
     returns. To process each item exactly once, record which items have arrived, and put missing
     items again. If an item cannot be unpickled, the error is raised in place of the item, which is
     lost. Later items are not affected. If a wait is interrupted, for example by Ctrl-C, no item is
-    lost: an item that arrives within the next second is kept in the object for its next `get`. If
-    an event loop stops awaiting a thread (`asyncio.to_thread`), the thread continues to wait, and
-    the item that it receives is lost. To limit this wait, pass `timeout_s`.
+    lost, because an item that arrives within the next second is kept in the object for its next
+    `get`. If an event loop stops awaiting a thread (`asyncio.to_thread`), the thread continues to
+    wait, and the item that it receives is lost. To limit this wait, pass `timeout_s`.
 
     **Order.** Each object returns items in the order in which they were put. Threads that share an
     object receive the items in any order.
@@ -571,7 +571,10 @@ def _key_of_task() -> str:
 
 
 def _producer() -> str:
-    """Return the ID of a producer: the key of the current task, or a random ID outside of tasks."""
+    """Return the ID of a producer.
+
+    The ID is the key of the current task, or a random ID outside of tasks.
+    """
     return _key_of_task() or uuid.uuid4().hex
 
 

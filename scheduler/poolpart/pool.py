@@ -1,4 +1,4 @@
-"""The pool: all workers of a cluster, which can be divided into partitions."""
+"""The pool of all workers of a cluster, which can be divided into partitions."""
 
 from __future__ import annotations
 
@@ -390,8 +390,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If not exactly one selector is passed, if the rule selects fewer workers than `minimum`,
-            or if other workers already have this partition.
+            If no selector or several selectors are passed, if the rule selects fewer workers than
+            `minimum`, or if other workers already have this partition.
 
         Examples
         --------

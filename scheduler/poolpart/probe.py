@@ -1,4 +1,4 @@
-"""Functions that run on a worker to find out about its machine."""
+"""Functions that run on a worker and query its GPUs."""
 
 from __future__ import annotations
 

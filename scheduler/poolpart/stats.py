@@ -81,7 +81,10 @@ class TaskStatistics(SchedulerPlugin):
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
     def queued_since(self, key: Any) -> float | None:
-        """Return when a task became ready to run in seconds since 1970, or None if unknown."""
+        """Return the time at which a task became ready to run, or None if unknown.
+
+        The time is in seconds since 1970.
+        """
         return self._runnable.get(key)
 
     def _keep(
@@ -211,7 +214,7 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
 
 
 def _times_of_running(task: Any) -> tuple[float | None, float | None]:
-    """Return when a running task started and how long it has been running, in seconds.
+    """Return the start time and the running time of a running task in seconds.
 
     The start is in seconds since 1970. Both values are None until the first heartbeat after the
     start, because workers report running times with their heartbeats.

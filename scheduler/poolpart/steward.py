@@ -457,7 +457,9 @@ class Steward(SchedulerPlugin):
 
 
 def worker_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
-    """Return a key that identifies a worker across restarts: its name, or its nanny's address.
+    """Return a key that identifies a worker across restarts.
+
+    The key is the worker's name, or its nanny's address.
 
     The nanny's address is used for default names, which are derived from the worker's address and
     change with a restart. Names are not converted to strings, because for Dask, the name 0 from

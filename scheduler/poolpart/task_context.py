@@ -1,4 +1,4 @@
-"""Context of the current task: the client of its worker, and errors if the worker is leaving."""
+"""Access to the client of the current task's worker, and errors if this worker is leaving."""
 
 from __future__ import annotations
 

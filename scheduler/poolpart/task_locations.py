@@ -98,6 +98,6 @@ def _task_place(task: Any) -> TaskLocation:
 
 
 def _in_use(worker: Any, resource: str) -> float:
-    """Return how much of a resource is in use, which Dask itself miscounts after work stealing."""
+    """Return the amount of a resource in use, which Dask itself miscounts after work stealing."""
     held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
     return float(sum(held))

@@ -208,5 +208,5 @@ def test_workers_that_close_while_the_scheduler_owes_an_answer_say_nothing(tmp_p
 
 def test_encryption_needs_a_package_that_is_optional(monkeypatch):
     monkeypatch.setattr(local, "find_spec", lambda name: None)
-    with pytest.raises(PoolError, match="requires cryptography.* Run pip install cryptography"):
+    with pytest.raises(PoolError, match=r"requires cryptography.* Run pip install cryptography"):
         local_cluster({"A": (1, 1)}, security=True)

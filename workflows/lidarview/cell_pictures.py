@@ -81,7 +81,7 @@ def draw_sensor(sensor: Sensor) -> bytes:
 
 
 def draw_survey(survey: Survey) -> bytes:
-    """Draw a survey from above: the sensor positions, with arrows along the sensors' x axes."""
+    """Draw the sensor positions of a survey from above, with arrows along the sensors' x axes."""
     page = Page(PICTURE_SIZE)
     sensors = sensor_positions(survey)
     limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
@@ -115,7 +115,8 @@ def _headings(survey: Survey, count: int = 24) -> Floats:
 def _around(points: Floats) -> Floats:
     """Return the limits of a chart around points, in the aspect ratio of the chart.
 
-    `points` has shape (n, 2); the result has shape (2, 2), the lower and the upper corner.
+    `points` has shape (n, 2). The result has shape (2, 2) and contains the lower and the upper
+    corner.
     """
     lower = points.min(axis=0)
     upper = points.max(axis=0)
@@ -159,7 +160,7 @@ draw_storedcloud = draw_cloud
 
 
 def _sampled(cloud: CloudLike, step: int) -> Floats:
-    """Return the positions (n, 3) of every `step`-th point of a cloud."""
+    """Return the positions of every `step`-th point of a cloud."""
     pieces = [np.zeros((0, 3))]
     first = 0
     for piece in cloud.chunks():

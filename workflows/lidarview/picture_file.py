@@ -65,7 +65,7 @@ class SensorPositions:
         return [f"{self.name} {number}".strip() for number in numbers.tolist()]
 
     def position_at(self, time_ns: float) -> Floats:
-        """Return the position (3,) at a time."""
+        """Return the position at a time."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
         last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
@@ -79,12 +79,16 @@ class PlannedPath:
     corners: Floats  # (w, 2) from start to target, local, in meters
     length_m: float
     shortest_m: float  # length of the shortest path, infinite if discs block the target
-    clearance_m: float  # distance to the nearest disc: negative inside, infinite without discs
+    # Distance to the nearest disc, which is negative inside a disc and infinite without discs.
+    clearance_m: float
     trials: Sequence[Floats] = ()  # (w, 2) corners of each trial's path, without its ends
 
     @property
     def excess(self) -> float:
-        """Relative excess over the shortest length; 0.01 means 1 % longer."""
+        """Relative excess over the shortest length.
+
+        For example, 0.01 means that the path is 1 % longer.
+        """
         return self.length_m / self.shortest_m - 1
 
 
@@ -103,17 +107,17 @@ class PlanningPicture:
 class PictureContent:
     """The content of a result's pictures, except the points."""
 
-    scene: Scene  # the trajectories of actors have at most `MAX_POSITIONS` positions
+    scene: Scene  # its actors have trajectories of at most `MAX_POSITIONS` positions
     sensors: Sequence[SensorPositions]
-    hit_counts: AnyArray  # (f,) hits on each triangle, the actors' triangles last
+    hit_counts: AnyArray  # (f,) hits on each triangle, with the actors' triangles last
     sample_rays: Floats32  # (k, 2, 3) start and end points of some rays, local, in meters
     planning: PlanningPicture | None = None
     duration_ns: float = 0.0  # duration of the survey
     extra_columns: Sequence[Column] = ()  # columns of the cloud that are not in `TABLE`
-    # (objects,) share of light that each object reflects, actors last; None if unknown
+    # (objects,) fraction of light that each object reflects, with actors last; None if unknown.
     reflectance: Floats | None = None
-    coordinates: str = "world"  # frame of the points; the scene is not shown with "sensor"
-    triangles: int = 0  # number of triangles in the scene; simpler instances may be drawn
+    coordinates: str = "world"  # frame of the points; the scene is not shown if it is "sensor"
+    triangles: int = 0  # number of triangles in the scene; drawn instances may be simplified
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
     face_materials: Ints32 | None = None  # (f,) material of each static triangle, -1 for none
@@ -381,7 +385,7 @@ def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
 
 
 def sensor_positions(survey: Survey) -> list[SensorPositions]:
-    """Return the positions of each sensor: its stations, or samples of its trajectory."""
+    """Return the positions of each sensor, which are its stations or samples of its trajectory."""
     path = survey.path
     sensors: list[SensorPositions] = []
     first = 0
@@ -402,7 +406,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
 def moving_positions(
     sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Return the positions (k, 3) that a picture of a survey with motion must show.
+    """Return the positions that a picture of a survey with motion must show.
 
     These are the positions of the moving sensors or, if only actors move, of all sensors and
     actors. The result is empty without motion.

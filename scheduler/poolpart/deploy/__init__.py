@@ -1,4 +1,6 @@
-"""Clusters whose workers form partitions from the start: local, in queues, over SSH, in Kubernetes.
+"""Clusters whose workers form partitions from the start.
+
+The workers run locally, in queues, over SSH, or in Kubernetes.
 
 Partitions and pipes do not need these modules, because they can divide any running cluster.
 """

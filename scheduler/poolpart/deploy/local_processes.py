@@ -1,4 +1,4 @@
-"""Worker processes of local clusters: how they are started and restarted."""
+"""Start and restart the worker processes of local clusters."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Features beside the core, one idea per module. The README lists the purpose of each module.
+"""Optional features on top of the core, with one feature per module.
 
-These modules import the core. Of the rest of the package, only `Pool`, `Partition`, `Pipe` and
-`deploy` import them, and they never import these classes in turn. Modules that define a `Feature`
-add it to `features.FEATURES`, through which the core calls it.
+The README lists the purpose of each module. The modules import the core, but they never import
+`Pool`, `Partition`, `Pipe` or `deploy`, which are the only importers of this folder. Modules that
+define a `Feature` add it to `features.FEATURES`, through which the core calls it.
 """
 
 from . import dashboard_page, inherit, metrics

@@ -140,7 +140,10 @@ def _worker_row(worker: Any) -> list[object]:
 
 
 def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
-    """Return the sort key of a worker's row, which sorts 9 before 10 and no partition last."""
+    """Return the sort key of a worker's row.
+
+    The key sorts 9 before 10, and workers without a partition last.
+    """
     name = str(row[0])
     partition = str(row[1])
     return partition == _label(""), partition, len(name), name
@@ -249,7 +252,10 @@ async def _open_page(owner: str, link: str | None, dask_scheduler: Any = None) -
 
 
 async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
-    """Close the page for a client. It stays open for other clients. Runs on the scheduler."""
+    """Close the page for a client.
+
+    The page stays open for other clients. Runs on the scheduler.
+    """
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
 

@@ -1,4 +1,4 @@
-"""Inheritance: tasks that a task of a partition submits belong to the same partition.
+"""Inheritance of the partition by tasks that a task of the partition submits.
 
 In plain Dask, resources are not inherited, so the tasks that a GPU task submits run on any worker.
 With this feature, the scheduler assigns such tasks, at any depth, to the partition of the

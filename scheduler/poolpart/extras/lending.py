@@ -1,4 +1,4 @@
-"""Lending of slots: a task of a partition lends its slots while it waits for other tasks.
+"""Lending of slots by tasks of a partition while they wait for other tasks.
 
 A task that waits for tasks that it has submitted to its own partition occupies the slots that these
 tasks need. Therefore, while it waits, other tasks can use its slots and its worker thread:
@@ -268,7 +268,7 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
 
 
 class _WaitHooks:
-    """Implementation of `internals.client.WaitHooks`, whose methods the waits of clients call."""
+    """Implementation of `internals.client.WaitHooks`, which Dask's clients call while they wait."""
 
     def may_lend(self) -> bool:
         """Return whether the task of this thread has slots to lend."""

@@ -1,4 +1,4 @@
-"""Functions for clients that use private API: waits that lend slots, callbacks, and requests."""
+"""Waits that lend slots, callbacks, and requests for clients, based on private API."""
 
 from __future__ import annotations
 

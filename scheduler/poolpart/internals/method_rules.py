@@ -86,7 +86,7 @@ class MethodRules:
         self._added: list[tuple[Any, str, Any]] = []  # (object, method name, rule)
 
     def call_after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
-        """Call `rule(result, …)` after a method, with its result and arguments, for a new result.
+        """Call `rule(result, …)` after a method, and return the rule's result instead.
 
         `parameter` is the name of a parameter that the method must have.
 

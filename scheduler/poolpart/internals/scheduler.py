@@ -323,8 +323,8 @@ def _unpacked(result: Any) -> Any:
 def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
     """Add a plugin to all current and future workers, or remove it if `plugin` is None.
 
-    Returns the requests in flight, one per worker. Workers that do not respond, for example because
-    the cluster is closing, are ignored.
+    The result contains the requests in flight, one per worker. Workers that do not respond, for
+    example because the cluster is closing, are ignored.
     """
 
     # The function is nested so that it is pickled by value. A closing worker removes its plugins

@@ -1,4 +1,4 @@
-"""Functions that use private API on a worker: declared resources, lent slots, and inputs."""
+"""Access to the resources, slots, and inputs of a worker through private API."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def add_handler(worker: Any, name: str, handler: Callable[..., Any]) -> None:
 
 
 async def why_unreadable(key: Any, holder: str, dask_worker: Any = None) -> str:
-    """Return why a worker cannot unpickle a result of another worker, or "" if it can.
+    """Return the reason why a worker cannot unpickle another worker's result, or "" if it can.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Formats of clouds: a module writes and reads each."""
+"""Point cloud formats, each of which has a module that writes and reads it."""

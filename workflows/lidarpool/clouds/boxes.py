@@ -120,5 +120,5 @@ class SweepBoxes:
 
     @property
     def rows(self) -> Floats32:
-        """Center, length, width, height and yaw of each box, as float32 of shape (k, 7)."""
+        """Center, length, width, height and yaw of each box, float32. Shape (k, 7)."""
         return np.column_stack([self.centers, self.sizes, self.yaw]).astype(np.float32)

@@ -101,7 +101,10 @@ class E57(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans of an E57 file. Points are in the scanner frame, with a pose per scan."""
+        """Open the scans of an E57 file.
+
+        Points are in the scanner frame, and each scan has a pose.
+        """
         return _open_e57(source)
 
 
@@ -255,7 +258,7 @@ def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
 
 
 def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
-    """Read the supported fields of a scan as {name: array with shape (n,)}.
+    """Read the supported fields of a scan as {name: values}.
 
     This does not use the reading function of pye57, because its types are too small for some
     values: 8 bits for colors and 16 bits for row numbers.
@@ -290,7 +293,7 @@ def _states(kind: str) -> list[str]:
 
 
 def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
-    """Return the positions in a scan as Cartesian coordinates of shape (n, 3)."""
+    """Return the positions in a scan as Cartesian coordinates."""
     first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
     if kind == "cartesian":
         return np.stack([first, second, third], axis=1)
@@ -334,7 +337,7 @@ def _full_color(header: Any, highest: float) -> float:
 
 
 def _scale(headers: Sequence[Any]) -> _Scale:
-    """Return how to convert the intensities of all scans to the same scale.
+    """Determine the common scale to which the intensities of all scans are converted.
 
     Intensities are used as stored unless all scans that have them declare limits.
     """
@@ -388,7 +391,7 @@ def _stated_name(header: Any) -> str:
 
 
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the pose of a scan with shape (4, 4), or None if it has none, and notes about it.
+    """Return the pose matrix of a scan, or None if it has no pose, and notes about the pose.
 
     Raises ValueError if the pose is not finite.
     """

@@ -62,7 +62,10 @@ def summarize_flight_lines(survey: Survey) -> dict[str, float] | None:
 
 
 def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
-    """Return when a sensor starts and stops firing in a survey of `steps` steps, in seconds."""
+    """Return the times in seconds at which a sensor starts and stops firing in a survey.
+
+    `steps` is the number of steps in the survey.
+    """
     _, firings = sensor.firings(steps - 1)
     return sensor.start_ns / 1e9, sensor.begins_ns(np.array([firings])).item() / 1e9
 
@@ -179,7 +182,7 @@ class FlightLines:
 
     @cached_property
     def _directions(self) -> Floats:
-        """Direction of flight in each sweep, as horizontal unit vectors of shape (n, 3)."""
+        """Direction of flight in each sweep, as horizontal unit vectors. Shape (n, 3)."""
         axes = self.sweeps.pose.rotations[:, :, 0]
         knots = self.sweeps.knots
         moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
@@ -187,14 +190,14 @@ class FlightLines:
 
     @cached_property
     def _stations(self) -> Ints:
-        """Station of each sweep, with shape (n,)."""
+        """Station of each sweep. Shape (n,)."""
         sweeps = self.sweeps
         per_station = np.bincount(sweeps.sensor) // sweeps.stations
         return sweeps.numbers // np.maximum(per_station[sweeps.sensor], 1)
 
     @cached_property
     def _sources(self) -> Ints:
-        """Point source ID of each sweep, starting at 1, with shape (n,)."""
+        """Point source ID of each sweep, starting at 1. Shape (n,)."""
         sweeps = self.sweeps
         source = self._stations.copy()
         for sensor, lidar in enumerate(sweeps.lidars):
@@ -209,7 +212,7 @@ class FlightLines:
 
 
 def _level(moves: Floats, axes: Floats) -> Floats:
-    """Return horizontal unit vectors of shape (k, 3) in the direction of movement.
+    """Return horizontal unit vectors in the direction of movement.
 
     Parameters
     ----------

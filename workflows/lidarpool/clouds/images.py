@@ -1,4 +1,7 @@
-"""Range images, which contain all rays of a sweep by channel and firing, even without returns."""
+"""Range images, which contain all rays of a sweep by channel and firing.
+
+Rays without a return are included.
+"""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsim.columns.cloud import CloudLike
 
-_SATURATED_SHARE = 0.01  # maximum share of points that are stored as the highest integer
+_SATURATED_SHARE = 0.01  # maximum fraction of points that are stored as the highest integer
 _HIGHEST = 65_535  # integer that represents the full scale
 _MIN_EXPONENT = -149  # exponent of the smallest float32
 _EXPONENTS = 300  # number of exponents that are counted

@@ -216,7 +216,7 @@ def _table(matrix: Floats) -> bytes:
 
 
 def _row(rotation: Floats) -> str:
-    """Format a rotation of shape (3, 3) as a 3 x 4 matrix without translation."""
+    """Format a rotation as a 3 x 4 matrix without translation."""
     return " ".join(f"{value:.9e}" for value in np.column_stack([rotation, np.zeros(3)]).ravel())
 
 
@@ -317,17 +317,18 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:
-    """Convert the matrices in `poses.txt`, of shape (n, 3, 4), to lidar poses of shape (n, 4, 4).
+    """Convert the matrices in `poses.txt` to lidar poses.
 
-    The matrices are camera poses. The file `calibration` contains the transformation from the lidar
-    to the camera. If this file does not exist, they are assumed to be lidar poses.
+    The matrices have shape (n, 3, 4), and the poses have shape (n, 4, 4). The matrices are camera
+    poses. The file `calibration` contains the transformation from the lidar to the camera. If this
+    file does not exist, they are assumed to be lidar poses.
     """
     camera = _calibration(calibration)
     return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
 
 
 def _matrices(path: Path) -> Floats:
-    """Read a file with one 3 x 4 matrix per line, as an array of shape (n, 3, 4).
+    """Read a file with one 3 x 4 matrix per line.
 
     Raises ValueError with the line number if a line is invalid.
     """
@@ -339,7 +340,7 @@ def _matrices(path: Path) -> Floats:
 
 
 def _calibration(path: Path) -> Floats:
-    """Read the transformation from the lidar to the camera, with shape (4, 4).
+    """Read the transformation matrix from the lidar to the camera.
 
     Returns the identity if the file does not exist.
     """
@@ -360,7 +361,7 @@ def _calibration(path: Path) -> Floats:
 
 
 def _square(matrix_rows: Floats) -> Floats:
-    """Extend a matrix of shape (3, 4) to shape (4, 4)."""
+    """Extend a 3 x 4 matrix to a 4 x 4 matrix."""
     return np.vstack([matrix_rows, [0, 0, 0, 1]])
 
 

@@ -1,4 +1,7 @@
-"""Read and write LAS and LAZ with laspy. Written files are version 1.4, point formats 6 to 10."""
+"""Read and write LAS and LAZ files with laspy.
+
+Written files have version 1.4 and point formats 6 to 10.
+"""
 
 from __future__ import annotations
 
@@ -165,7 +168,7 @@ def _start_s(sweeps: Sweeps) -> float:
 
 
 def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]:
-    """Return intensities (n,) as the integers that are stored in the format."""
+    """Return intensities as the integers that are stored in the format."""
     fractions = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
     return np.round(fractions * _MAX_INTENSITY).astype(np.uint16)
 

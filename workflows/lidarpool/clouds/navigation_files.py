@@ -1,4 +1,4 @@
-"""Measurement files for the IMU and GNSS receiver of a vehicle: imu.csv and gnss.csv.
+"""Measurement files for the IMU (imu.csv) and the GNSS receiver (gnss.csv) of a vehicle.
 
 The files are stored next to the cloud and contain one row per sample, sorted by time. Bags are
 created from these files, so that all formats contain the same values.

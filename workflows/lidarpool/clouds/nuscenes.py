@@ -325,7 +325,7 @@ def _actor_categories(sweeps: Sweeps) -> list[str]:
 
 
 def _spelled_alike(name: str) -> str:
-    """Normalize a name, so that names that differ only in case or underscores are equal."""
+    """Normalize a name so that names are equal if they differ only in case or underscores."""
     return name.casefold().replace("_", " ")
 
 
@@ -613,6 +613,6 @@ class _DataSet:
 
 
 def _pose_of(row: _Row) -> Floats:
-    """Return the pose in a row with a rotation and a translation, with shape (4, 4)."""
+    """Return the pose matrix for a row with a rotation and a translation."""
     w, x, y, z = row["rotation"]
     return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))

@@ -379,7 +379,7 @@ class _Record:
         self._parts.append(rows)
 
     def rows(self) -> AnyArray:
-        """Return the encoded messages as uint8 with shape (n, k)."""
+        """Return the encoded messages as uint8, with one row per message."""
         count = next(len(part) for part in self._parts if not isinstance(part, bytes))
         columns = [
             np.tile(np.frombuffer(part, np.uint8), (count, 1)) if isinstance(part, bytes) else part

@@ -20,7 +20,7 @@ _MIN_TIMES = 8  # distinct times of a sweep; fewer are packet times, or lack pre
 
 
 class PointClock(StrEnum):
-    """PointClock of the point times."""
+    """Clock to which the point times of a recording refer."""
 
     RELATIVE = "relative to the timestamp of the sweep"
     ABSOLUTE = "clock of the timestamps"

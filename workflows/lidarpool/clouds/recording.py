@@ -41,7 +41,7 @@ _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
-    """The recording has several sensors or topics, and none was chosen.
+    """Raised if a recording has several sensors or topics, and none was chosen.
 
     `contents` is a sentence that lists them, and `option` is the option that chooses one of them.
     """
@@ -273,7 +273,7 @@ class Recording:
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
-        """Timestamps of the sweeps in nanoseconds, float64 of shape (count,), or None."""
+        """Timestamps of the sweeps in nanoseconds, float64, or None. Shape (count,)."""
         if self.read_stamps is None:
             return None
         with reading(self.name):
@@ -305,7 +305,7 @@ class Recording:
         return Rings.from_sweeps(self.name, [*sweeps.values()]), times
 
     def rings_of(self, sweep: Sweep) -> Ints | None:
-        """Return the ring of each point in a sweep without a ring column, with shape (n,).
+        """Return the ring of each point in a sweep without a ring column.
 
         Rings are numbered from the lowest ring. Points without a ring or without a return have the
         value -1. Returns None if the rings are unknown, or if there is a ring column.

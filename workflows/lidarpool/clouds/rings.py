@@ -2,7 +2,7 @@
 
 KITTI `.bin` files and many PCD files have no ring column. If points are stored ring by ring, a new
 ring starts where the azimuth jumps back. Otherwise, rings can be recognized by their elevation
-angles: beams that sweep cones have few distinct elevations, unless the points are
+angles, because beams that sweep cones have few distinct elevations unless the points are
 motion-compensated.
 """
 

@@ -172,7 +172,7 @@ class RerunLog:
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Log a planned path, given its corners in world coordinates, with shape (w, 3)."""
+        """Log a planned path, given its corners in world coordinates."""
         self._log_static(f"{WORLD}/path", self._line(path, _GREEN))
 
     def show_sweep(self, shown: ShownSweep) -> None:
@@ -232,7 +232,7 @@ def _normals(corners: Floats32) -> Floats32:
 
 
 def _colors(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:
-    """Return the colors of points with shape (n, 3).
+    """Return the RGB colors of points.
 
     They are the colors in the columns, or are derived from the intensity or else the height.
     """

@@ -1,4 +1,4 @@
-"""Data that live views and viewer recordings show: the surroundings, and each sweep."""
+"""Surroundings and sweeps in the form that live views and viewer recordings show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read text files and NumPy arrays: .xyz, .txt, .asc, .csv, .pts, .ptx and .npy."""
+"""Read text files (.xyz, .txt, .asc, .csv, .pts and .ptx) and NumPy arrays (.npy)."""
 
 from __future__ import annotations
 

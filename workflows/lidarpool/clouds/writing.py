@@ -1,4 +1,7 @@
-"""Write clouds in any format. A file or folder is either written completely or not at all."""
+"""Write clouds in any format.
+
+A file or folder is either written completely or not at all.
+"""
 
 from __future__ import annotations
 
@@ -433,9 +436,9 @@ def save_cloud(
         Number of poses per second on `/tf` in mcap and rosbag2. By default, there is one pose at
         the start of each sweep, and one at the end of the last sweep.
     organized
-        Whether mcap and rosbag2 contain a point for each ray, arranged in the same rows as by the
-        driver of the layout. Rays without a return are NaN. This option is available for the
-        layouts velodyne, ouster, images and robosense.
+        Whether mcap and rosbag2 contain a point for each ray, in the row order of the layout's
+        driver. Rays without a return are NaN. This option is available for the layouts velodyne,
+        ouster, images and robosense.
     intensity_full_scale
         Intensity that .las and .laz files store as 65,535. By default, it is the smallest power of
         two for which at most 1 % of the points are stored as 65,535.

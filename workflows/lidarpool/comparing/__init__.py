@@ -1,1 +1,1 @@
-"""Comparison of two clouds or recordings of the same place, and its report."""
+"""Compare two clouds or recordings of the same scene, and report the differences."""

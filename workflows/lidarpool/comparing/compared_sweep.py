@@ -72,16 +72,16 @@ def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
 
 
 def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
-    """Return a note on how the rings of a sweep were determined, if they were.
+    """Return a note on how the rings of a sweep were determined.
 
-    The list is empty if the rings are stored in a column or unknown.
+    The list is empty if the rings are stored in a column or are unknown.
     """
     is_stated = "channel" in sweep.columns or sweep.rings is None
     return [] if is_stated else [recording.rings.note.removesuffix(".")]
 
 
 def _ray_keys(columns: Columns) -> Ints:
-    """Return a unique key for each return of each ray, of shape (n,)."""
+    """Return a unique key for each return of each ray."""
     if "time" in columns:
         rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
     else:

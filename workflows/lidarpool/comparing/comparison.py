@@ -97,7 +97,7 @@ class Comparison:
 
 
 class _ImageLayout(NamedTuple):
-    """Heights in pixels of the elements on a page with three range images, one below the other."""
+    """Heights in pixels of the elements on a page with three stacked range images."""
 
     image_height: int
     page_height: int
@@ -185,7 +185,10 @@ def _draw_gap_legend(page: Page, axes: Axes) -> None:
 
 
 def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
-    """Show an image of shape (r, c, …) as seen from the sensor, so that its left is on the left."""
+    """Show an image from the viewpoint of the sensor, with the sensor's left on the left.
+
+    The image has shape (r, c, …).
+    """
     row_count, column_count = colors.shape[:2]
     start_deg = images.start_deg - images.step_deg / 2
     stop_deg = start_deg + column_count * images.step_deg
@@ -223,7 +226,10 @@ def draw_rings(comparison: Comparison) -> Page:
 
 
 def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> None:
-    """Draw a histogram of residuals in meters. The axis ends at `limit`, in millimeters."""
+    """Draw a histogram of residuals in meters.
+
+    The axis ends at `limit`, in millimeters.
+    """
     bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimeters
     outer = np.floor(limit / bin_mm) + 0.5
     edges = np.arange(-outer, outer + 1) * bin_mm
@@ -393,7 +399,10 @@ def _residual_limit(comparison: Comparison) -> float:
 
 
 def _intensity_bins(values: AnyArray) -> AnyArray:
-    """Return histogram bin edges for intensities. Integers are at the centers of their bins."""
+    """Return histogram bin edges for intensities.
+
+    Integers are at the centers of their bins.
+    """
     upper = max(float(np.quantile(values, 0.995)), 1e-12)
     if upper <= 300 and (values == np.round(values)).all():
         return np.arange(-0.5, upper + 1)

@@ -34,7 +34,10 @@ _MAX_RANGE_M = 20_000.0  # beyond the range of any lidar with rings, so not in t
 
 @dataclass(frozen=True, eq=False)
 class RangeImages:
-    """Range images of two sweeps on the same cells. Rows are rings, columns are azimuth steps."""
+    """Range images of two sweeps on the same cells.
+
+    Rows are rings, and columns are azimuth steps.
+    """
 
     rings: Ints  # (r,): ring numbers of B, by descending elevation
     elevation_deg: Floats  # (r,): median elevation of the points
@@ -46,10 +49,9 @@ class RangeImages:
     hidden_shares: tuple[float, float]  # fractions of points that share a cell with a used point
     notes: tuple[str, ...]
     cell_rows: Ints  # (k,): row of each cell, or of each ray that has a return
-    compared: (
-        Floats  # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown
-    )
-    paired_by: str = "cells"  # or "rays"
+    # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown.
+    compared: Floats
+    paired_by: str = "cells"  # "cells" or "rays"
 
     @property
     def ranges(self) -> Floats:

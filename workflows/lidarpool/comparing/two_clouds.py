@@ -1,4 +1,4 @@
-"""Compare two clouds or recordings of the same place: pairs of sweeps, cells and nearest points."""
+"""Compare two clouds or recordings by sweeps, range image cells and nearest points."""
 
 from __future__ import annotations
 
@@ -520,7 +520,7 @@ class _Comparing:
         ]
 
     def _images(self) -> RangeImages | None:
-        """Return the range images to show, or None if any pair of sweeps has none."""
+        """Return the range images to show, or None if a pair of sweeps has no range images."""
         return None if self.ray_counts.any() else self.images
 
     def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
@@ -565,7 +565,7 @@ def _residual_figures(values: Floats) -> dict[str, Any]:
 
 
 def _no_return_figures(counts: Any) -> dict[str, Any]:
-    """Return how well A predicts the cells of B that have no return.
+    """Score A's prediction of the cells of B that have no return.
 
     `counts` contains the number of cells in each state of `CELLS`.
     """

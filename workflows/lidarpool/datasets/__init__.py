@@ -1,1 +1,1 @@
-"""Data sets of many jobs: writing them, their job tables, and reading them for training."""
+"""Write data sets of many jobs with their job tables, and read them for training."""

@@ -324,8 +324,8 @@ class DataSet:
         """Yield each finished job with its manifest and a description of damage to its files.
 
         The description is a clause, which is empty if the files are intact. If the manifest itself
-        is missing or damaged, it is an empty dictionary. By default, only file sizes are compared;
-        with `contents`, the checksums are compared, too. Raises OSError if the storage cannot be
+        is missing or damaged, it is an empty dictionary. By default, only file sizes are compared.
+        With `contents`, the checksums are compared, too. Raises OSError if the storage cannot be
         read.
         """
         check_job = self._job_checker(contents)

@@ -1,4 +1,4 @@
-"""Statistics of a data set: totals, and a few values for each job."""
+"""Statistics of a data set, with totals and a few values for each job."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class VariedQuantity:
 
     @cached_property
     def edges(self) -> Floats:
-        """Histogram bin edges, with shape (bins + 1,).
+        """Histogram bin edges. Shape (bins + 1,).
 
         Each label or small integer has its own bin. Otherwise, bins have equal widths, or equal
         ratios if the values have a logarithmic distribution.
@@ -225,7 +225,7 @@ class DataSetStatistics:
 
     @property
     def failures(self) -> Bools:
-        """Boolean mask of failed jobs, with shape (jobs,)."""
+        """Mask of the failed jobs. Shape (jobs,)."""
         return np.array(self._per_job["failed"]) > 0
 
     def percentiles(self, name: str) -> dict[str, float] | None:

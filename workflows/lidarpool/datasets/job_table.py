@@ -199,9 +199,9 @@ class Tally:
     def sha256(self) -> str:
         """Hash of positions and columns, as 64 hexadecimal digits.
 
-        Each column contributes a line with its name, type and hash, starting with the positions;
-        the result is the hash of these lines. It does not depend on the division into chunks, nor
-        on whether positions are float32 or float64 if their values are equal.
+        Each column contributes a line with its name, type and hash, starting with the positions,
+        and the result is the hash of these lines. It does not depend on the division into chunks,
+        nor on whether positions are float32 or float64 if their values are equal.
         """
         lines = (f"{name} {digest.hexdigest()}\n" for name, digest in self._columns.items())
         return hashlib.sha256("".join(lines).encode()).hexdigest()

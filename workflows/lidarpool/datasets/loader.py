@@ -304,7 +304,9 @@ def sweeps(
 
 
 def read_index(storage: Storage) -> dict[str, Any]:
-    """Read the index of a data set. Its field `jobs` maps job numbers to sweep counts by sensor.
+    """Read the index of a data set.
+
+    The field `jobs` of the index maps job numbers to sweep counts by sensor.
 
     Raises LidarError if the data set is missing, unfinished or damaged.
     """

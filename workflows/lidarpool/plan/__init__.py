@@ -1,4 +1,4 @@
-"""Path planning: particle swarms that search for a short 2D path around discs."""
+"""Path planning with particle swarms, which search for a short 2D path around discs."""
 
 from .planning import Planning
 from .tangents import shortest_path_length

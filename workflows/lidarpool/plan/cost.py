@@ -1,4 +1,6 @@
-"""Cost of a path: its length, plus a penalty for entering discs that outweighs any shortcut.
+"""Cost of a path, which is its length plus a penalty for entering discs.
+
+The penalty outweighs any shortcut through a disc.
 
 One thread evaluates the cost hundreds of thousands of times per second. Therefore values are in
 single precision, particles are along the last (contiguous) axis, and results are written to
@@ -61,9 +63,9 @@ class PathCost:
         }
 
     def evaluate(self) -> Floats32:
-        """Return the cost of each path in `waypoints`, with shape (particles,).
+        """Return the cost of each path in `waypoints`.
 
-        Every call returns the same buffer.
+        The result has shape (particles,). Every call returns the same buffer.
         """
         for block in self._blocks:
             workspace = self._workspaces[block.stop - block.start]
@@ -124,7 +126,7 @@ class _Workspace:
         self._zeros = np.zeros(width, np.float32)  # an array, for speed (see the class docstring)
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
-        """Write the cost of each path to `cost`, with shape (width,).
+        """Write the cost of each path to `cost`, which has shape (width,).
 
         `points` contains the points of the paths, including their ends. Shape (k + 2, 2, width).
         """

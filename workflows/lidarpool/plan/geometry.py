@@ -27,9 +27,9 @@ def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
 
 
 def path_length(points: Floats) -> float:
-    """Return the length of the polyline through `points`, which have shape (p, 2)."""
+    """Return the length of the polyline through points in the plane."""
     steps = np.diff(points, axis=0)
-    # The order of additions in np.sum varies between machines; Python's sum is reproducible.
+    # The order of additions in np.sum varies between machines, but Python's sum is reproducible.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
@@ -63,13 +63,19 @@ class PathAxes:
         self._middle = (np.array(start) + np.array(target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points in the plane to these axes. Both arrays have shape (p, 2)."""
+        """Convert points in the plane to these axes.
+
+        Both arrays have shape (p, 2).
+        """
         cos, sin = self._axis
         x, y = (points - self._middle).T / self.unit_m
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
-        """Convert points in these axes to the plane. Both arrays have shape (p, 2)."""
+        """Convert points in these axes to the plane.
+
+        Both arrays have shape (p, 2).
+        """
         cos, sin = self._axis
         x, y = points.T * self.unit_m
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle

@@ -1,4 +1,4 @@
-"""A planning problem: two end points, the discs to avoid, and the search effort."""
+"""Planning problems, which consist of two end points, the discs to avoid, and the search effort."""
 
 from __future__ import annotations
 

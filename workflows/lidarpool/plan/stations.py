@@ -59,7 +59,7 @@ class StationVisibility:
         self._highest = highest + 1e-9
 
     def visible_sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
-        """Return which side of the surface at each point is visible from a station.
+        """Determine the side of the surface at each point that is visible from a station.
 
         `station` has shape (3,), `points` and the unit vectors `normals` have shape (n, 3).
         Positions are local, in meters, and points lie on triangles of the scene. The result has
@@ -116,10 +116,10 @@ class StationPlan:
     """
 
     stations: Floats  # (s, 3) world meters
-    coverage: Floats  # (s,) share in 0 to 1, after each station
+    coverage: Floats  # (s,) fraction of the reachable area after each station, 0 to 1
     candidates: Floats  # (c, 3) world meters
     spacing_m: float  # spacing of the candidates
-    targets: Bools  # (objects,) whether an object is to be covered; other objects only occlude
+    targets: Bools  # (objects,) whether an object should be covered; other objects only occlude
     area_m2: Floats  # (objects,) area of targets; twice this is reachable if both sides are
     reachable_m2: Floats  # (objects,) area of targets that candidates see
     covered_m2: Floats  # (objects,) area of targets that the stations see
@@ -137,7 +137,7 @@ class SurveyCoverage:
     targets: Bools  # (objects,) whether the area of an object counts
     area_m2: Floats  # (objects,) area of targets; twice this is reachable if both sides are
     reachable_m2: Floats  # (objects,) area that the stations see
-    covered_m2: Floats  # (objects,) area of that with a point of the cloud nearby
+    covered_m2: Floats  # (objects,) part of this area that has a point of the cloud nearby
 
 
 def plan_stations(
@@ -308,7 +308,10 @@ def survey_coverage(
 
 
 def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
-    """Return a mask of the objects that match a target. Without targets, all objects match."""
+    """Return a mask of the objects that match a target.
+
+    Without targets, all objects match.
+    """
     mask = np.full(len(names), not targets)
     for pattern in targets:
         rows = rows_named(pattern, names)
@@ -325,7 +328,7 @@ class _Visibility(NamedTuple):
 
     visible: Bools  # (c, n), whether a candidate sees a side
     owner: Ints  # (n,), objects of the sides
-    area_m2: Floats  # (n,), area that a side stands for
+    area_m2: Floats  # (n,), area that a side represents
 
 
 def _visibility(
@@ -344,7 +347,7 @@ class _Choice(NamedTuple):
     """Chosen rows of `_Visibility`, in order of choice."""
 
     row_indices: list[int]
-    shares: list[float]  # shares of the area, covered after each row
+    shares: list[float]  # fraction of the area that is covered after each row
     covered: Bools  # (n,)
 
 
@@ -386,12 +389,13 @@ def _default_spacing_m(scene: Scene) -> float:
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return grid positions where an instrument can be set up, in local meters, with shape (c, 3).
+    """Return grid positions where an instrument can be set up, in local meters.
 
-    The floor is the lowest surface. If the lowest surface is the underside of a slab, the floor is
-    the top of the slab. Excluded are floors that can be reached only by a slope of more than 45°,
-    such as eaves without ground below, positions with a surface within 0.3 m of the instrument or
-    between the instrument and the floor, and positions inside objects.
+    The result has shape (c, 3). The floor is the lowest surface. If the lowest surface is the
+    underside of a slab, the floor is the top of the slab. Excluded are floors that can be reached
+    only by a slope of more than 45°, such as eaves without ground below, positions with a surface
+    within 0.3 m of the instrument or between the instrument and the floor, and positions inside
+    objects.
 
     Raises
     ------
@@ -527,9 +531,9 @@ class _SurfaceSamples(NamedTuple):
     """Sample points on the surfaces of a scene."""
 
     points: Floats  # (n, 3), local meters
-    normals: Floats  # (n, 3), of length 1
+    normals: Floats  # (n, 3), unit vectors
     owner: Ints  # (n,), objects
-    area_m2: Floats  # (n,), area that a point stands for
+    area_m2: Floats  # (n,), area that a point represents
 
 
 def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:

@@ -109,7 +109,7 @@ class Swarm:
         self._move()
 
     def best(self) -> Floats32:
-        """Return the corners of the best path found so far, with shape (waypoints, 2)."""
+        """Return the corners of the best path found so far. Shape (waypoints, 2)."""
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
     def _remember(self, cost: Floats32) -> None:
@@ -141,7 +141,7 @@ def _group_count(particles: int) -> int:
 
 
 def _spreads(groups: int, widest: float) -> Floats:
-    """Return the initial spread of each group around the straight line, with shape (groups,)."""
+    """Return the initial spread of each group around the straight line."""
     widest = max(_MIN_LAST_SPREAD, widest)
     if groups == 1:
         return np.array([widest])
@@ -150,7 +150,7 @@ def _spreads(groups: int, widest: float) -> Floats:
 
 
 def _scatter_paths(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
-    """Return the initial positions of all particles, with shape (corners, 2, groups, size).
+    """Return the initial positions of all particles. Shape (corners, 2, groups, size).
 
     The paths of the first group bend at one point, those of the second group at two points, and so
     on. Bends are drawn within the group's spread around the straight line, and corners are evenly

@@ -170,7 +170,10 @@ def _free_tangents(
 
 
 def _graph(tangents: _Tangents, centers: Floats, radii: Floats) -> Graph:
-    """Return the graph of tangents and arcs. Nodes 0 and 1 are the start and the target."""
+    """Return the graph of tangents and arcs.
+
+    Nodes 0 and 1 are the start and the target.
+    """
     graph: Graph = defaultdict(list)
 
     def connect(node: int, neighbor: int, length: float) -> None:

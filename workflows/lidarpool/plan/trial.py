@@ -1,4 +1,4 @@
-"""A trial runs one particle swarm on any worker, and the plan is the best of all trials."""
+"""Planning trials, each of which runs one particle swarm, and the best plan of all trials."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run_trial(planning: Planning, trial: int) -> Trial:
 
 
 def with_ends(planning: Planning, waypoints: Floats) -> Floats:
-    """Return the complete path of start, waypoints and target, with shape (k + 2, 2)."""
+    """Return the complete path of start, waypoints and target. Shape (k + 2, 2)."""
     return np.vstack([planning.start, waypoints, planning.target])
 
 

@@ -83,7 +83,7 @@ _GEOGRAPHIC_SYSTEMS = {
     6667, 6668, 6697, 7789, 7843, 7844, 7912, 9518, 9755, 9989,
 }  # fmt: skip
 _CODES = re.compile(r"(?i)\b(EPSG|ESRI)[:/]+(?:[\d.]*[:/]+)?(\d{4,6})\b")
-_MAX_SLOPE = 100  # if the ratio of height to width is larger, coordinates are in degrees
+_MAX_SLOPE = 100  # above this ratio of height to width, coordinates are assumed to be in degrees
 _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or export it in parts"
 
 _Json = dict[str, Any]
@@ -177,7 +177,7 @@ class _CityFile:
         points = _points(document["vertices"]) * self._scale + self._translate
         objects: dict[str, _Json] = document["CityObjects"]
         levels: dict[str, list[tuple[float, _Json]]] = {}
-        # Finest level of detail of each object's parts
+        # Finest level of detail of each object's parts.
         parts: dict[str, float] = defaultdict(lambda: -np.inf)
         for key, entry in objects.items():
             levels[key] = list(self._with_levels(entry.get("geometry") or ()))
@@ -277,7 +277,7 @@ class _CityFile:
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
-        """Triangulate polygons, and return the triangles (t, 3) and their owners (t, 2)."""
+        """Triangulate polygons, and return the triangles and their owners."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
@@ -294,7 +294,7 @@ class _CityFile:
         return faces, owners
 
     def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
-        """Return triangles with the color and name of a material; -1 means no material."""
+        """Return triangles with the color and name of a material, or without a material for -1."""
         colors = None
         name = ""
         if material >= 0:
@@ -374,7 +374,7 @@ class _System:
     crs: Any  # None without rasterio, and if PROJ does not know the code
     is_of_angles: bool
     unit_m: float = 1.0  # unit of x and y, meters
-    height_units: float = 1.0  # units of x and y in the unit of heights
+    height_units: float = 1.0  # height unit divided by the unit of x and y
 
     @classmethod
     def from_head(cls, head: _Json, corners: Floats) -> _System:
@@ -400,7 +400,7 @@ class _System:
         return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
 
     def check(self, corners: Floats) -> None:
-        """Raise MeshFileError if coordinates (n, 3) are angles or not true to scale."""
+        """Raise MeshFileError if coordinates are angles or not true to scale."""
         reproject = "Reproject it, for example with `cjio FILE crs_reproject {} save NEW`"
         if self.is_of_angles:
             raise MeshFileError(
@@ -430,14 +430,14 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners (n, 3) of a city are apparently in degrees."""
+    """Return True if the corners of a city are apparently in degrees."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))
 
 
 def _points(coordinates: Any) -> Floats:
-    """Return coordinates (v, 3).
+    """Return coordinates as an array with three columns.
 
     Raises ValueError if they have another shape.
     """
@@ -451,7 +451,7 @@ def _points(coordinates: Any) -> Floats:
 
 
 def _integers(numbers: Sequence[int]) -> Ints:
-    """Return integers (n,).
+    """Return integers.
 
     Raises ValueError if the values are not integers.
     """

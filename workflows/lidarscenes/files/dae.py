@@ -87,7 +87,10 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Document:
-    """The elements of a file by ID; each geometry is read once."""
+    """The elements of a file by ID.
+
+    Each geometry is read only once.
+    """
 
     def __init__(
         self, root: Element, allowance: Allowance, paint: _Effects | None, options: ReadOptions
@@ -182,9 +185,10 @@ class _Document:
     def _read_geometry(
         self, geometry: Element, bound: tuple[tuple[str, Element], ...]
     ) -> list[SceneMesh]:
-        """Return the mesh of all primitives, which differ only in their materials, or nothing.
+        """Return the mesh of all primitives in a list, which is empty without triangles.
 
-        `bound` are the material symbols and the elements that they refer to.
+        The primitives differ only in their materials. `bound` maps material symbols to the elements
+        that they refer to.
         """
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
@@ -262,7 +266,7 @@ class _Document:
         return None if shade is None else Colors.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
-        """Return texture coordinates (c, 2), and the offset of their indices in <p>."""
+        """Return texture coordinates, and the offset of their indices in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")
@@ -289,7 +293,7 @@ class _Document:
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
-        """Return the positions (v, 3) in <vertices>."""
+        """Return the positions in <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
             raise ValueError(f"{_tag(vertices)} has no <input> with the semantic POSITION")
@@ -305,7 +309,7 @@ class _Document:
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:
-        """Return the numbers (count, stride) in a <source>."""
+        """Return the numbers in a <source>. Shape (count, stride)."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError(f"{_tag(source)} has no <accessor>")
@@ -322,7 +326,10 @@ class _Document:
 
 
 class _Effects:
-    """The diffuse colors of effects; each image is read once."""
+    """The diffuse colors of effects.
+
+    Each image is read only once.
+    """
 
     def __init__(self, path: Path, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -332,7 +339,7 @@ class _Effects:
         self._texture = cache_with_errors(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or the color (1, 1, 3) of an effect, or None if it has none."""
+        """Return the image or the color of an effect, or None if it has neither."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
@@ -378,7 +385,7 @@ class _Effects:
 def _triangles(
     primitive: Element, points: Floats, corners: Callable[[Element], Ints]
 ) -> Iterator[Ints]:
-    """Yield the triangles (t, 3) of a primitive.
+    """Yield the triangles of a primitive.
 
     `corners` returns the corners in a <p> or <h>.
     """
@@ -462,7 +469,7 @@ def _tag(element: Element) -> str:
 
 
 def _step(element: Element) -> Floats:
-    """Return the matrix (4, 4) of a transform element.
+    """Return the matrix of a transform element.
 
     Raises ValueError if it has the wrong number of values.
     """
@@ -480,7 +487,7 @@ def _rotate(numbers: Floats) -> Floats:
 
 
 def _look_at(numbers: Floats) -> Floats:
-    """Return the matrix for a camera position, a target, and an up vector, given as (9,)."""
+    """Return the matrix for a camera position, a target, and an up vector (nine numbers)."""
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / norm(eye - target)
     x = np.cross(up, z) / norm(np.cross(up, z))

@@ -1,4 +1,7 @@
-"""List the mesh formats that lidarscenes adds; `mesh_formats` in lidarsim finds this table."""
+"""List the mesh formats that lidarscenes adds.
+
+`mesh_formats` in lidarsim finds this table.
+"""
 
 from __future__ import annotations
 

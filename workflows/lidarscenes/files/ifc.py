@@ -44,8 +44,8 @@ from lidarsim.words import plural
 
 from .child_process import ReaderProcess
 
-# {number: (name, IFC classes, including their subclasses)}. Numbers are ASPRS LAS 1.4 classes. From
-# 64 on, they are user-defined; 64 to 72 are used for roads.
+# {number: (name, IFC classes, including their subclasses)}. Numbers are ASPRS LAS 1.4 classes.
+# Numbers from 64 on are user-defined, and 64 to 72 are used for roads.
 _CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
     2: (
         "ground",
@@ -158,7 +158,7 @@ def _check_end(path: Path) -> None:
 def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
     """Check that a building has all requested storeys.
 
-    Raises MeshFileError, with the names of its storeys, if not.
+    Otherwise, raises MeshFileError with the names of its storeys.
     """
     missing = [name for name in wanted or () if name not in storeys]
     if missing:

@@ -1,4 +1,4 @@
-"""Read an IFC building with ifcopenshell in the process that `ifc.py` starts; this is a script.
+"""Script that reads an IFC building with ifcopenshell in the process that `ifc.py` starts.
 
 Invalid files can crash ifcopenshell, and here this affects only this process. The script imports
 nothing from lidarpool. It writes frames to standard output (see `child_process.py`): first the
@@ -57,7 +57,8 @@ _UNREAD = {
     "IfcStructuralItem",
 }
 _TERRAIN = "IfcSite"
-# Relations of an element: its attribute, and the attribute of the relation that has the parent.
+# Relations of an element, as its attribute and the attribute of the relation that refers to the
+# parent.
 _PARENTS = (
     ("ContainedInStructure", "RelatingStructure"),
     ("Decomposes", "RelatingObject"),
@@ -334,9 +335,9 @@ def _unpacked(path: str, max_bytes: int) -> bytes:
 
 
 def _with_read_schema(head: bytes) -> bytes:
-    """Replace the schema in the header of a file by an equivalent one that the library supports.
+    """Replace the schema in the header of a file by an equivalent schema that the library supports.
 
-    Raises UnreadSchemaError if there is none.
+    Raises UnreadSchemaError if there is no equivalent schema.
     """
     stated = _SCHEMA.search(head)
     if stated is None:  # the library will refuse the file
@@ -352,7 +353,7 @@ def _with_read_schema(head: bytes) -> bytes:
 
 
 class UnreadSchemaError(Exception):
-    """The library does not support the schema of a file.
+    """Raised if the library does not support the schema of a file.
 
     The arguments are the schema and the supported schemas.
     """
@@ -398,7 +399,7 @@ def main(path: str, request: dict[str, Any]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
-        """Write a frame: a line of JSON, and the bytes of arrays."""
+        """Write a frame, which is a line of JSON followed by the bytes of arrays."""
         signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")

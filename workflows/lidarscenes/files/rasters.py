@@ -97,7 +97,7 @@ class RasterOptions:
         Rectangle | None,
         about("part of a raster to read, as [x0, y0, x1, y1] with the minimum and maximum x and y"),
     ] = None
-    # Coordinate system of the mesh, `world.epsg` in scenarios; None chooses one for the file.
+    # Coordinate system of the mesh (`world.epsg` in scenarios), or None to choose a suitable one.
     epsg: EpsgCode | None = None
 
     def __post_init__(self) -> None:
@@ -141,7 +141,10 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
 def _raster_mesh(
     source: _Source, target_crs: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[SceneMesh, str]:
-    """Return the mesh of a raster in a coordinate system, and a summary; append notes."""
+    """Return the mesh of a raster in a coordinate system, and a summary.
+
+    Notes are appended to `notes`.
+    """
     request: RasterOptions = options.own
     window = request.window
     chosen = request.step_m is not None or window is not None
@@ -165,7 +168,7 @@ def _raster_mesh(
 def _read_values(
     grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange
 ) -> tuple[Floats, Bools]:
-    """Return the values in the first band (rows, columns), and whether they are valid."""
+    """Return the values in the first band, and a mask of the valid values."""
     band = grid.file.read(1, window=(row_range, column_range), masked=True)
     values = np.ma.getdata(band).astype(np.float64)
     return values, ~np.ma.getmaskarray(band) & np.isfinite(values)
@@ -231,7 +234,7 @@ class _Source:
 
     file: Any
     affine: Any  # transform from columns and rows to x and y, in meters in a local system
-    crs: Any  # horizontal coordinate system of x and y; None without a position on Earth
+    crs: Any  # horizontal coordinate system of x and y, or None without a position on Earth
     up_m: float | None  # unit of the vertical coordinate system in meters
     local: _LocalSystem | None = None  # stated system without a position on Earth
 
@@ -250,7 +253,7 @@ class _LocalSystem:
 
     @property
     def note(self) -> str:
-        """A note on the conversion to meters, or an empty string for meters."""
+        """Note on the conversion to meters, or an empty string if the unit is the meter."""
         if self.unit_m == 1:
             return ""
         return (
@@ -484,7 +487,10 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
 
 
 def _affine(file: Any, path: Path) -> Any:
-    """Return the transform from columns and rows to x and y, by default with pixels of 1 m."""
+    """Return the transform from columns and rows to x and y.
+
+    By default, pixels have a size of 1 m.
+    """
     from rasterio.transform import Affine
 
     affine = file.transform
@@ -508,7 +514,7 @@ def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def _corners(file: Any, affine: Any) -> Floats:
-    """Return the corners (4, 2) of a file in its coordinate system."""
+    """Return the corners of a file in its coordinate system."""
     return np.array([_apply(affine, x, y) for x in (0, file.width) for y in (0, file.height)])
 
 
@@ -538,7 +544,7 @@ class _RasterGrid:
 
     @cached_property
     def extent(self) -> Floats:
-        """Minimum and maximum x and y (2, 2) in the coordinates of the mesh."""
+        """Minimum and maximum x and y in the coordinates of the mesh. Shape (2, 2)."""
         from rasterio.warp import transform_bounds
 
         corners = _corners(self.file, self.affine)

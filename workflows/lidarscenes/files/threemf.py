@@ -3,7 +3,7 @@
 The specifications are by the 3MF Consortium (2018).
 
 trimesh is not used, because it follows nested components only to a limited depth and confuses the
-parts of inner files. assimp 5.4 is not used either: it does not read the parts of inner files,
+parts of inner files. assimp 5.4 is not used either. It does not read the parts of inner files,
 ignores required extensions, and crashes if a property index is out of range.
 """
 
@@ -68,7 +68,7 @@ class _MeshObject:
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
-    # Group ID and index of the property for triangles that state none
+    # Group ID and index of the default property, for triangles without a property.
     default_property: tuple[str, str] = ("", "0")
     shades: array[int] = field(default_factory=lambda: array("B"))  # shades of corners, if read
     materials: list[str] = field(default_factory=list)  # names of triangles, if read
@@ -96,7 +96,7 @@ class _MeshObject:
 
 @dataclass(frozen=True, eq=False)
 class _Placement:
-    """A component or build item: an object placed by a matrix (4, 4)."""
+    """A component or build item, which is an object that a matrix places."""
 
     key: _Key
     name: str
@@ -131,7 +131,7 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Package:
-    """The inner files in an archive, each read when one of its objects is placed."""
+    """The inner files in an archive, each of which is read when one of its objects is placed."""
 
     def __init__(
         self, archive: zipfile.ZipFile, allowance: Allowance, options: ReadOptions

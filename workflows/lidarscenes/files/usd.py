@@ -1,8 +1,8 @@
 """Read OpenUSD scenes (.usd, .usda, .usdc, .usdz) with usd-core (Pixar, license TOST-1.0).
 
 `usd_child.py` reads the scenes in a separate process, and explains why. usd-core resolves
-references to other files; content from outside the scene's folder is refused. `usd_materials.py`
-reads masks and colors.
+references to other files, but content from outside the scene's folder is refused.
+`usd_materials.py` reads masks and colors.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Read an OpenUSD scene with usd-core in the process that `usd.py` starts; this is a script.
+"""Script that reads an OpenUSD scene with usd-core in the process that `usd.py` starts.
 
 Some invalid files crash usd-core, and others need unlimited memory. Here, this affects only this
 process. The script imports nothing from lidarpool, so that it starts quickly. It writes frames to
@@ -48,7 +48,7 @@ _SHOWN = (
 
 
 class StageLimitError(Exception):
-    """The stage has too many prims, copies, or poses."""
+    """Raised if the stage has too many prims, copies, or poses."""
 
 
 class _Inherited(NamedTuple):
@@ -85,7 +85,7 @@ class StageNodes:
         self.matrices: list[NDArray[np.float64]] = []
         self.copies: list[NDArray[np.float64]] = []
         self.moving: list[int] = []  # moving nodes that are not children
-        # Time codes and the first three rows of the poses, (k, 13) each
+        # Time codes and the first three rows of the poses, with shape (k, 13).
         self.motions: list[NDArray[np.float64]] = []
         self.counts: Counter[str] = Counter()  # counts for notes
 
@@ -124,7 +124,7 @@ class StageNodes:
             raise StageLimitError(kind)
 
     def _node(self, prim: Any, inherited: _Inherited) -> list[Any]:
-        """Return a node: its name, mesh number, child numbers, and copies.
+        """Return a node, which consists of its name, mesh number, child numbers, and copies.
 
         A copy is (node number, index into `copies`).
         """
@@ -193,7 +193,7 @@ class StageNodes:
         return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
-        """Return the time codes and world poses (k, 13) of a prim, or None if it does not move.
+        """Return the time codes and world poses of a prim, or None if it does not move.
 
         Interpolating positions linearly, and rotations about a single axis, deviates from OpenUSD
         by at most `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD`.
@@ -403,7 +403,7 @@ class MaterialReader:
         return {"materials": materials, "values": values} if materials or values else {}
 
     def _values(self, prim: Any, name: str) -> tuple[str, NDArray[np.float32]] | None:
-        """Return the interpolation and the values (k, w) of a primvar, or None if it is not set."""
+        """Return the interpolation and the values of a primvar, or None if it is not set."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         values = np.array(primvar.ComputeFlattened(self.time) if primvar else None)
         if values.dtype.kind != "f" or values.ndim != 2:
@@ -439,7 +439,7 @@ class MaterialReader:
         return number, [source["values"] for source in sources if "values" in source]
 
     def _properties(self, shader: Any, kind: str) -> dict[str, Any]:
-        """Return the requested properties of a surface: color, opacity, and opacity threshold."""
+        """Return the requested properties among color, opacity, and opacity threshold."""
         properties: dict[str, Any] = {}
         if kind not in _SURFACES:
             if self._colors:
@@ -504,7 +504,7 @@ class MaterialReader:
         return source | self._coordinates(shader.GetInput("st"))
 
     def _coordinates(self, coordinate_input: Any) -> dict[str, Any]:
-        """Return the name of texture coordinates, and the matrix (3, 2) that maps (u, v, 1)."""
+        """Return the name of texture coordinates, and the 3 x 2 matrix that maps (u, v, 1)."""
         matrix = np.eye(3)
         for _ in range(_MAX_LINKS):
             attributes = (
@@ -710,7 +710,7 @@ def main(path: str, request: dict[str, Any]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
-        """Write a frame: a line of JSON, and the bytes of arrays."""
+        """Write a frame, which is a line of JSON followed by the bytes of arrays."""
         signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")

@@ -35,7 +35,7 @@ _DISPLAY: ColorSource = {"values": "displayColor"}
 
 
 class _Use(NamedTuple):
-    """The use of an image by a material; several meshes may share it."""
+    """The use of an image by a material, which several meshes may share."""
 
     image: int
     channels: str  # "rgb", or a letter of "rgba"
@@ -54,13 +54,13 @@ class _Use(NamedTuple):
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
     def light(self, channel: str) -> Floats:
-        """Return the linear light (256,) for each byte value of a channel."""
+        """Return the linear light for each byte value of a channel. Shape (256,)."""
         k = "rgba".index(channel)
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
 
 
 class MeshAppearance:
-    """The arrays of a mesh that its materials use: texture coordinates and colors.
+    """Texture coordinates and colors of a mesh, as used by its materials.
 
     Parameters
     ----------
@@ -78,9 +78,9 @@ class MeshAppearance:
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
     def coordinates(self, source: ColorSource, face_indices: Ints) -> tuple[Floats, Ints]:
-        """Return texture coordinates (c, 2) in glTF's convention, and their indices (k, 3).
+        """Return texture coordinates in glTF's convention, and their indices.
 
-        There is an index for each corner of the triangles.
+        The indices have shape (k, 3), with an index for each corner of the triangles.
         """
         values, corners = self._corner_values(source["values"], face_indices, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
@@ -98,7 +98,7 @@ class MeshAppearance:
         return Colors.from_vertex_colors(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
-        """Return values (c, width), and their indices (k, 3) at corners.
+        """Return values, and their indices at the corners of triangles.
 
         Raises MaskError if the mesh has no suitable values.
         """
@@ -150,7 +150,7 @@ class UsdMaterials:
         )
 
     def colors(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Colors | None:
-        """Return the colors that a material gives to triangles, or None."""
+        """Return the colors of triangles with a material, or None."""
         if not self.colored:
             return None
         material = self._materials[number]
@@ -171,7 +171,7 @@ class UsdMaterials:
         return None
 
     def cutout(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Cutout | None:
-        """Return the mask that a material gives to triangles, or None if they are opaque."""
+        """Return the mask of triangles with a material, or None if they are opaque."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
         with self.notes.record_mask_error(material["name"]):

@@ -21,13 +21,13 @@ from lidarsim.words import plural
 DENSITY = "PadBVTotal"
 # Tolerated difference, in voxels, between corners and counts. The writer in HELIOS++ causes 1.5.
 _MAX_COUNT_ERROR = 2
-# The box is enlarged on all sides by this share of a voxel's edge length, so that its sides do not
-# coincide with the ground or a neighboring grid, where rays could miss them.
+# The box is enlarged on all sides by this fraction of a voxel's edge length, so that its sides do
+# not coincide with the ground or a neighboring grid, where rays could miss them.
 _MARGIN = 0.02
 
 
 def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a voxel file as an object: a box around the voxels with leaves.
+    """Read a voxel file as an object, which is a box around the voxels with leaves.
 
     As in HELIOS++, the first voxel starts at `min_corner`, and each voxel has the edge length
     `res`. Voxels that are not listed or whose density is NaN have no leaves.
@@ -108,7 +108,7 @@ def _read_table(data: bytes) -> _Table:
 
 
 def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
-    """Return the numbers (n, k) in the used columns.
+    """Return the numbers in the used columns.
 
     Raises ValueError, with the line number, if a line is invalid.
     """
@@ -120,7 +120,7 @@ def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line:
 
 
 def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
-    """Return a box around voxels (x, y, z) that start at a corner (3,), in meters."""
+    """Return a box around voxels that start at a corner, in meters."""
     sides_m = np.array(densities.shape) * edges_m
     margin_m = _MARGIN * edges_m.min()
     shell = box(name, tuple(sides_m + 2 * margin_m))

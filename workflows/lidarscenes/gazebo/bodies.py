@@ -260,7 +260,7 @@ class BodyReader:
 
 
 def _placement_frame(placing: Element, posed: Element) -> str:
-    """Return the frame of a model that its pose refers to; empty for the model's own frame."""
+    """Return the frame of a model that its pose refers to, or "" for the model's own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
 

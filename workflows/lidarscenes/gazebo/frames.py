@@ -77,7 +77,7 @@ def read_pose(element: Element) -> RelativePose:
 
 
 def read_matrix(pose: Element) -> Floats:
-    """Return the matrix (4, 4) of a <pose>.
+    """Return the 4 x 4 matrix of a <pose>.
 
     The pose consists of x, y, z, and either roll, pitch, and yaw or a quaternion. In a recorded
     state, physics may have moved a model to a pose with infinite or very large numbers. The matrix
@@ -135,14 +135,14 @@ class FrameGraph:
         return [self.root, *self._poses]
 
     def merge(self, nested: FrameGraph, placement: Floats) -> None:
-        """Add the frames of a merged model whose root is placed by a matrix (4, 4)."""
+        """Add the frames of a merged model whose root is placed by a matrix."""
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
             self.define(name, RelativePose(matrix, self.root), self.root)
         self.nested.update(nested.nested)
 
     def matrix(self, name: str) -> Floats:
-        """Return the matrix (4, 4) from a frame to the root.
+        """Return the 4 x 4 matrix from a frame to the root.
 
         Raises
         ------
@@ -172,12 +172,12 @@ class FrameGraph:
         return self._poses[name]
 
     def transform_between(self, frame: str, target: str) -> Floats:
-        """Return the matrix (4, 4) from a frame to another frame."""
+        """Return the 4 x 4 matrix from a frame to another frame."""
         return matmul(inverse_pose(self.matrix(target)), self.matrix(frame))
 
 
 def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
-    """Return the matrix (4, 4) of a model whose `placement_frame` has a given pose (4, 4)."""
+    """Return the 4 x 4 matrix of a model whose `placement_frame` has a given pose."""
     if not placement_frame:
         return pose
     return matmul(pose, inverse_pose(frames.matrix(placement_frame)))

@@ -26,7 +26,7 @@ from .world import GazeboOptions, World, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a world as a scenario: `scenario.yaml`, and a data file for each lidar.
+    """Write a world as a scenario, with a `scenario.yaml` file and a data file for each lidar.
 
     Parameters
     ----------

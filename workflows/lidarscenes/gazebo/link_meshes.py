@@ -85,7 +85,7 @@ class LinkMeshes:
         self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
         """Read the meshes of a link, as `link_meshes` returns them."""
-        # Shapes grouped by which masks see them: the first shape, its flags, and all meshes
+        # Shapes grouped by the masks that see them, as the first shape, its flags, and all meshes.
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):
             flags = ALL_BITS if self._collisions else self._flags_of(shape, name)

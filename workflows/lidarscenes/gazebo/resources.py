@@ -37,7 +37,7 @@ _SDF_VERSION = (1, 12)  # newest supported version
 
 
 class ResourceNotFoundError(Exception):
-    """A file or model was not found in any folder.
+    """Raised if a file or model is not found in any folder.
 
     The argument of the error is the name to report.
     """
@@ -46,8 +46,8 @@ class ResourceNotFoundError(Exception):
 class Candidate(NamedTuple):
     """A path that a URI may refer to, and the folder that must contain the path.
 
-    If `is_allowed` is False, the path must not be read: its folder is merely near the world, and
-    contains no file that identifies it as a model or package.
+    If `is_allowed` is False, the path must not be read, because its folder is merely near the
+    world, and contains no file that identifies it as a model or package.
     """
 
     path: Path
@@ -92,7 +92,10 @@ class Resources:
 
     @classmethod
     def for_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
-        """Return the resources of a world; the folders in `assets` are searched first."""
+        """Return the resources of a world.
+
+        The folders in `assets` are searched first.
+        """
         folder = path.parent.resolve()
         above = [folder, *folder.parents][: _MAX_FOLDERS_UP + 1]
         default = folder.parent if folder.name.lower() in _WORLD_FOLDERS else folder
@@ -227,7 +230,7 @@ class Resources:
 
 
 def short_name(uri: str) -> str:
-    """Return a short name of a model for messages: OWNER/NAME on Fuel, otherwise the name."""
+    """Return a short name of a model for messages, which is OWNER/NAME for a model on Fuel."""
     name = printable(unquote(uri.strip()))
     parts = [part for part in name.split("/") if part]
     if name.startswith(("http://", "https://")) and len(parts) >= 6:

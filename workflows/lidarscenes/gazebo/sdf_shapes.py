@@ -1,4 +1,4 @@
-"""Convert SDFormat shapes to meshes: primitives, polylines, height maps, and roads."""
+"""Convert SDFormat primitives, polylines, height maps, and roads to meshes."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _plane(shape: Element) -> SceneMesh | None:
 
 
 def _from_z(normal: Floats) -> Floats:
-    """Return the shortest rotation (3, 3) from the z axis to a unit vector (3,)."""
+    """Return the shortest rotation from the z axis to a unit vector."""
     x, y, z = normal.tolist()
     if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
@@ -143,7 +143,7 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
 
 
 def _ring(polyline: Element) -> Floats:
-    """Return the points (n, 2) of a polyline without repetitions."""
+    """Return the points of a polyline without repetitions."""
     texts = [point.text or "" for point in polyline.findall("point")]
     points = np.array([parse_numbers(text, "<point>", 2) for text in texts]).reshape(-1, 2)
     follows = np.ones(len(points), np.bool_)
@@ -153,7 +153,7 @@ def _ring(polyline: Element) -> Floats:
 
 
 def _area(ring: Floats) -> float:
-    """Return the signed area of a ring (n, 2), positive if it is counterclockwise."""
+    """Return the signed area of a ring, which is positive if the ring is counterclockwise."""
     x, y = (ring - ring[0]).T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 
@@ -173,7 +173,7 @@ def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
 
 
 def _contains(ring: Floats, point: Floats) -> bool:
-    """Return True if a point (2,) is inside a ring (n, 2)."""
+    """Return whether a point is inside a ring."""
     a = ring - point
     b = np.roll(a, -1, axis=0)
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
@@ -182,7 +182,7 @@ def _contains(ring: Floats, point: Floats) -> bool:
 
 
 def _wall(ring: Ints, above: int) -> Ints:
-    """Return the faces (2n, 3) between two rings of vertices.
+    """Return the faces between two rings of vertices.
 
     `ring` (n,) contains the vertices of the first ring. The vertices of the second ring have the
     same order and are `above` larger.

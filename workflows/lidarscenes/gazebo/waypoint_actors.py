@@ -65,7 +65,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
-    """Return the times (k,) in seconds and the poses (k, 4, 4) of an actor.
+    """Return the times in seconds and the poses of an actor.
 
     A stationary actor has a single pose.
     """
@@ -90,7 +90,7 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
 
 
 def _waypoint_pose(waypoint: Element) -> Floats:
-    """Return the pose (4, 4) of a waypoint in the world.
+    """Return the pose of a waypoint in the world.
 
     Raises LidarError if the waypoint has no pose.
     """

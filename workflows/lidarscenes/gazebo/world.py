@@ -1,8 +1,8 @@
 """Read Gazebo worlds and models (.sdf and .world) as scenes.
 
 The reader follows the specification of SDFormat 1.12 (http://sdformat.org/spec) and, where it is
-ambiguous, the behavior of Gazebo. No package on PyPI reads SDFormat; libsdformat is only available
-as a part of Gazebo.
+ambiguous, the behavior of Gazebo. No package on PyPI reads SDFormat, and libsdformat is only
+available as a part of Gazebo.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class World:
     def _placed_links(self) -> Iterator[PlacedLink]:
         """Yield the links of all models, with poses from the state where it has any."""
         state = self.state
-        # Models with the names, the matrix, and the outermost matrix of their enclosing models
+        # Models with the names, the matrix, and the outermost matrix of their enclosing models.
         stack: list[tuple[PlacedModel, tuple[str, ...], Floats | None, Floats | None]] = [
             (child, (), None, None)
             for child in reversed(self.body.children)
@@ -147,7 +147,7 @@ class PlacedObject(NamedTuple):
 
 
 def is_in_reach(matrix: Floats) -> bool:
-    """Return True if the position of a matrix (4, 4) is finite and plausible for a world."""
+    """Return whether the position of a matrix is finite and plausible for a world."""
     return bool(np.isfinite(matrix).all() and (np.abs(matrix[:3, 3]) < _REACH_M).all())
 
 

@@ -153,12 +153,12 @@ def read_flag(values: dict[str, str], name: str, default: bool) -> bool:
 
 
 def read_vector(values: Element | dict[str, str] | None) -> Floats:
-    """Return the attributes x, y, and z as an array (3,), with zeros for missing attributes."""
+    """Return the attributes x, y, and z as an array, with zeros for missing attributes."""
     return np.array([read_number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
 def read_rotation(element: Element | None) -> Floats:
-    """Return the product (3, 3) of the <rot> rotations in an element, in their order.
+    """Return the product of the <rot> rotations in an element, in their order.
 
     The axes are fixed unless the element states ``rotations="local"``, in which case each rotation
     is about the axes that the previous rotations have rotated.

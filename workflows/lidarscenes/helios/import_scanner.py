@@ -32,7 +32,10 @@ _MAX_NAMES = 12  # maximum number of scanners in a message
 
 
 class _Reference(NamedTuple):
-    """A reference to a scanner: FILE.xml#ID, or FILE.xml if the file has a single scanner."""
+    """A reference to a scanner, such as FILE.xml#ID.
+
+    The ID can be omitted if the file has a single scanner.
+    """
 
     file: Path
     scanner: str  # ID of the scanner, or empty
@@ -59,7 +62,7 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     """Write a HELIOS++ scanner as a scenario.
 
     The folder gets `scenario.yaml`, with the scene of `lidarpool demo`, and the data files of the
-    sensors. The axes are converted: y in HELIOS++ becomes x.
+    sensors. The axes are converted, so that y in HELIOS++ becomes x.
 
     Parameters
     ----------

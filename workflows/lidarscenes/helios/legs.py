@@ -206,7 +206,7 @@ def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
-    """Return a platform rotation (3, 3) for angles in degrees, as HELIOS++ interprets them."""
+    """Return a platform rotation for angles in degrees, as HELIOS++ interprets them."""
     if kind == "CANONICAL":
         return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":

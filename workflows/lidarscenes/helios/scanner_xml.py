@@ -1,4 +1,4 @@
-"""Convert HELIOS++ scanners to sensors: data files, and rotations on their platforms.
+"""Convert HELIOS++ scanners to sensors with data files and rotations on their platforms.
 
 HELIOS++ scanners look along y, with z up and x to the right. Mirrors and heads move by a step
 between two pulses. This is reproduced, including the rounding to whole pulses per scan line.
@@ -28,7 +28,8 @@ _LINE = rotation_about(np.array([1.0, 0.0, 0.0]), 90)
 _CONE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
-_HEAD_STEP_DEG = 10.0  # maximum rotation per scan with a head; without, it is a full cycle
+# Maximum rotation per scan with a head. A scan without a head is a full cycle.
+_HEAD_STEP_DEG = 10.0
 _FRAME_HZ = 10.0  # arbitrary, because prism patterns do not repeat
 _SLACK = 1e-9  # tolerance for divisions whose exact results are integers
 
@@ -229,7 +230,7 @@ class _Aim(NamedTuple):
 
 
 def _aim(emitter: Floats) -> _Aim | None:
-    """Decompose a rotation (3, 3), or return None if it includes a roll."""
+    """Decompose a rotation, or return None if it includes a roll."""
     if abs(emitter[2, 0]) > 1e-12:
         return None
     tilt = np.arctan2(emitter[2, 1], emitter[2, 2])

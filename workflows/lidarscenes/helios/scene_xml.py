@@ -39,7 +39,7 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 @dataclass
 class HeliosPart:
-    """A mesh file in a scene with its placement: rotation, scale, and translation."""
+    """A mesh file in a scene with its rotation, scale, and translation."""
 
     assets: Assets
     file: Path
@@ -97,7 +97,7 @@ class HeliosPart:
 
     @property
     def is_ground(self) -> bool:
-        """Whether platforms and other parts can stand on the part."""
+        """Whether the part is ground for platforms and other parts."""
         if self.surfels is not None and self.library is None:
             return True
         grounds = (values.get("isGround", "").lower() for values in self.materials.values())
@@ -220,7 +220,10 @@ class HeliosScene:
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """Return the entries of `materials` for all objects, or for their faces if these differ."""
+        """Return the entries of `materials` for all objects.
+
+        Objects whose faces differ have an entry for each of their materials.
+        """
         spectra = partial(self._reflectance, wavelength_nm)
         kinds = [part.material_fields(spectra) for part in self.parts]
         if not any(kind for part_kinds in kinds for kind in part_kinds.values()):
@@ -364,7 +367,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
-    """Return the points (n, 3) in a file and the cell size of its surfels, both in meters."""
+    """Return the points in a file and the cell size of its surfels, both in meters."""
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read_file(path).decode("utf-8", "replace").translate(separators).splitlines()
     if not any(line.partition("//")[0].strip() for line in lines):

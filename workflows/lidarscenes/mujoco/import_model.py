@@ -29,9 +29,9 @@ from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, seen_geoms
 from ..writers.lidar_scenario import Lidar, rounded, write_scenario
 from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
 
-_RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
-_SITE = 6  # mjOBJ_SITE, of sensor_objtype
-_ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC, of cam_projection
+_RANGEFINDER = 7  # mjSENS_RANGEFINDER in sensor_type
+_SITE = 6  # mjOBJ_SITE in sensor_objtype
+_ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC in cam_projection
 _MAX_RAYS = 65_536  # maximum number of rays of a camera
 _MAX_RATE_HZ = 1e6
 
@@ -41,13 +41,13 @@ class _Group(NamedTuple):
 
     body: int  # body that carries the rangefinders
     camera: int | None  # camera of the beams; None for beams of sites
-    cutoff_m: float  # 0 for none
+    cutoff_m: float  # 0 if there is no cutoff
     noise_m: float  # standard deviation
     rate_hz: float
 
 
 def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a model as a scenario: `scenario.yaml`, and a data file for each sensor.
+    """Write a model as a scenario, with a `scenario.yaml` file and a data file for each sensor.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _groups(model: Any) -> dict[_Group, list[int]]:
 
 
 def _rate_hz(model: Any, sensor: int) -> float:
-    """Return the measurement rate of a sensor: its own, or that of the simulation steps."""
+    """Return the measurement rate of a sensor, by default that of the simulation steps."""
     intervals = getattr(model, "sensor_interval", None)  # since MuJoCo 4
     interval_s = 0.0 if intervals is None else float(np.atleast_1d(intervals[sensor])[0])
     interval_s = interval_s if interval_s > 0 else model.timestep_s
@@ -188,7 +188,7 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
 
 
 def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats, Floats]:
-    """Return the frame (4, 4) of a sensor in the world, and its beam origins and directions (k, 3).
+    """Return the frame of a sensor in the world, and its beam origins and directions.
 
     For sites, the frame has the axes of the body, and its origin is the mean position of the sites.
     For a camera, the frame looks along x, with z pointing up in the image.
@@ -211,7 +211,7 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
 
 
 def _pixel_directions(model: Any, camera: int) -> Floats:
-    """Return the ray directions (pixels, 3) of a camera, row by row, with x forward and z up."""
+    """Return the ray directions of a camera, row by row, with x forward and z up."""
     width, height = model.cam_resolution[camera].tolist()
     sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
     row, column = np.divmod(np.arange(width * height), width)
@@ -235,7 +235,7 @@ def _degrees(angles: Floats) -> list[float]:
 
 
 def _unusable(model: Any, camera: int | None) -> str:
-    """Return why a camera cannot become a sensor, or an empty string."""
+    """Return the reason why a camera cannot become a sensor, or an empty string."""
     if camera is None:
         return ""
     projections = getattr(model, "cam_projection", None)

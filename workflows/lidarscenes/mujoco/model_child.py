@@ -1,4 +1,4 @@
-"""Read a MuJoCo model in the process that `model_file.py` starts; this is a script, not a module.
+"""Script that reads a MuJoCo model in the process that `model_file.py` starts.
 
 Invalid files can crash the process, and some models need unlimited memory. Here, this affects only
 this process. The script imports nothing from lidarpool. It writes one frame to standard output: a
@@ -40,7 +40,7 @@ _OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
 
 
 class NoKeyframeError(Exception):
-    """The model lacks a keyframe.
+    """Raised if the model lacks a keyframe.
 
     The argument of the error is the list of the existing keyframes.
     """

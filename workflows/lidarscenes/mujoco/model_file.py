@@ -1,6 +1,6 @@
 """Read MuJoCo models (MJCF) as scenes of the geoms that a lidar sees in the initial state.
 
-MuJoCo itself (Apache-2.0) reads the files in a separate process; see `model_child.py`. Geoms are
+MuJoCo itself (Apache-2.0) reads the files in a separate process (see `model_child.py`). Geoms are
 converted to meshes as in `lidarsim.worlds.MujocoScanner`.
 """
 
@@ -180,7 +180,7 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
 def _choice(
     model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]
 ) -> BodySelection:
-    """Return which parts of a model are visible.
+    """Return the visible parts of a model.
 
     Raises MeshFileError if there are too many geoms.
     """
@@ -232,7 +232,7 @@ def _named_geoms_of_world(model: Any) -> list[int]:
 
 
 def body_matrix(model: Any, body: int) -> Floats:
-    """Return the matrix (4, 4) from the frame of a body to the world."""
+    """Return the 4 x 4 matrix from the frame of a body to the world."""
     return affine(model.xmat[body].reshape(3, 3), model.xpos[body])
 
 

@@ -1,4 +1,4 @@
-"""Check the files that a MuJoCo model refers to: included models, meshes, and textures.
+"""Check the included models, meshes, and textures that a MuJoCo model refers to.
 
 MuJoCo opens these files itself. They are checked here first, so that a model reads data only from
 its own folder and from folders that the user allows.

@@ -1,4 +1,4 @@
-"""Generate cars with a few hundred triangles: a body with recessed windows on four wheels."""
+"""Generate cars with recessed windows and four wheels from a few hundred triangles each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 from .city_kinds import lay_down, loft, regular_polygon
 
 _RECESS_M = 0.03  # depth of a window
-_FRAME = 0.12  # width of the frame as a share of the window
+_FRAME = 0.12  # width of the frame as a fraction of the window
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class CarModel:
     stations: tuple[tuple[float, float, float, float], ...]
     glazed: range  # stations that are followed by windows
     axles: tuple[float, float]
-    wheel_m: float = 0.33  # radius
+    wheel_m: float = 0.33  # wheel radius
 
 
 MODELS = (
@@ -66,7 +66,7 @@ MODELS = (
 
 
 def car(model: CarModel) -> SceneMesh:
-    """Return a car that stands on z = 0, centered at the origin.
+    """Return a car with its wheels at z = 0, centered at the origin.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def _body(model: CarModel) -> tuple[Floats, Ints]:
 
 
 def _window(quad: Floats) -> list[Floats]:
-    """Return the quadrilaterals of a window: a pane, the sides of its recess, and a frame."""
+    """Return the quadrilaterals of a window's pane, recess, and frame."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
     hole = quad + _FRAME * (middle - quad)

@@ -33,16 +33,16 @@ _OBJECT = np.dtype({
 CLASSES = ("pavement", "building", "tree", "car", "lamp")
 PAVEMENT, BUILDING, TREE, CAR, LAMP = range(len(CLASSES))
 
-_GROUND_SHARE = 0.03  # minimum share of the triangles that are used for the ground
+_GROUND_SHARE = 0.03  # minimum fraction of the triangles that are used for the ground
 _MARGIN_M = 12.0
 _STREET_M = 13.0
 _AVENUE_M = 24.0
 _AVENUE_EVERY = 4
 _BLOCK_M = ((60.0, 100.0), (46.0, 62.0))  # along x, along y
-_PAVEMENT_M = 3.5  # width
+_PAVEMENT_M = 3.5  # width of the pavement
 _CURB_M = 0.15  # height of the pavement
 _LOT_M = 16.5
-_PARKS = 0.09  # share of the blocks
+_PARKS = 0.09  # fraction of the blocks that are parks
 
 
 def city(
@@ -54,14 +54,14 @@ def city(
     """Return a city with a given number of triangles.
 
     More triangles make the city larger, not finer. There is a crossing at (0, 0), where a sensor
-    may stand. The ground at z = 0 is an object, and so is the pavement of all blocks. Each
+    can be placed. The ground at z = 0 is an object, and so is the pavement of all blocks. Each
     building, tree, car, and street lamp is an object with a number counted from the center, such as
     building-12.
 
     Parameters
     ----------
     triangles
-        Number of triangles; the scene has up to 2 % fewer.
+        Number of triangles. The scene has up to 2 % fewer triangles.
     seed
         Seed of the random generator. The same arguments always result in the same city.
     trees
@@ -167,7 +167,7 @@ def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
 
 
 def _copies(solid: Solid, objects: AnyArray) -> Floats:
-    """Return the vertices (objects, v, 3) of the copies of a solid, in meters."""
+    """Return the vertices of the copies of a solid, in meters. Shape (objects, v, 3)."""
     vertices = solid.vertices * objects["scale"][:, None]
     cos = np.cos(objects["yaw"])[:, None]
     sin = np.sin(objects["yaw"])[:, None]
@@ -232,7 +232,7 @@ class _CityBlocks:
         self._lay_blocks(rings)
 
     def _lay_blocks(self, rings: int) -> None:
-        """Set the centers and sizes (n, 2) of the blocks, from the center outward."""
+        """Set the centers and sizes of the blocks, from the center outward."""
         spans = []
         for min_m, max_m in _BLOCK_M:
             halves = []
@@ -255,7 +255,7 @@ class _CityBlocks:
         self._park = park
 
     def objects(self) -> AnyArray:
-        """Return all objects by block: the pavement, followed by the others in random order."""
+        """Return all objects by block, with the pavement followed by the others in random order."""
         n = len(self._middle)
         slab = np.column_stack([self._size, np.ones(n)])
         objects = np.concatenate(
@@ -341,7 +341,7 @@ class _CityBlocks:
         )
 
     def _towers(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return towers on the lots with the given indices (n,)."""
+        """Return towers on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         height = np.clip(lots.centrality[lot_indices] * rng.uniform(0.2, 1.15, n), 0, 0.999)
@@ -368,7 +368,7 @@ class _CityBlocks:
         )
 
     def _houses(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return houses on the lots with the given indices (n,)."""
+        """Return houses on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         kind = rng.integers(self._count["house"], size=n)
@@ -387,7 +387,7 @@ class _CityBlocks:
         )
 
     def _yard_trees(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return trees behind houses on the lots with the given indices (n,)."""
+        """Return trees behind houses on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         depth = rng.uniform(0.72, 0.95, n) * lots.size[lot_indices, 1]
@@ -408,7 +408,7 @@ class _CityBlocks:
         return self._trees(block, xy)
 
     def _trees(self, block: Ints, xy: Floats) -> AnyArray:
-        """Return trees at positions (n, 2) in blocks (n,)."""
+        """Return trees at positions in blocks."""
         rng = self._rng
         n = len(block)
         kind = rng.integers(self._count["tree"], size=n)

@@ -15,16 +15,16 @@ from .plants import SCALES, SPECIES, all_trees, place_instances
 
 MAX_CARS = 50_000
 
-# Along the edges of a block, in meters: distance between positions, inward offset from the edge,
-# and free space at corners.
+# Distance between positions along the edges of a block, inward offset from the edge, and free space
+# at corners, in meters.
 _TREE_APART_M = 7.0
 _TREE_INWARD_M = 1.3
 _TREE_CORNER_M = 5.0
 _CAR_APART_M = 6.5
 _CAR_INWARD_M = -1.3
 _CAR_CORNER_M = 8.0
-_CAR_SHIFT_M = 0.5  # maximum, along the street
-_CURB_ON_RIGHT = 0.9  # share of cars with the curb on their right
+_CAR_SHIFT_M = 0.5  # maximum shift along the street
+_CURB_ON_RIGHT = 0.9  # fraction of cars with the curb on their right
 _STREET_REACH_M = 3.5  # maximum crown radius at streets, which keeps the center of the road free
 # Yards and parks have at most one tree per cell, in its central part.
 _YARD_M = 6.0
@@ -108,7 +108,7 @@ def _tree_sites(
 
 
 def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
-    """Place cars along the curbs of blocks (b, 2, 2), which are given by their centers and sizes.
+    """Place cars along the curbs of blocks, which are given by their centers and sizes.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
 
 def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) -> Ints:
-    """Choose `count` distinct rows at random, with probabilities proportional to weights (n,).
+    """Choose `count` distinct rows at random, with probabilities proportional to weights.
 
     Raises LidarError if there are fewer rows.
     """
@@ -153,7 +153,7 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
 def _street_positions(
     size: Floats, spacing: float, inward: float, corner: float
 ) -> tuple[Floats, Floats]:
-    """Return positions (n, 2) along the edges of a block centered at the origin, and yaws (n,).
+    """Return positions along the edges of a block centered at the origin, and yaws.
 
     A car that faces the direction of its yaw has the block on its right.
     """
@@ -175,7 +175,7 @@ def _street_positions(
 
 
 def _yard_positions(size: Floats, rng: np.random.Generator) -> Floats:
-    """Return positions (n, 2) in a block centered at the origin, behind its street trees."""
+    """Return positions in a block centered at the origin, behind its street trees."""
     inner = size - 2 * (_TREE_INWARD_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)
     cells = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij"), axis=-1)

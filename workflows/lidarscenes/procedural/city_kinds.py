@@ -15,7 +15,7 @@ from lidarsim.scene.shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles of an object that stands on z = 0, in local coordinates in meters.
+    """Triangles of an object whose base is at z = 0, in local coordinates in meters.
 
     `vertices` are float64 (v, 3), and `faces` int64 (f, 3), counterclockwise as seen from outside.
     """
@@ -45,7 +45,7 @@ def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
 
 
 def _towers() -> list[Solid]:
-    """Return office towers with `TOWER_FLOORS` floors: square, stepped, round, and L-shaped."""
+    """Return square, stepped, round, and L-shaped office towers with `TOWER_FLOORS` floors."""
     corner = np.array([[0, 0], [0, 8], [-9, 8], [-9, -8], [9, -8], [9, 0]], dtype=np.float64)
     return [
         tower
@@ -248,12 +248,12 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """Return the outline (4, 2) of a rectangle centered at the origin."""
+    """Return the outline of a rectangle centered at the origin. Shape (4, 2)."""
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
 
 
 def regular_polygon(sides: int, radius: float) -> Floats:
-    """Return the outline (sides, 2) of a regular polygon centered at the origin."""
+    """Return the outline of a regular polygon centered at the origin. Shape (sides, 2)."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 

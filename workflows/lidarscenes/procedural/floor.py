@@ -1,4 +1,4 @@
-"""Find the floor below a position, where a sensor stands, and the ceiling above it."""
+"""Find the floor below the position of a sensor, and the ceiling above it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.scene.scene import Scene
 
-# Maximum thickness of a floor slab. Sensors stand inside thicker objects, such as a hall.
+# Maximum thickness of a floor slab. Sensors can be inside thicker objects, such as a hall.
 SLAB_M = 0.5
 FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 
@@ -29,13 +29,13 @@ def floor_and_ceiling(scene: Scene, x: float, y: float) -> tuple[float, float]:
 
 
 def surface_heights(scene: Scene, x: float, y: float) -> Floats:
-    """Return the world heights (k,) at which a vertical line at x, y crosses triangles."""
+    """Return the world heights at which a vertical line at x, y crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
 def triangles_in_box(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
-    """Return the indices (k,) of the triangles whose bounding boxes overlap a box.
+    """Return the indices of the triangles whose bounding boxes overlap a box.
 
     The corners of the box are local coordinates of shape (3,), or (2,) for any height.
     """
@@ -51,7 +51,7 @@ def triangles_in_box(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indice
 
 
 def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
-    """Return the heights (k,) at which a vertical line crosses triangles.
+    """Return the heights at which a vertical line crosses triangles.
 
     The line is at a local position (2,). The second result is a mask (k,) of the triangles that
     face up.
@@ -68,7 +68,7 @@ def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
 
 
 def _areas(p: Floats, q: Floats, position: Floats) -> Floats:
-    """Return twice the signed areas (f,) of the triangles p, q, position in plan view.
+    """Return twice the signed areas of the triangles p, q, position in plan view.
 
     Counterclockwise triangles have positive areas.
     """

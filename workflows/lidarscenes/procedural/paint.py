@@ -51,7 +51,7 @@ def paint_scene(scene: Scene) -> Scene:
     faces = _face_geometry(scene)
 
     def paint(kind: str, mask: Bools, color: str) -> None:
-        """Paint the faces of a kind that are selected by a mask (f,)."""
+        """Paint the faces of a kind that are selected by a mask."""
         image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[color]
 
     paint("building", faces.up > _UP, "tiles")
@@ -88,7 +88,7 @@ def _face_geometry(scene: Scene) -> _FaceGeometry:
 
 
 def _part_paint(faces: Ints32, number: int) -> Ints32:
-    """Return the paints (f,) of an instanced mesh, which is a tree with leaves or a car."""
+    """Return the paints of an instanced mesh, which is a tree with leaves or a car."""
     # Leaves do not share vertices with other triangles. Cars have no leaves.
     leaf = np.bincount(faces.ravel())[faces].max(axis=1) == 1
     if leaf.any():

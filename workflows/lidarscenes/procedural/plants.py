@@ -1,4 +1,4 @@
-"""Generate trees with trunk, branches, twigs, and leaves as single triangles.
+"""Generate trees with a trunk, branches, twigs, and leaves that are single triangles.
 
 Following Weber and Penn (1995), a stem carries branches, branches carry twigs, and twigs carry
 leaves, in the proportions of a species. A triangle is larger than a real leaf, so that a few of
@@ -73,7 +73,7 @@ SPECIES = (
 
 
 def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
-    """Return a tree that stands at the origin.
+    """Return a tree with its base at the origin.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def place_instances(
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the points (k, 3) and radii (k,) of a stem from the root to the top, in meters."""
+    """Return the points and radii of a stem from the root to the top, in meters."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -155,7 +155,7 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the points (n, k, 3) and radii (n, k) of branches, in meters."""
+    """Return the points and radii of branches, in meters."""
     n = species.branches
     share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
@@ -180,7 +180,7 @@ def _branches(
 
 
 def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the heights (n,) of branches as fractions of the crown, and their lengths (n,).
+    """Return the heights of branches as fractions of the crown, and their lengths.
 
     Branches are denser where they are long, so that they fill the crown evenly.
     """
@@ -193,7 +193,7 @@ def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, 
 
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
-    """Return the ends (n, 2, 3) of twigs, which grow from the outer parts of branches."""
+    """Return the ends of twigs, which grow from the outer parts of branches. Shape (n, 2, 3)."""
     n = len(branches)
     m = species.twigs
     share = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
@@ -211,7 +211,7 @@ def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floa
 
 
 def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Return the vertices and faces of separate leaves around twigs (n, 2, 3)."""
+    """Return the vertices and faces of separate leaves around twigs."""
     n = len(twigs)
     m = species.leaves
     length, width = species.leaf_m
@@ -228,7 +228,7 @@ def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[
 
 
 def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
-    """Return the vertices and faces of open tubes along paths (n, k, 3) with radii (n, k)."""
+    """Return the vertices and faces of open tubes along paths with the given radii."""
     n, k = radii.shape
     tangents = _unit(np.gradient(paths, axis=1))
     # Use the same reference axis along a tube, so that the tube is not twisted.

@@ -14,13 +14,13 @@ from raybeam import RayCaster, available_backends
 
 from .floor import triangles_in_box
 
-RAYS = 1000  # rays from each position, and from outside
+RAYS = 1000  # number of rays from each position, and from outside
 HAND_M = 0.1  # closer hits are ignored
 CLEAR_M = 0.5  # required clearance around a sensor
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
-# Shares of rays. Of the downward rays from 1, 2, and 3 m above a patch of ground 5 m wide, a share
-# of 0.4 hits the patch.
+# Fractions of rays. Of the downward rays from 1, 2, and 3 m above a patch of ground 5 m wide, a
+# fraction of 0.4 hits the patch.
 _GROUND = 0.4
 _SKY = 0.3
 _ENCLOSED = 0.95
@@ -32,25 +32,27 @@ _LEAVES = 0.4  # maximum openness of leaves
 # Limits for a room, which is a closed body with a floor and upright walls inside.
 _MIN_ROOM_WIDTH_M = 2.0
 _MAX_ROOM_HEIGHT_M = 15.0
-_WHOLE = 0.9  # a body that spans this share of each side is the whole scene
-# A room spans at least this share of the scene along each axis. Smaller bodies are objects in it.
+_WHOLE = 0.9  # a body that spans this fraction of each side is the whole scene
+# A room spans at least this fraction of the scene along each axis. Smaller bodies are objects in
+# it.
 _SPANS = 1 / 3
-# Limits for the z of directions: more than 10 degrees above the horizon, within 60 degrees of
-# straight up, and within 30 degrees of straight down. The shares are of rays that hit a cover.
+# Limits for the z component of directions more than 10 degrees above the horizon, within 60 degrees
+# of straight up, and within 30 degrees of straight down. The fractions apply to the rays that hit a
+# cover.
 _RAISED = 0.17
 _UPWARD = 0.5
 _DOWNWARD = -0.87
 _COVERED = 0.9
 _WIDELY_COVERED = 0.95
-# Minimum share of directions with surfaces inside a body. A flat surface covers at most half.
+# Minimum fraction of directions with surfaces inside a body. A flat surface covers at most half.
 _AROUND = 0.6
-# Distances and number of directions in which free positions are searched for.
+# Distances, and number of directions, at which free positions are searched for.
 _STEPS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 _DIRECTIONS = 16
 
 
 def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
-    """Return True if a surface is within `CLEAR_M` of any of the local positions (k, 3)."""
+    """Return True if a surface is within `CLEAR_M` of any of the local positions."""
     points = np.asarray(positions, np.float64).reshape(-1, 3)
     nearby = triangles_in_box(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
     if not len(nearby):
@@ -72,7 +74,7 @@ class Views:
 
     @property
     def hit(self) -> Bools:
-        """Mask (n,) of the rays that hit a surface at a distance of more than `HAND_M`."""
+        """Mask of the rays that hit a surface at a distance of more than `HAND_M`."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
@@ -101,7 +103,7 @@ class PlacementChecker:
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
     def cast_around(self, positions: ArrayLike) -> Views:
-        """Cast rays in all directions from local positions (k, 3)."""
+        """Cast rays in all directions from local positions."""
         points = np.asarray(positions, np.float64).reshape(-1, 3)
         directions = sphere_directions(RAYS)
         return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
@@ -140,7 +142,7 @@ class PlacementChecker:
         return not self._is_room(views)
 
     def is_inside_body(self, position: ArrayLike) -> bool:
-        """Return whether a local position (3,) is inside a closed body that is not a room.
+        """Return whether a local position is inside a closed body that is not a room.
 
         A body that stands on the ground may lack a bottom.
         """
@@ -229,7 +231,7 @@ class PlacementChecker:
         return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:
-        """Cast rays from local origins (n, 3) along unit directions (n, 3)."""
+        """Cast rays from local origins along unit directions."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -241,7 +243,7 @@ class PlacementChecker:
 
 
 def _is_level(views: Views) -> Bools:
-    """Return a mask (n,) of the rays that hit level surfaces."""
+    """Return a mask of the rays that hit level surfaces."""
     return np.asarray(np.abs(views.normals[:, 2]) > 0.99)
 
 
@@ -277,7 +279,7 @@ def _openness(scene: Scene) -> float:
 
 
 def sphere_directions(count: int) -> Floats:
-    """Return unit vectors (count, 3), evenly distributed over a sphere along a Fibonacci spiral."""
+    """Return unit vectors, evenly distributed over a sphere along a Fibonacci spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count
     angle = np.pi * (1 + np.sqrt(5)) * numbers

@@ -23,11 +23,11 @@ _RELIEF = 0.16  # maximum height divided by the side length
 _CELL_M = 5.0
 _MAX_CELLS = 1_000
 _TRIED = 4  # positions that are tried in a cell
-_MIDDLE = 0.4  # size of the central part as a share of the cell
+_MIDDLE = 0.4  # size of the central part as a fraction of the cell
 _STEEPEST = np.tan(np.radians(40.0))
 _ROOT_M = 0.6
 _EDGE_M = 5.0  # margin of the terrain without trees
-_GLADE_M = 12.0  # radius without trees around the center, where a sensor stands by default
+_GLADE_M = 12.0  # radius without trees around the center, which is the default position of a sensor
 _WOODS_M = 120.0  # size of woods
 _WOOD_CELLS = 20  # minimum size of woods in cells
 _DENSER = 5.0  # logarithm of the density ratio between woods and open land
@@ -48,7 +48,8 @@ def terrain(
     Parameters
     ----------
     triangles
-        Number of triangles. The terrain is a complete grid, so it has up to a row fewer.
+        Number of triangles. The terrain is a complete grid, so it may have up to one row of
+        triangles fewer.
     seed
         Seed of the random generator. The same arguments always result in the same terrain.
     side_m
@@ -118,7 +119,7 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
 def _flattest_positions(
     heights: Floats, side_m: float, cells: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the flattest of several random positions (cells², 3) in each cell, and its slope."""
+    """Return the flattest of several random positions in each cell, and its slope."""
     number = np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), axis=-1)
     inside = 0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_TRIED, cells * cells, 2))
     shares = (number.reshape(-1, 2) + inside) / max(cells, 1)
@@ -129,7 +130,7 @@ def _flattest_positions(
 
 
 def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, Floats]:
-    """Return the heights and slopes of the terrain at fractions (..., 2) of the sides."""
+    """Return the heights and slopes of the terrain at fractions of the sides."""
     size = np.array(heights.shape) - 1
     grid_position = share * size
     i, j = np.moveaxis(np.minimum(grid_position.astype(np.int64), size - 1), -1, 0)
@@ -145,7 +146,7 @@ def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, F
 
 
 def grid_faces(column_count: int, row_count: int) -> Ints:
-    """Return two triangles for each cell of a grid, shape (columns * rows, 2, 3).
+    """Return two triangles for each cell of a grid. Shape (columns * rows, 2, 3).
 
     The grid has (columns + 1) x (rows + 1) points.
     """
@@ -157,7 +158,7 @@ def grid_faces(column_count: int, row_count: int) -> Ints:
 
 
 def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
-    """Return heights (len(x), len(y)) from 0 to `_RELIEF` on a grid from 0 to 1."""
+    """Return heights from 0 to `_RELIEF` on a grid from 0 to 1. Shape (len(x), len(y))."""
     total = np.zeros((len(x), len(y)))
     damping = np.ones_like(total)
     for octave in range(_OCTAVES):
@@ -175,7 +176,7 @@ def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _noise(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
-    """Return gradient noise (len(x), len(y)) on a grid, with values of about -1 to 1.
+    """Return gradient noise on a grid, with values of about -1 to 1. Shape (len(x), len(y)).
 
     The gradients are at integer coordinates.
     """

@@ -16,17 +16,17 @@ from lidarsim.io.allowance import Allowance
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 
 GAP_M = 1e-6  # starts of pieces that are closer together count as one
-HEIGHT_SHARE = 0.1  # height tolerance as a share of the tolerance in plan
+HEIGHT_SHARE = 0.1  # height tolerance as a fraction of the tolerance in plan
 SAMPLES = 5  # points in an interval for measuring curvatures
 _MAX_SAMPLED_M = 30.0  # maximum length of a sampled interval
 _MAX_CUTS = 64  # maximum number of parts of a longer interval
 MAX_STEPS = 1e9  # maximum number of parts of an interval, more than fit into memory
 _GROUP_SIZE = 1 << 17  # number of coordinates that are measured together
-_STEP_SHARE = 0.01  # smallest step that gets two stations, as a share of the tolerance in plan
-_MARGIN = 0.94  # share of the tolerance to use, because samples underestimate the error
+_STEP_SHARE = 0.01  # smallest step that gets two stations, as a fraction of the tolerance in plan
+_MARGIN = 0.94  # fraction of the tolerance to use, because samples underestimate the error
 _LEAST_WIDTH_M = 1e-4  # narrower cells have no reliable slope across the road
 _MAX_STEEPENING = 10.0  # limits slopes where a road turns about a point on its surface
-_FOLDED_SHARE = 0.3  # cells that are folded by a larger share have no unique height
+_FOLDED_SHARE = 0.3  # cells that are folded by a larger fraction have no unique height
 # Weights that extrapolate a parabola from three values by one sample and by half a sample.
 _FROM_MIDDLE = np.array([3.0, -3.0, 1.0])
 _FROM_PARTS = np.array([1.875, -1.25, 0.375])
@@ -51,7 +51,7 @@ class RoadStations:
 
     @classmethod
     def at(cls, distances: Floats) -> RoadStations:
-        """Return stations at distances (k,), with values from after any steps."""
+        """Return stations at distances, with values from after any steps."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
@@ -165,9 +165,9 @@ class Intervals:
         return len(self.ends)
 
     def samples(self, count: int) -> RoadStations:
-        """Return `count` evenly spaced stations in each interval, shape (n * count,).
+        """Return `count` evenly spaced stations in each interval.
 
-        They include the start and the stop of the interval.
+        The result has shape (n * count,) and includes the start and the stop of each interval.
         """
         starts = self.ends[:, :1]
         s = starts + (self.ends[:, 1:] - starts) * np.linspace(0, 1, count)
@@ -212,7 +212,7 @@ class SampledSurface(NamedTuple):
     height_m: float  # height tolerance in meters
 
     def is_step(self, sag_m: float) -> Bools:
-        """Return a mask (n,) of the intervals with a step of the surface at their stop."""
+        """Return a mask of the intervals with a step of the surface at their stop."""
         count = len(self.intervals)
         if count < 2:
             return np.zeros(count, np.bool_)
@@ -223,7 +223,10 @@ class SampledSurface(NamedTuple):
 
     @property
     def is_measured(self) -> bool:
-        """Whether there are enough samples to measure curvatures; planes have two per interval."""
+        """Whether there are enough samples to measure curvatures.
+
+        Planes have two samples per interval.
+        """
         return len(self.points) > 0 and self.points.shape[1] == SAMPLES * len(self.intervals)
 
     def parts(self) -> Iterator[SampledSurface]:
@@ -292,13 +295,13 @@ def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> 
 
 
 def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats]:
-    """Return the numbers of parts (n,) into which to divide the intervals of each surface.
+    """Return the numbers of parts into which to divide the intervals of each surface.
 
     The numbers are not rounded. Triangles between two cross sections deviate from the surface for
-    two reasons: the bend along the road, which decreases with the square of the distance, and the
-    twist between two columns, which decreases with the distance. Both are measured as height
-    differences at the same position in plan: a chord that is beside a curve is also too high or too
-    low on a road that slopes sideways.
+    two reasons. These are the bend along the road, which decreases with the square of the distance,
+    and the twist between two columns, which decreases with the distance. Both are measured as
+    height differences at the same position in plan, because a chord beside a curve is also too high
+    or too low on a road that slopes sideways.
     """
     if not surfaces:
         return []
@@ -346,15 +349,15 @@ class _Columns(NamedTuple):
         return cls(count, *(np.concatenate(arrays) for arrays in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest column value (r, k) in each interval (n,), as `_largest` does."""
+        """Return the largest column value in each interval, as `_largest` does."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest cell value (q, k) in each interval (n,), as `_largest` does."""
+        """Return the largest cell value in each interval, as `_largest` does."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:
-        """Return the largest magnitude (n,) of the values in each interval.
+        """Return the largest magnitude of the values in each interval.
 
         Row j of the values (m, k) contains k samples along the interval `intervals[j]`. The weights
         `ends` (3,) extrapolate the first three values to the start of the interval and, in reverse
@@ -370,7 +373,7 @@ class _Columns(NamedTuple):
 
 
 def has_extent(points: Floats, faces: Ints) -> Bools:
-    """Return a mask of the triangles (f, 3) that are not degenerate."""
+    """Return a mask of the triangles that are not degenerate."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     edges = np.stack([b - a, c - a, c - b])
@@ -379,7 +382,7 @@ def has_extent(points: Floats, faces: Ints) -> Bools:
 
 
 def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Floats, Floats]:
-    """Return the errors (n,) that bends cause in plan and in height, for undivided intervals."""
+    """Return the errors that bends cause in plan and in height, for undivided intervals."""
     # Half of the second differences (r, 3), a quarter of the error of an undivided interval.
     bends = [(v[:, 2:] + v[:, :-2]) / 2 - v[:, 1:-1] for v in (x, y, z)]
     along = [v[:, 2:] - v[:, :-2] for v in (x, y, z)]
@@ -400,7 +403,7 @@ def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Fl
 
 
 def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
-    """Return the height errors (n,) that the twist of cells causes."""
+    """Return the height errors that the twist of cells causes."""
     along = [v[:, 1:] - v[:, :-1] for v in (x, y, z)]
     across = [(v[:, 1:] + v[:, :-1]) / 2 for v in (x, y, z)]
     across = [v[columns.left] - v[columns.right] for v in across]

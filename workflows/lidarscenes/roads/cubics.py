@@ -47,7 +47,7 @@ class Cubics:
         return len(self.starts)
 
     def values(self, stations: RoadStations) -> Floats:
-        """Return the values at stations (k,)."""
+        """Return the values at stations."""
         if not len(self):
             return np.zeros_like(stations.s)
         if self.is_constant and len(self) == 1:
@@ -58,7 +58,7 @@ class Cubics:
         return np.asarray(((d * x + c) * x + b) * x + a)
 
     def slopes(self, stations: RoadStations) -> Floats:
-        """Return the first derivatives at stations (k,)."""
+        """Return the first derivatives at stations."""
         if self.is_constant:
             return np.zeros_like(stations.s)
         row_indices = self._row_indices(stations.pieces)
@@ -67,7 +67,7 @@ class Cubics:
         return np.asarray((3 * d * x + 2 * c) * x + b)
 
     def _row_indices(self, distances: Floats) -> Ints:
-        """Return the indices of the polynomials that are valid at distances (k,)."""
+        """Return the indices of the polynomials that are valid at distances."""
         return np.maximum(np.searchsorted(self.starts, distances, "right") - 1, 0)
 
 

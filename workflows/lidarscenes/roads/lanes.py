@@ -1,4 +1,4 @@
-"""Convert lanes to strips of triangles: lane sections, borders, heights, and curbs.
+"""Convert lanes to strips of triangles, with their borders, heights, and curbs.
 
 `section_surfaces` measures the surface of each lane section at samples, and then places the
 stations of its triangles according to the measured curvatures.
@@ -35,7 +35,7 @@ from .cubics import NO_CUBICS, Cubics
 from .elements import MAX_SHOWN, UnreadElements, read_number
 from .road import Road, RoadFrames, RoadNetwork
 
-_ACROSS_SHARE = 0.3  # share of the height tolerance that is used for curved cross sections
+_ACROSS_SHARE = 0.3  # fraction of the height tolerance that is used for curved cross sections
 _CURB_M = 1e-3  # minimum height of a curb
 _MIN_COLUMNS = 2  # minimum number of point columns in a section with lanes
 _BYTES_PER_POINT = 400  # peak memory per point of a lane
@@ -85,7 +85,7 @@ class Lane:
         return len(self.inner_heights) > 0
 
     def width(self, stations: RoadStations, inner_t: Floats, middle_t: Floats) -> Floats:
-        """Return the width (k,) in meters, which may be negative if the file says so.
+        """Return the width in meters, which is negative where the file defines a negative width.
 
         `inner_t` and `middle_t` (k,) are the t coordinates of the inner border and of the center
         lane.
@@ -143,7 +143,7 @@ class LaneSection:
         return [*self.lanes[1], *self.lanes[-1]]
 
     def borders(self, road: Road, stations: RoadStations) -> dict[int, Floats]:
-        """Return the t coordinates (k,) of the outer lane borders by lane number.
+        """Return the t coordinates of the outer lane borders by lane number.
 
         Number 0 is the center lane.
         """
@@ -200,7 +200,7 @@ class LaneSection:
         return borders, widths
 
     def _crossings(self, road: Road, intervals: Intervals) -> Floats:
-        """Return the distances (x,) at which widths become negative or borders cross kinks."""
+        """Return the distances at which widths become negative or borders cross kinks."""
         kinks = road.kinks(self.start, self.stop) if road.curved_across else np.zeros(0)
         if not len(kinks) and all(
             lane.widths.is_constant and not len(lane.borders) for lane in self.all_lanes
@@ -208,11 +208,11 @@ class LaneSection:
             return kinks
 
         def values(stations: RoadStations) -> Floats:
-            """Return widths and borders (v, k)."""
+            """Return widths and borders. Shape (v, k)."""
             borders, widths = self._borders_and_widths(road, stations)
             return np.stack([*widths.values(), *borders.values()])
 
-        # Pairs of a width or border and a level that it may cross
+        # Pairs of a width or border and a level that it may cross.
         lanes = len(self.all_lanes)
         levels = np.concatenate([np.zeros(lanes), np.tile(kinks, lanes + 1)])
         crossing = np.concatenate(
@@ -238,7 +238,7 @@ class LaneSection:
 
 
 def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) -> Floats:
-    """Return the distances (x,) between bounds at which a predicate changes, by bisection."""
+    """Return the distances between bounds at which a predicate changes, by bisection."""
     is_first = is_above(lower)
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
@@ -331,7 +331,7 @@ class Strip(NamedTuple):
 
     @property
     def faces(self) -> Ints:
-        """Triangles (f, 3), with normals that point up or, for a curb, away from the road."""
+        """Triangles with normals that point up or, for a curb, away from the road. Shape (f, 3)."""
         faces = grid_faces(*self.t.shape)
         if len(self.steps):
             # There is a wall where heights step, but not where only widths step.
@@ -346,7 +346,7 @@ class Strip(NamedTuple):
 
 @lru_cache(maxsize=256)
 def grid_faces(columns: int, stations: int) -> Ints:
-    """Return two triangles for each cell of a grid with columns * stations points, shape (f, 3)."""
+    """Return two triangles for each cell of a grid with columns * stations points."""
     corners = np.arange(columns * stations).reshape(columns, stations)
     a = corners[:-1, :-1]
     b = corners[:-1, 1:]
@@ -395,7 +395,7 @@ class SectionSurface:
         self._allowance = allowance
         self.borders = section.borders(road, self.stations)
         self._lines = self._lines_across()
-        # Points (c, k, 3) of all borders, from right to left, if cross sections are straight
+        # Points (c, k, 3) of all borders, from right to left, if cross sections are straight.
         self._border_points: Floats | None = None
         if not road.curved_across:
             right = [self.borders[lane.number] for lane in section.lanes[-1][::-1]]
@@ -451,7 +451,7 @@ class SectionSurface:
         return surface
 
     def points(self, stations: Ints, t: Floats) -> Floats:
-        """Return points (q, 3) on cross sections, given stations and t coordinates (q,)."""
+        """Return points on cross sections, given stations and t coordinates."""
         frames = self.frames
         count = len(self._points)
         if count < _MIN_COLUMNS:
@@ -469,20 +469,20 @@ class SectionSurface:
 
     @cached_property
     def _t(self) -> Floats:
-        """The t coordinates (c, k) of the points of all strips, from right to left."""
+        """The t coordinates of the points of all strips, from right to left."""
         ordered = [strip.t if strip.lane.side > 0 else strip.t[::-1] for strip in self.strips]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations)))])
 
     @cached_property
     def _points(self) -> Floats:
-        """The points (c, k, 3) of all strips, from right to left."""
+        """The points of all strips, from right to left."""
         ordered = [
             strip.points if strip.lane.side > 0 else strip.points[::-1] for strip in self.strips
         ]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations), 3))])
 
     def _lines_across(self) -> Floats:
-        """Return the ascending t coordinates (j,) at which strips need additional points."""
+        """Return the ascending t coordinates at which strips need additional points."""
         if not self._road.curved_across:
             return np.zeros(0)
         borders = np.stack([*self.borders.values()])
@@ -525,7 +525,7 @@ class SectionSurface:
             yield Strip(lane, t, base, self.steps)
 
     def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:
-        """Return the t coordinates (c, k) of the points of a lane, from the inside outward."""
+        """Return the t coordinates of the points of a lane, from the inside outward."""
         lower = np.minimum(inner_t, outer_t)
         upper = np.maximum(inner_t, outer_t)
         lines = self._lines
@@ -536,7 +536,7 @@ class SectionSurface:
         return np.stack([inner_t, *(np.clip(line, lower, upper) for line in lines), outer_t])
 
     def _base(self, t: Floats) -> Floats:
-        """Return the points (c, k, 3) of a lane at t coordinates (c, k).
+        """Return the points of a lane at t coordinates.
 
         The heights of the lane itself are not included.
         """

@@ -1,4 +1,4 @@
-"""Evaluate road reference lines in plan: lines, arcs, spirals, and cubics, in a common table.
+"""Evaluate the lines, arcs, spirals, and cubics of road reference lines in plan.
 
 Lines, arcs, and spirals are curves whose curvature varies linearly (clothoids). They are
 integrated by five-point Gauss-Legendre quadrature over pieces that turn by at most half a radian,
@@ -27,7 +27,7 @@ from .elements import read_non_negative, read_number
 _MAX_TURN = 0.5  # maximum turn of a piece of a clothoid in radians
 _CUBIC_PIECES = 16  # number of pieces of a cubic geometry, each with separate stations
 _CUBIC_SAMPLES = 64  # samples per piece for computing arc lengths
-_MIN_SPEED = 1e-3  # minimum ratio of the speeds along a cubic; slower cubics reverse
+_MIN_SPEED = 1e-3  # minimum ratio of the speeds along a cubic; slower cubics reverse direction
 _LEAST_M = 1e-9  # shorter geometries are skipped
 # Nodes and weights of five-point Gauss-Legendre quadrature from 0 to 1.
 _NODES = np.array([-0.9061798459386640, -0.5384693101056831, 0.0]) / 2 + 0.5
@@ -71,7 +71,7 @@ class _Cubic(NamedTuple):
 
 
 class PlanTable:
-    """The reference lines of all roads in a file, one after another along a common distance.
+    """Table of the reference lines of all roads in a file, concatenated along a common distance.
 
     Roads are added with `add_road`. After `finish`, they can be evaluated together.
     """
@@ -89,8 +89,8 @@ class PlanTable:
     def add_road(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
         """Add the geometries of a road that starts at `offset` in the table.
 
-        Returns the starts of the geometries on the road. The last geometry ends with the road,
-        which has a length of `length` meters.
+        The result contains the starts of the geometries on the road. The last geometry ends with
+        the road, which has a length of `length` meters.
         """
         starts = [read_non_negative(geometry, "s") for geometry in geometries]
         first = len(self._bends)
@@ -116,12 +116,12 @@ class PlanTable:
         self._bend_table = bends[np.argsort(bends[:, 0], kind="stable")]
 
     def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
-        """Return the largest curvatures in 1/m in intervals (k,) that are each within a piece."""
+        """Return the largest curvatures in 1/m in intervals that are each within a piece."""
         row_indices = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
         return np.asarray(self._bend_table[np.maximum(row_indices, 0), 1])
 
     def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
-        """Return points at distances (k,) in the table.
+        """Return points at distances in the table.
 
         `pieces` (k,) are the distances that select the pieces on which the points are evaluated.
         """
@@ -255,7 +255,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
 
 
 def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
-    """Return points on a cubic at distances (k,) in the table."""
+    """Return points on a cubic at distances in the table."""
     along = distances - cubic.start
     parameters = _parameters(cubic, along)
     u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
@@ -270,7 +270,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
 
 
 def _parameters(cubic: _Cubic, along: Floats) -> Floats:
-    """Return the parameters of a cubic at distances (k,) from its start.
+    """Return the parameters of a cubic at distances from its start.
 
     Beyond the end of the cubic, the parameters remain at the end.
     """
@@ -283,7 +283,7 @@ def _parameters(cubic: _Cubic, along: Floats) -> Floats:
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:
-    """Return the coefficients (4,) of a cubic along the heading and to the left."""
+    """Return the coefficients of a cubic along the heading and to the left."""
     if shape.tag == "poly3":
         u = [0.0, 1.0, 0.0, 0.0]
         v = [read_number(shape, name, 0.0) for name in "abcd"]

@@ -1,4 +1,4 @@
-"""Evaluate OpenDRIVE roads: reference lines, cross sections, and coordinates along roads.
+"""Evaluate the reference lines and cross sections of OpenDRIVE roads.
 
 Sources: ASAM OpenDRIVE 1.8.1 (2024), sections 7 to 11. Crossfall and poly3 follow VIRES OpenDRIVE
 1.4H.
@@ -29,7 +29,7 @@ _STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
 MAX_ROAD_M = 1e7  # maximum length of a road
 MAX_LINES = 1e5  # maximum number of points between two kinks of a cross section
 _GAP_M = 1.0  # gap between roads in the table of reference lines
-_MAX_MISSING = 0.01  # share of a road's length by which its geometry may be too short
+_MAX_MISSING = 0.01  # fraction of a road's length by which its geometry may be too short
 _CROSSFALL_SIDES = {"left": (1,), "right": (-1,), "both": (1, -1)}
 _KNOWN = (
     "type", "planView", "elevationProfile", "lateralProfile", "lanes", "objects", "signals",
@@ -38,7 +38,10 @@ _KNOWN = (
 
 
 class RoadFrames(NamedTuple):
-    """Coordinate frames of roads at stations; a point is origin + t * side + h * up."""
+    """Coordinate frames of roads at stations.
+
+    The point at t and h is origin + t * side + h * up.
+    """
 
     origins: Floats  # (k, 3) in meters
     along: Floats  # (k, 3) unit vectors along the reference line
@@ -133,7 +136,7 @@ class Road:
 
     @cached_property
     def breaks(self) -> Floats:
-        """Distances (b,) in meters at which polynomials of the road change."""
+        """Distances in meters at which polynomials of the road change."""
         profiles = (
             self.elevation, self.superelevation, self.lane_offset, *self.crossfalls.values()
         )  # fmt: skip
@@ -143,10 +146,10 @@ class Road:
         return np.concatenate(starts)
 
     def heights(self, stations: RoadStations, t: Floats, pieces: Floats | None = None) -> Floats:
-        """Return the heights of crossfall and shapes at t coordinates (..., k).
+        """Return the heights of crossfall and shapes at t coordinates.
 
-        They are relative to the banked plane. `pieces` (..., k) are the t coordinates that select
-        the pieces of the shapes, by default `t`.
+        The heights are relative to the banked plane. `t` and `pieces` have shape (..., k), and
+        `pieces` are the t coordinates that select the pieces of the shapes, by default `t`.
         """
         heights = np.zeros_like(t)
         for side, crossfall in self.crossfalls.items():
@@ -158,14 +161,14 @@ class Road:
         return heights
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) of kinks in cross sections between two distances."""
+        """Return the t coordinates of kinks in cross sections between two distances."""
         kinks = [np.zeros(1 if any(map(len, self.crossfalls.values())) else 0)]
         if self.shapes is not None:
             kinks.append(self.shapes.kinks(start, stop))
         return np.unique(np.concatenate(kinks))
 
     def points_across(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
-        """Return the ascending t coordinates (j,) at which cross sections need points.
+        """Return the ascending t coordinates at which cross sections need points.
 
         `t` (2,) are the lower and the upper limit. Straight lines between the points are within
         `height_m` of the cross sections between the distances `start` and `stop`.
@@ -188,7 +191,7 @@ class Road:
 
 
 class LateralShapes:
-    """Heights across a road: cubics of t at stations, interpolated linearly between stations."""
+    """Heights across a road, which are cubics of t at stations and linear between stations."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         groups: dict[float, list[list[float]]] = {}
@@ -196,7 +199,7 @@ class LateralShapes:
             row = [read_number(element, name, 0.0) for name in ("t", *"abcd")]
             groups.setdefault(read_number(element, "s"), []).append(row)
         self.stations: Floats = np.array(sorted(groups))  # (m,)
-        # The cubics at each station in ascending order, padded with starts that are never reached
+        # The cubics at each station in ascending order, padded with starts that are never reached.
         count = max(map(len, groups.values()))
         table = np.zeros((len(groups), count, 5))
         table[..., 0] = np.inf
@@ -206,7 +209,7 @@ class LateralShapes:
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at distances (k,) and t coordinates (..., k).
+        """Return the heights at distances and t coordinates.
 
         `pieces` (..., k) are the t coordinates that select the cubics.
         """
@@ -219,7 +222,7 @@ class LateralShapes:
         return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) at which cubics start.
+        """Return the t coordinates at which cubics start.
 
         Stations that determine the heights between the two distances are considered.
         """
@@ -227,7 +230,7 @@ class LateralShapes:
         return np.unique(starts[np.isfinite(starts)])
 
     def steps(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates (j,) at which heights step.
+        """Return the t coordinates at which heights step.
 
         Stations that determine the heights between the two distances are considered.
         """
@@ -241,7 +244,7 @@ class LateralShapes:
         return np.unique(starts[:, 1:][is_step & np.isfinite(starts[:, 1:])])
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
-        """Return the largest second derivatives in 1/m between ascending t coordinates (j + 1,)."""
+        """Return the largest second derivatives in 1/m between ascending t coordinates."""
         row_range = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
         pieces = np.maximum((self._starts[row_range, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
@@ -260,7 +263,7 @@ class LateralShapes:
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
     def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at t coordinates (..., k) for stations with given indices (k,)."""
+        """Return the heights at t coordinates (..., k) for stations with given indices."""
         cubics = np.maximum(
             (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
         )
@@ -300,7 +303,7 @@ class RoadNetwork:
         return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
     def frames(self, roads: Sequence[Road], stations: Sequence[RoadStations]) -> RoadFrames:
-        """Return the frames of roads at stations (k,) on each road, concatenated."""
+        """Return the frames of roads at stations on each road, concatenated."""
         pairs = [*zip(roads, stations, strict=True)]
         if not pairs:
             return RoadFrames(*np.zeros((5, 0, 3)))
@@ -324,6 +327,6 @@ class RoadNetwork:
         return RoadFrames(origins, along, side, upright * cosines - level_side * sines, level_side)
 
     def point(self, road: Road, s: float, t: float, h: float = 0.0) -> Floats:
-        """Return the point (3,) at road coordinates s, t, and h."""
+        """Return the point at road coordinates s, t, and h."""
         frames = self.frames([road], [RoadStations.at(np.array([s]))])
         return np.asarray(frames.origins[0] + t * frames.side[0] + h * frames.up[0])

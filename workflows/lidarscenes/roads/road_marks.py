@@ -80,7 +80,7 @@ def painted_quads(
 
 
 def _quads(right: Ints, count: int) -> Ints:
-    """Return triangles (f, 3) between cross sections and the following ones.
+    """Return triangles between cross sections and the following ones.
 
     `right` contains the indices of the right points. The left points are `count` indices later.
     """
@@ -99,7 +99,7 @@ class _Knots(NamedTuple):
     stations: Ints  # (q,) last station before each cross section, ascending
     shares: Floats  # (q,) fraction of the distance to the next station
     first_t: Floats  # (q,) t coordinate of the line's center at `stations`
-    second_t: Floats  # (q,) the same at the following stations
+    second_t: Floats  # (q,) t coordinate at the following stations
     width: float  # in meters
     quads: Ints  # (p,) cross sections at which quadrilaterals start
     color: str
@@ -152,7 +152,7 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
 
 
 def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
-    """Express distances (d,) as fractional station indices."""
+    """Express distances as fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
     shares = (distances - s[stations]) / lengths
@@ -160,7 +160,7 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
-    """Return the right and then the left edges of lines on the lanes, shape (2q, 3)."""
+    """Return the right and then the left edges of lines on the lanes. Shape (2q, 3)."""
     station_indices = np.concatenate([entry.stations for entry in knots])
     shares = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
@@ -202,7 +202,7 @@ def _lines_of_mark(
 ) -> list[_Line]:
     """Return the lines of a road mark.
 
-    The lines are stated explicitly, by the type of the mark, or by the name of the mark.
+    The lines are defined explicitly, by the type of the mark, or by the name of the mark.
     """
     color = _color(mark, "white")
     width = read_non_negative(mark, "width", 0.0) or WIDTH_M
@@ -273,7 +273,7 @@ def _typed_line(
 def _dashes(
     start: float, stop: float, length: float, space: float, allowance: Allowance
 ) -> tuple[Floats, Floats]:
-    """Return the starts and stops (d,) of dashes, or of a single dash without gaps."""
+    """Return the starts and stops of dashes, or of a single dash without gaps."""
     if not start < stop:
         return np.zeros(0), np.zeros(0)
     if space <= 0 or length <= 0:
@@ -286,6 +286,6 @@ def _dashes(
 
 
 def _color(element: Element, default: str) -> str:
-    """Return the color of a mark or line; the standard color is white."""
+    """Return the color of a mark or line, which is white if its color is "standard"."""
     color = element.get("color") or default
     return "white" if color == "standard" else color[:20]

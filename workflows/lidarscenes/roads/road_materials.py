@@ -14,7 +14,7 @@ ASPHALT = "asphalt"
 CONCRETE = "concrete"
 EARTH = "earth"
 GRASS = "grass"
-PAINT = "paint"  # a color may follow: "paint white"
+PAINT = "paint"  # a color may follow, as in "paint white"
 SIGN = "sign face"
 LAMP = "lamp"
 METAL = "metal"
@@ -44,7 +44,7 @@ _LINEAR = {
 }
 _OTHER = (0.5, 0.5, 0.5)
 
-# {lane type: material}; all others are asphalt.
+# {lane type: material}. All other lanes are asphalt.
 _LANES = {
     "sidewalk": CONCRETE,
     "walking": CONCRETE,
@@ -52,7 +52,7 @@ _LANES = {
     "median": GRASS,
     "none": EARTH,
 }
-# {object type: material}; all others are concrete.
+# {object type: material}. All other objects are concrete.
 _OBJECTS = {
     "building": WALL,
     "tree": LEAVES,
@@ -119,7 +119,7 @@ CLASSES = {
 
 @cache
 def material_color(material: str) -> Bytes:
-    """Return the sRGB color (1, 1, 3) of a material."""
+    """Return the sRGB color of a material. Shape (1, 1, 3)."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 

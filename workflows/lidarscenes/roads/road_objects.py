@@ -1,4 +1,4 @@
-"""Convert road objects: boxes, cylinders, outlines, repeated copies, markings, and tunnels."""
+"""Convert road objects such as boxes, cylinders, outlines, copies, markings, and tunnels."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class ObjectBuilder:
                 yield painted_strips(starts + lift, stops + lift, width, paint)
 
     def _dashed(self, line: Floats, marking: Element) -> tuple[Floats, Floats]:
-        """Return the starts and stops (d, 3) of the dashes of a marking along a line (n, 3)."""
+        """Return the starts and stops of the dashes of a marking along a line."""
         dash = read_non_negative(marking, "lineLength", 0.0)
         space = read_non_negative(marking, "spaceLength", 0.0)
         starts = []
@@ -230,7 +230,7 @@ class ObjectBuilder:
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
     def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
-        """Return the corners (k, 4, 3) of a tunnel, clockwise from the lower left."""
+        """Return the corners of a tunnel, clockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -276,7 +276,7 @@ class _Rail(NamedTuple):
         )
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
-        """Return the cross sections (k, 4, 3), clockwise from the lower right."""
+        """Return the cross sections, clockwise from the lower right. Shape (k, 4, 3)."""
         share = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
@@ -332,7 +332,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
 
 
 def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSurface:
-    """Return the surface between two lines of points (k, 2, 3) at samples."""
+    """Return the surface between two lines of points at samples."""
     columns = np.moveaxis(points, 1, 0)
     is_cell = np.ones(1, np.bool_)
     return SampledSurface(samples.intervals, columns, is_cell, HEIGHT_SHARE * sag_m)
@@ -341,7 +341,7 @@ def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSu
 def _rings(
     network: RoadNetwork, rails: Collection[_Rail], stations: Sequence[RoadStations]
 ) -> Iterator[Floats]:
-    """Yield the cross sections (k, 4, 3) of each rail at stations."""
+    """Yield the cross sections of each rail at stations. Shape (k, 4, 3)."""
     frames = network.frames([rail.road for rail in rails], stations)
     stop = 0
     for rail, at in zip(rails, stations, strict=True):
@@ -513,7 +513,7 @@ def _flat_pieces(
     placement: _Placement,
     outlines: Sequence[_Outline],
 ) -> Iterator[Piece]:
-    """Yield the paint of an object without height: stripes, or the whole area of a mark."""
+    """Yield the paint of an object without height, which is stripes or the whole area of a mark."""
     lift = np.array([0, 0, LIFT_M])
     rings = [outline.corners for outline in outlines]
     rings = rings or [transform_points(_rectangle(placement.size), frame.origin, frame.turn)]
@@ -525,7 +525,7 @@ def _flat_pieces(
 
 
 def _rectangle(size: Sequence[float]) -> Floats:
-    """Return the counterclockwise corners (4, 3) of a rectangle, starting at the rear right."""
+    """Return the counterclockwise corners of a rectangle, starting at the rear right."""
     half_length = size[0] / 2
     half_width = size[1] / 2
     return np.array(
@@ -539,7 +539,7 @@ def _rectangle(size: Sequence[float]) -> Floats:
 
 
 def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
-    """Return the surface between two lines of points (k, 3), with walls at steps (j,)."""
+    """Return the surface between two lines of points, with walls at steps."""
     count = len(first)
     points = np.concatenate([first, second])
     a = np.arange(count - 1)
@@ -561,5 +561,5 @@ def _paint_of(element: Element) -> str:
 
 
 def _paint_color(color: str | None) -> str:
-    """Return the color of paint; the standard color is white."""
+    """Return the color of paint, which is white if its color is "standard"."""
     return "white" if color in (None, "", "standard") else color[:MAX_SHOWN]

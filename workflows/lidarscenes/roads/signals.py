@@ -1,4 +1,4 @@
-"""Convert road signals: plates of traffic signs and boxes of traffic lights, on poles."""
+"""Convert road signals to plates for traffic signs and boxes for traffic lights, on poles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LAMP_M = 0.25  # thickness of traffic lights
 POLE_M = 0.038  # radius of poles
 _MIN_POLE_M = 0.3  # signals with a lower bottom edge have no pole
 _POLE_SAG_M = 0.003
-# German signs that are paint on the road: lines, arrows and hatched areas.
+# German signs that are painted on the road, such as lines, arrows and hatched areas.
 _PAINTED = ("293", "294", "295", "296", "297", "298", "299", "340", "341")
 _GERMAN = ("opendrive", "de", "deu", "ger", "germany")
 _KNOWN_SIGNALS = ("signal", "signalReference")

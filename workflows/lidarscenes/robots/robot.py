@@ -1,4 +1,4 @@
-"""Define robots: links, the joints between links, and the poses of links over time."""
+"""Define robots with links, the joints between links, and the poses of links over time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lidarsim.scene.transform import rotation_about
 from lidarsim.schema.checks import as_array, check_fits, check_list
 from lidarsim.words import name_hint, plural
 
-_LATE_S = 1e-3  # some beams of the last firing are fired slightly after the survey's end
+_LATE_S = 1e-3  # some beams of the last firing are fired slightly after the end of the survey
 MOVING = ("revolute", "continuous", "prismatic")
 HELD = ("fixed", "floating", "planar")
 
@@ -114,7 +114,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Text with the numbers of links and triangles, and the movable joints."""
+        """Text with the numbers of links and triangles, and with the movable joints."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
@@ -273,7 +273,7 @@ class Robot:
         time_unit: TimeUnit | None,
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Return the times (k,) in seconds, and the values (k,) of all movable joints by name."""
+        """Return the times in seconds, and the values of all movable joints by name."""
         check_fits("time_unit", time_unit, TimeUnit | None)
         check_list("ignore", ignore)
         table: dict[str, Any] = {}
@@ -290,7 +290,7 @@ class Robot:
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
-        """Check the times (k,) and joint values (k,) in a table.
+        """Check the times and joint values in a table.
 
         Raises LidarError if they are invalid.
         """
@@ -312,7 +312,7 @@ class Robot:
         return {joint.name: joint for joint in self.joints.values() if joint.moves}
 
     def _add_missing(self, table: dict[str, Floats], count: int) -> None:
-        """Add the values (count,) of joints that are missing in a table: mimicked or at rest."""
+        """Add the values of joints that are missing in a table, which are mimicked or at rest."""
         joints = self._moving_joints()
         for name in joints:
             chain = [joints[name]]
@@ -430,7 +430,7 @@ class LinkPath:
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station.
+        """Return positions and rotations at times of a station.
 
         Times are in nanoseconds. Sums are evaluated in a fixed order, so the results do not depend
         on the number of times.
@@ -450,7 +450,7 @@ class LinkPath:
         return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return linear and angular velocities (k, 3) at times (k,) of a station.
+        """Return linear and angular velocities at times of a station.
 
         Times are in nanoseconds. The velocities are in the scene frame, in m/s and rad/s, and
         include the motion of all joints exactly. At a time of the joint values, they are those of
@@ -475,7 +475,7 @@ class LinkPath:
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
-        """Return the motion of the root at times (k,).
+        """Return the motion of the root at times.
 
         Velocities are zero unless `moving` is set.
         """
@@ -492,7 +492,7 @@ class LinkPath:
         )
 
     def _moments_s(self, times_ns: Floats) -> Floats:
-        """Convert times (k,) to the clock of the joint values, in seconds.
+        """Convert times to the clock of the joint values, in seconds.
 
         Raises LidarError if a time is outside the joint values.
         """
@@ -508,7 +508,7 @@ class LinkPath:
         return moments_s
 
     def _slopes(self, hinge: Hinge, moments_s: Floats) -> Floats:
-        """Return the rates of change (k,) of a joint value at times (k,), per second."""
+        """Return the rates of change of a joint value at times, per second."""
         if len(self.times_s) < 2:
             return np.zeros(len(moments_s))
         slopes = np.diff(hinge.values) / np.diff(self.times_s)
@@ -527,7 +527,7 @@ class _LinkMotion(NamedTuple):
     rates: Floats  # (3, k) angular velocities, rad/s
 
     def transformed(self, matrix: Floats) -> _LinkMotion:
-        """Return the motion of a frame with a constant pose (4, 4) in this frame."""
+        """Return the motion of a frame with a constant pose in this frame."""
         moved = _product(self.rotations, matrix[:3, :, None])
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
 
@@ -538,14 +538,14 @@ class _LinkMotion(NamedTuple):
         return self._replace(anchors=self.positions, velocities=moved)
 
     def with_hinge_velocity(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
-        """Add the velocity of a hinge whose value changes at the rates `slopes` (k,)."""
+        """Add the velocity of a hinge whose value changes at the rates `slopes`."""
         added = _product(self.rotations, hinge.axis[:, None, None] * slopes)[:, 0]
         if hinge.slides:
             return self._replace(velocities=self.velocities + added)
         return self._replace(rates=self.rates + added)
 
     def after_hinge(self, hinge: Hinge, value: Floats) -> _LinkMotion:
-        """Return the motion with the poses beyond a hinge with values (k,)."""
+        """Return the motion with the poses beyond a hinge with values."""
         if hinge.slides:
             slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]
             return self._replace(positions=self.positions + slide)
@@ -557,7 +557,10 @@ class _LinkMotion(NamedTuple):
 
 
 def _product(left_matrices: Floats, right_matrices: Floats) -> Floats:
-    """Return the products of matrices (3, 3, k) and (3, m, k), where k may be 1."""
+    """Return the products of 3 x 3 matrices and 3 x m matrices.
+
+    The shapes are (3, 3, k) and (3, m, k), where k may be 1.
+    """
     return np.asarray(
         (
             left_matrices[:, 0, None] * right_matrices[0]

@@ -207,7 +207,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
 
 
 def _origin(element: Element) -> Floats:
-    """Return the matrix (4, 4) of an <origin>.
+    """Return the 4 x 4 matrix of an <origin>.
 
     It rotates about the fixed x, y, and z axes, and then translates.
     """
@@ -354,7 +354,7 @@ class _LinkMeshes:
                 self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
     def _color(self, visual: Element) -> Bytes | None:
-        """Return the color (1, 1, 3) of a visual or of its material in the robot, or None."""
+        """Return the color of a visual or of its material in the robot, or None."""
         material = visual.find("material")
         if not self.colors or material is None:
             return None
@@ -365,7 +365,7 @@ class _LinkMeshes:
         return as_bytes(_numbers(color, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
-        """Return scale factors (3,), which may be zero, and the meshes to be scaled."""
+        """Return scale factors, which may be zero, and the meshes to be scaled."""
         if shape.tag == "mesh":
             if len(factors := shape.get("scale", "").split()) == 4:  # some public files have four
                 shape.set("scale", " ".join(factors[:3]))

@@ -1,4 +1,4 @@
-"""Convert files with the rays of a sensor to scenarios: ray lists and OmniLidar prims."""
+"""Convert files with the rays of a sensor, such as ray lists and OmniLidar prims, to scenarios."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RAYS_FILE = "rays.npz"
 
 
 def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a sensor file as a scenario: `scenario.yaml`, and a file with the rays.
+    """Write a sensor file as a scenario, with a `scenario.yaml` file and a file with the rays.
 
     The scenario has the scene of `lidarpool demo`, but with this sensor.
 

@@ -1,8 +1,8 @@
-"""Read an OmniLidar prim with usd-core in the process that `omnilidar.py` starts; this is a script.
+"""Script that reads an OmniLidar prim with usd-core in the process that `omnilidar.py` starts.
 
 Invalid files can crash usd-core, and here this affects only this process. The script imports
-nothing from lidarpool. It writes one frame to standard output: a line of JSON with the attributes
-of the prim, followed by the bytes of the arrays that the line lists.
+nothing from lidarpool. It writes one frame to standard output, which is a line of JSON with the
+attributes of the prim, followed by the bytes of the arrays that the line lists.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class _Writer:
         return len(parts) - 1
 
     def add(self, name: str, object_parts: list[SceneMesh | SceneInstance]) -> None:
-        """Add an object as a node; its parts share a matrix."""
+        """Add an object as a node whose parts share a matrix."""
         meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in object_parts]
         key = tuple(id(mesh) for mesh in meshes)
         translated = self._origin.any() and not isinstance(object_parts[0], SceneInstance)
@@ -163,7 +163,7 @@ class _Writer:
     def _corners(
         self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
-        """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
+        """Return the attributes of triangles with separate corners."""
         corners = rotate(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
@@ -209,7 +209,7 @@ class _Writer:
             material: dict[str, Any] = {"pbrMetallicRoughness": matt}
             material |= {"name": name} if name else {}
             if image is None:
-                pass  # a name alone
+                pass  # only a name
             elif image.size == 3 and image.ndim == 3:
                 matt["baseColorFactor"] = [*LINEAR[image.ravel()].round(6).tolist(), 1]
             elif image.ndim == 3:

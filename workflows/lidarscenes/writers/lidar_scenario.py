@@ -131,7 +131,7 @@ def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
 def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
     """Return the sections with sensors and poses.
 
-    If all lidars belong to the same model, the pose is that of the model; otherwise it is the
+    If all lidars belong to the same model, the pose is that of the model. Otherwise, it is the
     origin.
     """
     of_one_model = len({lidar.model for lidar in lidars}) == 1
@@ -156,7 +156,7 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
 
 
 def _pose(matrix: Floats) -> dict[str, Any]:
-    """Return a matrix (4, 4) as a pose in a scenario."""
+    """Return a 4 x 4 matrix as a pose in a scenario."""
     pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
     angles = {name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
     return {

@@ -28,13 +28,13 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
     A .ply file stores one object without a name, while .glb and .obj store all objects with their
-    names. Only .glb stores masks and colors; in .ply and .obj, triangles are opaque and gray. If a
+    names. Only .glb stores masks and colors. In .ply and .obj, triangles are opaque and gray. If a
     triangle has both a mask and a texture, its color is the mean of the texture. All formats store
-    world coordinates in meters. A .glb file is Y-up, as its standard requires; .ply and .obj are
-    Z-up. Coordinates in .ply and .glb have single precision; in .glb, they are relative to the
-    scene's origin. The coordinate system, `Scene.epsg`, is preserved. A comment, or the generator
-    in .glb, tells `load_meshes` that this package has written the file. An existing file is
-    replaced only once the new file is complete.
+    world coordinates in meters. A .glb file is Y-up, as its standard requires, and .ply and .obj
+    files are Z-up. Coordinates in .ply and .glb have single precision. In .glb, they are relative
+    to the scene's origin. The coordinate system, `Scene.epsg`, is preserved. A comment, or the
+    generator in .glb, identifies this package as the writer of the file for `load_meshes`. An
+    existing file is replaced only once the new file is complete.
 
     Raises
     ------
@@ -103,5 +103,5 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 
 def _comments(scene: Scene) -> list[str]:
-    """Return the comments at the start of a file: units and axes, and the coordinate system."""
+    """Return the comments at the start of a file on units, axes, and the coordinate system."""
     return [FORMAT_COMMENT, *([] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"])]

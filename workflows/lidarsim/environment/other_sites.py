@@ -1,15 +1,17 @@
-"""Requests that a website makes with the browser of its visitor, which our services refuse.
+"""Protection of HTTP services against cross-site requests and DNS rebinding.
 
-Any website can let a visitor's browser send requests to services of the visitor's machine and
-network, by an image, a form or a script. Browsers keep the website from reading the answers. They
-do not keep the requests from being sent, and a name that the website resolves to an address of the
-visitor (DNS rebinding) makes the service a part of the website.
+With an image, a form or a script, any website can make a visitor's browser send requests to
+services on the visitor's machine and network. Browsers prevent the website from reading the
+responses, but they do not prevent the requests. If the website resolves one of its names to an
+address of the visitor (DNS rebinding), it can even read the responses, because the browser treats
+the service as part of the website.
 
-Browsers say in headers that no script can change who asks: `Sec-Fetch-Site` (W3C Fetch Metadata),
-`Origin` (RFC 6454), `Host` and `Referer` (RFC 9110). Other programs send none of them but `Host`.
+Browsers identify the origin of a request in headers that scripts cannot change: `Sec-Fetch-Site`
+(W3C Fetch Metadata), `Origin` (RFC 6454), `Host` and `Referer` (RFC 9110). Other programs usually
+send only `Host`.
 
-The packages lidarsim and poolpart can be installed alone, so each has this module. A test holds
-both files equal.
+The packages lidarsim and poolpart can be installed separately, so each contains a copy of this
+module. A test checks that both files are identical.
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ from collections.abc import Collection, Mapping
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-# HOST[:PORT]; an address of IPv6 stands in brackets.
+# HOST[:PORT], where IPv6 addresses are enclosed in brackets.
 _AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\s:/?#@\[\],]+)(?::\d*)?", re.ASCII | re.IGNORECASE)
-_OWN_SITES = ("none", "same-origin")  # "none" is of an address that the user has typed
-_BROWSER = "mozilla/"  # first letters of the User-Agent of every browser
+_OWN_SITES = ("none", "same-origin")  # "none" if the user has typed the address
+_BROWSER = "mozilla/"  # every browser's User-Agent begins with this
 
 
 def names_of_machine(listens_at: str) -> frozenset[str]:
     """Return the names that clients may use for a service that listens at an address.
 
-    The domain of the machine, whose look-up may take seconds, counts where the service listens on
-    a network.
+    If the service listens on a network, the names include the fully qualified domain name of the
+    machine, whose lookup may take seconds.
     """
     hostname = socket.gethostname().lower()
     names = {"localhost", hostname, f"{hostname}.local"}
@@ -47,24 +49,25 @@ def refusal(
     changes_state: bool = False,
     is_page: bool = False,
 ) -> str:
-    """Return why a request comes from another site, for the client, or "" if it is answered.
+    """Return the reason why a cross-site request is rejected, or "" if the request is accepted.
 
     Parameters
     ----------
     headers
-        {name in lower case: value}; values of a repeated header are joined by commas.
+        Mapping of names in lower case to values. The values of a repeated header are joined by
+        commas.
     names
-        Names of the service in lower case, or None where a proxy of an unknown name is in use. A
-        numeric address does not count as a name: a browser that asks for an address has connected
-        to it.
+        Names of the service in lower case, or None if it is behind a proxy whose name is unknown.
+        Numeric addresses are always accepted, because a browser that requests a numeric address
+        has connected to it.
     url_authority
-        HOST[:PORT] of a URL in absolute form, as clients of a proxy send it.
+        HOST[:PORT] of an absolute URL in the request line, as sent by clients of a proxy.
     changes_state
         Whether the request changes the state of the service. Browsers send `Sec-Fetch-Site` only
-        over TLS and to the loopback interface, and no `Origin` for an image. So a browser that
-        sends neither needs a `Referer` of the service.
+        over TLS and to the loopback interface, and they do not send `Origin` with requests for
+        images. Therefore, if a browser sends neither header, `Referer` must refer to the service.
     is_page
-        Whether the answer is a document that changes nothing and may be the target of links.
+        Whether the response is a read-only page that other websites may link to.
     """
     authorities = [text for text in (headers.get("host"), url_authority) if text]
     for authority in authorities:
@@ -86,13 +89,13 @@ def refusal(
 
 
 def _host_of(authority: str) -> str | None:
-    """Return the host of HOST[:PORT] in lower case, or None for other text."""
+    """Return the host of HOST[:PORT] in lower case, or None if the text has another form."""
     match = _AUTHORITY.fullmatch(authority)
     return match[1].lower().removesuffix(".") if match else None
 
 
 def _is_of(url: str, authorities: Collection[str]) -> bool:
-    """Return True if a URL is of the host and port that a request asks for."""
+    """Return whether a URL has the host and port that a request is addressed to."""
     try:
         return urlsplit(url).netloc.lower() in [authority.lower() for authority in authorities]
     except ValueError:
@@ -100,7 +103,7 @@ def _is_of(url: str, authorities: Collection[str]) -> bool:
 
 
 def _is_address(host: str) -> bool:
-    """Return True for an address of IPv4 or IPv6 as numbers."""
+    """Return whether a host is a numeric IPv4 or IPv6 address."""
     try:
         ip_address(host.strip("[]"))
     except ValueError:
@@ -109,5 +112,5 @@ def _is_address(host: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
-    """Return True for an address of the loopback interface, as numbers, and for localhost."""
+    """Return whether a host is a numeric loopback address or localhost."""
     return host == "localhost" or (_is_address(host) and ip_address(host.strip("[]")).is_loopback)

@@ -1,7 +1,8 @@
-"""Read the UDP datagrams of a network capture (pcap or pcapng, regardless of the file name).
+"""Read the UDP datagrams in a network capture, which is a pcap or pcapng file.
 
-Frames may have any of the link types in `_LINKS`, VLAN tags, padding and a frame check sequence.
-Frames of other protocols are skipped, because captures usually contain ARP, mDNS and others.
+The format is detected from the content, not from the file name. Frames may have any of the link
+types in `_LINKS`, VLAN tags, padding and a frame check sequence. Frames of other protocols are
+skipped, because captures usually contain ARP, mDNS and others.
 
 Sources: IETF drafts opsawg-pcap and opsawg-pcapng; registry of link types at tcpdump.org.
 """
@@ -35,13 +36,13 @@ _PCAP_MAGIC = {
 }
 _PCAPNG_MAGIC = bytes.fromhex("0a0d0d0a")
 _PCAPNG_ORDERS = {bytes.fromhex("4d3c2b1a"): "<", bytes.fromhex("1a2b3c4d"): ">"}
-# Types of pcapng blocks
+# Types of pcapng blocks.
 _SECTION = 0x0A0D0D0A
 _INTERFACE = 1
 _OLD_PACKET = 2
 _SIMPLE_PACKET = 3
 _ENHANCED_PACKET = 6
-# Options of an interface
+# Options of an interface.
 _RESOLUTION = 9
 _OFFSET = 14
 

@@ -42,7 +42,10 @@ class Datagrams:
         return len(self.payloads)
 
     def without(self, dropped: Bools) -> Datagrams:
-        """Return the datagrams that are not lost. `dropped` (n,) is True for lost datagrams."""
+        """Return the datagrams that are not lost.
+
+        `dropped` (n,) is True for lost datagrams.
+        """
         if not dropped.any():
             return self
         return replace(self, payloads=self.payloads[~dropped], due_ns=self.due_ns[~dropped])
@@ -50,7 +53,7 @@ class Datagrams:
 
 @dataclass(frozen=True, eq=False)
 class PacketSource:
-    """Everything that packets depend on besides the shots: the sensor and its times."""
+    """Properties of a sensor and its survey that packets depend on in addition to the shots."""
 
     sensor: Sensor
     mode: str  # mode of the reported returns (`Returns`)
@@ -97,7 +100,7 @@ class PacketEncoder(ABC):
     """Encodes the shots of a sensor as datagrams, sweep by sweep.
 
     The constructor of a subclass checks the identifiers and the return mode of the source. Shots
-    that do not fill a packet are kept for the next sweep (`CarryOver`).
+    that do not fill a packet are stored for the next sweep (`CarryOver`).
     """
 
     columns: tuple[str, ...] = ("reflectivity",)  # required cloud columns besides ray and range
@@ -105,7 +108,7 @@ class PacketEncoder(ABC):
     optional_identifiers: ClassVar[tuple[str, ...]] = ()  # optional in the sensor's data file
     address: ClassVar[str] = "192.168.1.201"  # factory default address of the sensor
     destination: ClassVar[str] = "255.255.255.255"
-    default_ports: ClassVar[Mapping[str, int]] = {}  # {packet kind: port}, starting with returns
+    default_ports: ClassVar[Mapping[str, int]] = {}  # {packet kind: port}, returns first
     # Whether receivers distinguish sensors on the same port by their addresses or serial numbers.
     distinguished_by_receivers: ClassVar[bool] = False
     # Whether the manufacturer's software ignores datagrams from the receiver's own address.
@@ -204,7 +207,7 @@ class PacketDecoder(ABC):
     """
 
     intensity: ClassVar[str] = ""  # column that is `WHITE` for a white surface at any range
-    refusal: ClassVar[str] = ""  # for unsupported packets, what the file contains and what to do
+    refusal: ClassVar[str] = ""  # description of unsupported packets, with advice
     sensors: Sequence[str] = ("",)  # names of the sensors in the file; "" for a single sensor
     notes: Sequence[str] = ()  # messages that follow the name of the file
 
@@ -223,7 +226,7 @@ class PacketDecoder(ABC):
 
     @abstractmethod
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return the point columns (n,) of a sweep, including x, y and z in meters."""
+        """Return the point columns of a sweep, including x, y and z in meters."""
 
     @abstractmethod
     def time_ns(self, sweep: Any) -> float:

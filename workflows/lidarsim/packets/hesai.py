@@ -1,4 +1,4 @@
-"""Hesai packets: PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128 and OT128.
+"""Packets of Hesai PandarXT-32, Pandar40P, Pandar64, PandarQT, Pandar128 and OT128 sensors.
 
 The sources are listed in hesai_layouts.py.
 """
@@ -168,13 +168,13 @@ class HesaiEncoder(PacketEncoder):
         return packets
 
     def _stamps_us(self, firings_ns: Ints) -> Ints:
-        """Return packet timestamps in µs since 1970, where stamped blocks fire at `firings_ns`."""
+        """Return packet timestamps in µs since 1970 from the firing times of stamped blocks."""
         offset_us = self._layout.first_laser_us + self._layout.reference_us
         stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
         return (stamps_ns + 500) // 1000
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots to blocks (n, b)."""
+        """Write azimuths and returns of shots to blocks."""
         layout = self._layout
         units = np.rint(shots.range_m * (1000 / UNIT_MM))
         fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
@@ -198,7 +198,7 @@ class HesaiEncoder(PacketEncoder):
 
 
 def _epoch_seconds(seconds: Ints) -> Bytes:
-    """Return seconds since 1970 as 6-byte PTP dates: a zero byte and a big-endian number."""
+    """Return seconds since 1970 as PTP dates, which are a zero byte and 5 big-endian bytes."""
     return seconds.astype(">u8").view(np.uint8).reshape(-1, 8)[:, 2:] * (np.arange(6) > 0)
 
 

@@ -48,7 +48,10 @@ class LaserTable(NamedTuple):
         return "\n".join(["Channel,Elevation,Azimuth", *lines, ""])
 
     def firetimes_file(self) -> str:
-        """Return the content of the firing time file. All states and ranges have equal times."""
+        """Return the content of the firing time file.
+
+        All states and ranges have equal times.
+        """
         states = self.layout.listed_states
         times_us = [_decimal(time) for time in self.time_us]
         if not states:

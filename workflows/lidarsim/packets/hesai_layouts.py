@@ -1,4 +1,4 @@
-"""Layouts of Hesai packets: fields, return modes and times of each model.
+"""Layouts of Hesai packets, with the fields, return modes and times of each model.
 
 Sources: user manuals of PandarXT-32, PandarXT-16, Pandar40P, Pandar64, PandarQT, Pandar128 and
 Pandar128E3X; UdpProtocol and UdpParser in HesaiLidar_SDK_2.0; the Hesai decoders of tier4/nebula
@@ -64,7 +64,7 @@ class HesaiPacketLayout:
         return header
 
     def dates(self, seconds: Ints) -> NDArray[np.uint8]:
-        """Return UTC dates (n, 6), from year to second, for seconds since 1970."""
+        """Return UTC dates, from year to second, for seconds since 1970."""
         times = seconds.astype("datetime64[s]")
         months = times.astype("datetime64[M]")
         days = times.astype("datetime64[D]")
@@ -87,7 +87,7 @@ def _numbered(
     return (*_SOP, *version, status, 0, lasers, blocks, 0, UNIT_MM, 1, flags)
 
 
-# {header position: byte in dual mode}: the last return comes first; there are two returns.
+# {header position: byte in dual mode}, with the last return first and two returns per block.
 _DUAL_NUMBERED = {8: 1, 10: 2}
 
 

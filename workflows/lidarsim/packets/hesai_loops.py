@@ -1,4 +1,4 @@
-"""Compiled loop that computes the checksums of Hesai packets, see hesai.py."""
+"""Compiled loop that computes the checksums of Hesai packets (hesai.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -25,9 +25,9 @@ def remainders() -> NDArray[np.uint32]:
 
 @compiled()
 def checksums(contents, table, sums):
-    """Write the CRC-32/MPEG-2 of each row of bytes `contents` (n, k) to `sums` (n,).
+    """Write the CRC-32/MPEG-2 of each row of bytes to `sums`.
 
-    `table` is the result of `remainders`.
+    `contents` has shape (n, k), `sums` has shape (n,), and `table` is the result of `remainders`.
     """
     for row in range(contents.shape[0]):
         crc = _ALL_BITS

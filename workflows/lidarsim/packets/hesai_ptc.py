@@ -1,4 +1,6 @@
-"""TCP commands (PTC) of a live Hesai sensor: calibration, identity, settings and destination.
+"""TCP commands (PTC) of a live Hesai sensor.
+
+The commands read the calibration, identity and settings, and set the destination of the packets.
 
 Sources: TCP API in the user manuals of PandarQT and PandarXT-16; PtcClient in HesaiLidar_SDK_2.0;
 the Hesai hardware interface of tier4/nebula.
@@ -46,7 +48,7 @@ _DESTINATION = Struct(">4sHH")
 _RETURN_MODES = {"last": 0, "strongest": 1, "dual": 2, "first": 3}
 _GPS_PORT = 10_110  # port of packets with GPS sentences, which are not sent
 
-# Exceptions that end a connection: caused by the peer, by invalid bytes, or by this side.
+# Exceptions that end a connection, caused by the peer, by invalid bytes, or by this side.
 _ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio.CancelledError)
 
 
@@ -66,7 +68,7 @@ class PtcDevice:
     firetimes: bytes  # content of the firing time file
 
     def inventory(self) -> bytes:
-        """Return serial number, versions and model."""
+        """Return the serial number, the versions and the model."""
         number = crc32(self.name.encode())
         mac = b"\x02" + number.to_bytes(5, "big")  # locally administered address
         fields = (f"SIM{number:010d}".encode(), b"", mac, b"", b"", b"", b"", 0)
@@ -74,7 +76,7 @@ class PtcDevice:
         return packed.ljust(_INVENTORY_BYTES.get(self.model_code, 120), b"\0")
 
     def config(self, own_host: str, destination: Destination) -> bytes:
-        """Return the settings of network, rotation, clock and returns."""
+        """Return the settings of the network, rotation, clock and returns."""
         return _CONFIG.pack(
             IPv4Address(own_host).packed,
             b"\xff\xff\xff\0",
@@ -95,7 +97,7 @@ class PtcDevice:
         )
 
     def status(self, uptime_s: float) -> bytes:
-        """Return uptime and rotation rate; all temperatures are 0."""
+        """Return the uptime and the rotation rate, with all temperatures set to 0."""
         ptp_state = 2 if self.ptp else 0  # locked, or free run
         return _STATUS.pack(
             int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
@@ -111,7 +113,9 @@ class _RefusedError(Exception):
 
 
 class PtcService(TcpService):
-    """Answers PTC commands. Each connection can carry any number of commands.
+    """Service that answers PTC commands.
+
+    Each connection can carry any number of commands.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""HTTP/1.1 services, as sensors provide them on port 80.
+"""Base class of HTTP/1.1 services, which sensors provide on port 80.
 
 Requests are small and come from few programs on a trusted network, but these programs may be
 broken. Sizes, times and the number of connections are therefore limited, and each connection
@@ -78,7 +78,10 @@ class RequestRefusedError(Exception):
 
 
 class HttpService(TcpService):
-    """Answers HTTP requests. The parameters are the same as in `TcpService`."""
+    """Service that answers HTTP requests.
+
+    The parameters are the same as in `TcpService`.
+    """
 
     usual_port = HTTP_PORT
     example_port = 8080

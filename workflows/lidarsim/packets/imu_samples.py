@@ -22,7 +22,7 @@ class ImuBatch(NamedTuple):
 
 
 class PacketImuSamples:
-    """IMU samples of the platform in chronological order; there are none without an IMU."""
+    """IMU samples of the platform in chronological order, or no samples without an IMU."""
 
     def __init__(self, source: PacketSource) -> None:
         instruments = source.instruments
@@ -42,7 +42,10 @@ class PacketImuSamples:
         return self._until(None)
 
     def _until(self, until_ns: int | None) -> ImuBatch | None:
-        """Return the samples up to a time, or all if it is None. If there are none, return None."""
+        """Return the samples up to a time, or all samples if it is None.
+
+        The result is None if there are no samples.
+        """
         rows = []
         while self._next_row is not None:
             if until_ns is not None and int(self._next_row[0]) > until_ns:

@@ -32,7 +32,7 @@ _PTP = 1
 
 @dataclass(frozen=True)
 class Ports:
-    """UDP ports of a device type: ports of the sensor, and default ports of the host."""
+    """UDP ports of a device type on the sensor, and default ports on the host."""
 
     points: int
     imu: int
@@ -66,7 +66,8 @@ PORTS = {
     ),
 }
 # Tag of the HAP for the first return. Return 0 is light reflected by the sensor itself, and returns
-# closer than 1.5 m are merged with it. All other tag bits, for noise, are 0: high confidence.
+# closer than 1.5 m are merged with it. All other tag bits, which describe noise, are 0 for high
+# confidence.
 _HAP_FIRST_RETURN = 0x10
 _HAP_MERGED_M = 1.5
 _POSITION = "position_m"  # name of the position column of shots
@@ -114,9 +115,9 @@ def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
 class LivoxEncoder(PacketEncoder):
     """Encodes packets of 96 points, and IMU packets if the platform has an IMU.
 
-    Points are positions in the sensor frame at their firing time; the motion of the platform is not
-    removed. A pulse without a return is a point with all coordinates 0. Lines alternate: point n
-    belongs to line n modulo the number of lines. The identifier `data_type` selects 32-bit
+    Points are positions in the sensor frame at their firing time, so the motion of the platform is
+    not removed. A pulse without a return is a point with all coordinates 0. Lines alternate: point
+    n belongs to line n modulo the number of lines. The identifier `data_type` selects 32-bit
     coordinates with a resolution of 1 mm (1, the default) or 16-bit coordinates with a resolution
     of 10 mm (2). IMU samples are rotated to the sensor's axes, because a real sensor's IMU is
     aligned with them.
@@ -171,7 +172,10 @@ class LivoxEncoder(PacketEncoder):
         return [self._points(filling).without(np.asarray(dropped)), *imu]
 
     def finish(self) -> list[Datagrams]:
-        """Return the last IMU packets. Points that do not fill a packet are not sent."""
+        """Return the last IMU packets.
+
+        Points that do not fill a packet are not sent.
+        """
         return self._imu(self._samples.remaining())
 
     @property
@@ -224,7 +228,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions (n, c, 3) in the sensor frame in meters, or NaN without a return."""
+        """Return positions in the sensor frame in meters, with NaN for shots without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]
@@ -235,7 +239,7 @@ class LivoxEncoder(PacketEncoder):
         return positions
 
     def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
-        """Write positions and reflectivities of shots to `points` (n, 96)."""
+        """Write positions and reflectivities of shots to `points`."""
         units = shots.columns[_POSITION][0] / kind.unit_m
         np.rint(units, out=units)
         limit = np.iinfo(np.dtype(kind.number)).max
@@ -282,7 +286,7 @@ class LivoxEncoder(PacketEncoder):
         return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
-        """Write the common header fields of packets (n,).
+        """Write the common header fields of packets.
 
         `stamps_ns` (n,) are the send times since the start of the survey. The clock of a sensor
         that is not synchronized starts at 0.
@@ -295,7 +299,7 @@ class LivoxEncoder(PacketEncoder):
 
 
 def _imu_axes(source: PacketSource) -> Floats:
-    """Return the rotation (3, 3) from the axes of the platform's IMU to the sensor's axes."""
+    """Return the rotation from the axes of the platform's IMU to the sensor's axes."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
     on_platform = matrices(np.array([source.instruments.imu.quaternion]))[0]
@@ -303,7 +307,7 @@ def _imu_axes(source: PacketSource) -> Floats:
 
 
 def _with_checksums(packets: Records) -> Bytes:
-    """Return packets as bytes (n, size) after computing their CRC-32 checksums."""
+    """Return packets as bytes after computing their CRC-32 checksums."""
     payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
     packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
     return payloads

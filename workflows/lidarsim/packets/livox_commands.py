@@ -1,4 +1,4 @@
-"""Commands of Livox SDK2: frames with checksums, and parameters as key-value pairs.
+"""Commands of Livox SDK2, which are frames with checksums and with parameters as key-value pairs.
 
 Sources: Livox communication protocol of the Mid-360 (1.4.11); sdk_protocol.cpp, build_request.cpp
 and livox_lidar_def.h in Livox-SDK2 1.4.3. All numbers are little-endian.

@@ -1,9 +1,9 @@
-"""Command interface of a live Livox sensor: discovery, parameters and state messages.
+"""Command interface of a live Livox sensor, with discovery, parameters and state messages.
 
-Livox-SDK2 searches for sensors with broadcasts to port 56000. These do not reach a sensor on the
-same machine, and the SDK ignores datagrams from its own address. The simulated sensor therefore has
-a separate address, such as 127.0.0.2, and announces itself to the host every second as if the host
-had searched.
+Livox-SDK2 searches for sensors with broadcasts to port 56000. The broadcasts do not reach a sensor
+on the same machine, and the SDK ignores datagrams from its own address. The simulated sensor
+therefore has a separate address, such as 127.0.0.2, and announces itself to the host every second
+as if the host had searched.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .livox_commands import (
 from .service import Destination, Service, is_single_receiver
 
 SEARCH_PORT = 56_000
-_ANNOUNCE_S = 1.0  # same interval as searches of the SDK
+_ANNOUNCE_S = 1.0  # same interval as the SDK's discovery broadcasts
 _LOOKS_S = 0.1  # interval of checks whether the service should stop
 _MAX_REQUESTS = 200  # per second; further requests are dropped so that a flood takes little time
 _SEARCH_ANSWER = Struct("<BB16s4sH")
@@ -51,7 +51,7 @@ _WORK_MODES = (_SAMPLING, 2, 9)  # sampling, idle, ready
 _APPLICATION = 1  # firmware type
 _VERSION = bytes((1, 0, 0, 0))
 
-# {parameter that can be set: length}; parameters without effect on packets are only stored.
+# {parameter that can be set: length}. Parameters without effect on packets are only stored.
 _LENGTHS: dict[int, int] = {
     Key.DATA_TYPE: 1,
     Key.PATTERN: 1,
@@ -95,7 +95,7 @@ class LivoxService(Service):
     Parameters
     ----------
     address
-        HOST to listen on; the ports are those of Livox sensors.
+        HOST to listen on. The ports are those of Livox sensors.
     destination, send_to
         As in `Service`.
     state
@@ -245,7 +245,10 @@ class LivoxService(Service):
         return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
 
     def _set(self, data: bytes) -> bytes:
-        """Set all parameters of a request, or none if any value is invalid; return the response."""
+        """Set all parameters of a request and return the response.
+
+        If any value is invalid, no parameter is set.
+        """
         try:
             values = parse_values(data)
             for key, value in values.items():

@@ -1,4 +1,4 @@
-"""Ouster packets: lidar packets, IMU packets, and the metadata that readers need.
+"""Lidar packets and IMU packets of Ouster sensors, and the metadata that readers need.
 
 Sources: firmware user manual, sections "Lidar Packet Format" and "IMU Data Format"; parsing.cpp,
 packet.cpp, xyzlut.cpp and metadata.cpp in ouster-sdk 1.0.1; sample recordings of ouster-sdk.
@@ -111,7 +111,10 @@ class RangeUnits(NamedTuple):
 
 
 class ReturnImages(NamedTuple):
-    """Returns of n columns of c beams, as arrays (r, n, c) of up to r returns, nearest first."""
+    """Returns of n columns of c beams, with up to r returns per beam, nearest first.
+
+    All arrays have shape (r, n, c).
+    """
 
     range_m: AnyFloats  # range from the beam origin; 0 or NaN without a return
     reflectivity: Bytes
@@ -120,7 +123,7 @@ class ReturnImages(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeasurementBlocks:
-    """Columns as a sensor measures them: n columns in complete packets, highest beam first."""
+    """Columns in the order of measurement, which fill packets completely, highest beam first."""
 
     frames: Ints  # (n,): number of the revolution
     measurement_ids: Ints  # (n,): column in the revolution
@@ -306,7 +309,7 @@ class OusterEncoder(PacketEncoder):
         return profile
 
     def _check_sensor(self) -> None:
-        """Raise LidarError if the sensor differs from what Ouster packets can represent."""
+        """Raise LidarError if Ouster packets cannot represent the sensor."""
         sensor = self.source.sensor
         head = sensor.head
         if isinstance(head, Mirror):
@@ -370,7 +373,10 @@ class OusterEncoder(PacketEncoder):
         return [] if rest is None else self._lidar(rest)
 
     def _lidar(self, shots: Shots) -> list[Datagrams]:
-        """Return lidar packets of shots. The first and the last packet may lack columns."""
+        """Return the lidar packets of shots.
+
+        The first and the last packet may lack columns.
+        """
         if not len(shots):
             return []
         blocks = self._blocks(shots)
@@ -418,7 +424,7 @@ class OusterEncoder(PacketEncoder):
         """Return the metadata of the sensor in the format of firmware 3.1."""
         profile = self._profile.name
         rate_hz = int(self.source.sensor.head.rate_hz)  # type: ignore[attr-defined]
-        # Azimuths are clockwise here; rows are shifted by whole columns to face forward.
+        # Azimuths are clockwise here, and rows are shifted by whole columns to face forward.
         azimuth_deg = -self._azimuth_deg
         shifts = np.rint(azimuth_deg * self._columns / 360).astype(int).tolist()
         beam_pose = np.eye(4)
@@ -470,7 +476,7 @@ class OusterEncoder(PacketEncoder):
         }
 
     def _lidar_pose(self) -> Floats:
-        """Return the pose (4, 4) of the head in the sensor frame, millimeters."""
+        """Return the pose of the head in the sensor frame, in millimeters."""
         sin, cos = sin_cos(np.radians(self.source.sensor.head.zero_deg))  # type: ignore[attr-defined]
         pose = np.eye(4)
         pose[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -478,7 +484,7 @@ class OusterEncoder(PacketEncoder):
         return pose
 
     def _imu_pose(self) -> Floats:
-        """Return the pose (4, 4) of the IMU in the sensor frame in mm; identity without one."""
+        """Return the pose of the IMU in the sensor frame in mm, or the identity without an IMU."""
         instruments = self.source.instruments
         if instruments is None or instruments.imu is None:
             return np.eye(4)
@@ -572,7 +578,7 @@ class OusterDecoder(PacketDecoder):
         return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
-        """Return the function that converts a scan to positions (rings, columns, 3) in meters."""
+        """Return the function that converts a scan to positions in meters."""
         if sensor not in self._tables:
             core = import_module("ouster.sdk.core")
             self._tables[sensor] = core.XYZLut(self._infos[sensor], False)

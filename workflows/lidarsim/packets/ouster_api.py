@@ -1,8 +1,8 @@
-"""Configuration interface of a live Ouster sensor: the HTTP API of firmware 3.0 and 3.1.
+"""Configuration interface of a live Ouster sensor, which is the HTTP API of firmware 3.0 and 3.1.
 
 Sources: sensor_http_imp.cpp, client.cpp and sensor_packet_source.cpp in ouster-sdk 1.0.1; the HTTP
-API documentation of the firmware. Clients can only set where packets are sent and whether they are
-sent; other properties of the simulated sensor cannot be changed.
+API documentation of the firmware. Clients can only set whether packets are sent and to which
+destination. Other properties of the simulated sensor cannot be changed.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from .http_service import (
 from .service import Destination
 
 _ROOT = "/api/v1/"
-_AUTO = "@auto"  # stands for the address of the client
+_AUTO = "@auto"  # placeholder for the address of the client
 _PORTS = ("udp_port_lidar", "udp_port_imu")
 _MODES = ("NORMAL", "STANDBY")
 
 
 class OusterApi(HttpService):
-    """Answers ouster-sdk, ouster-cli and ROS drivers.
+    """Service that answers requests of ouster-sdk, ouster-cli and ROS drivers.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ class OusterApi(HttpService):
         self._staged = staged
 
     def _apply(self) -> None:
-        """Activate the staged configuration, and send packets where it specifies."""
+        """Activate the staged configuration, and send packets to its destination."""
         self._active = self._staged
         numbers = [self._active[name] for name in _PORTS]
         if self._active["operating_mode"] == "STANDBY":

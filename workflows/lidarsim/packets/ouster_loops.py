@@ -1,4 +1,4 @@
-"""Compiled loops over pixels and checksums of Ouster packets, see ouster.py."""
+"""Compiled loops over pixels and checksums of Ouster packets (ouster.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -12,7 +12,7 @@ from raybeam.compiled import compiled
 
 from ..numerics.arrays import UInts64
 
-# Layouts of a pixel in 32-bit words, lowest bits first; sizes in bits are in brackets.
+# Layouts of a pixel in 32-bit words, with the lowest bits first and sizes in bits in brackets.
 SINGLE, DUAL, LOW_RATE = range(3)
 # SINGLE    range [up to 20] | reflectivity [8], 8 unused, signal [16] | near infrared [16]
 # DUAL      range [19], reflectivity [8 from 24] | the same for the second return
@@ -68,7 +68,10 @@ def write_pixels(returns, valid, layout, units, pixels):
 
 @cache
 def remainders() -> UInts64:
-    """Return the CRC remainders (8, 256) of a byte followed by 0 to 7 zero bytes."""
+    """Return the CRC remainders of each byte value followed by 0 to 7 zero bytes.
+
+    The result has shape (8, 256).
+    """
     tables = np.zeros((8, 256), np.uint64)
     remainder = np.arange(256, dtype=np.uint64)
     for _ in range(8):
@@ -83,10 +86,10 @@ def remainders() -> UInts64:
 
 @compiled()
 def checksums(words, tables, sums):
-    """Write the CRC-64 (ECMA-182) of each packet in `words` (n, k) to `sums` (n,).
+    """Write the CRC-64 (ECMA-182) of each packet in `words` to `sums`.
 
-    `words` are little-endian uint64. Eight bytes are processed at a time ("slicing by eight",
-    Kounavis and Berry 2005) with the `tables` from `remainders`.
+    `words` (n, k) are little-endian uint64. Eight bytes are processed at a time ("slicing by
+    eight", Kounavis and Berry 2005) with the `tables` from `remainders`.
     """
     for row in range(words.shape[0]):
         crc = _ALL_BITS

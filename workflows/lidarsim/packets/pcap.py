@@ -68,7 +68,7 @@ class PcapWriter:
         self._file.write(content.data)
 
     def _frames(self, group: Datagrams) -> Bytes:
-        """Return the frames of datagrams including their file headers, as an array (n, bytes)."""
+        """Return the frames of datagrams including their file headers, with one row per frame."""
         count, size = group.payloads.shape
         frames = np.zeros((count, _PAYLOAD_OFFSET + size), np.uint8)
         frames[:, _PAYLOAD_OFFSET:] = group.payloads
@@ -94,7 +94,7 @@ class PcapWriter:
         return pack(">HHHH", group.source_port or group.port, group.port, 8 + size, 0)
 
     def _udp_checksums(self, segments: Bytes) -> Bytes:
-        """Return the checksums of UDP segments (n, bytes) as big-endian bytes (n, 2)."""
+        """Return the checksums of UDP segments as big-endian bytes."""
         count, size = segments.shape
         padded = np.pad(segments, ((0, 0), (0, size % 2)))
         words = padded.view(">u2").sum(axis=1, dtype=np.int64)
@@ -121,7 +121,7 @@ def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> No
 
 
 def _complement(sums: Ints | Indices) -> Ints:
-    """Return the ones' complement checksums (RFC 1071) of sums (n,) of 16-bit words."""
+    """Return the ones' complement checksums (RFC 1071) of sums of 16-bit words."""
     folded = np.asarray(sums, np.int64)
     for _ in range(3):
         folded = (folded & 0xFFFF) + (folded >> 16)

@@ -1,4 +1,4 @@
-"""RoboSense packets: measurements (MSOP) and device data (DIFOP) of RS-LiDAR-16 and RS-Helios.
+"""Measurement (MSOP) and device data (DIFOP) packets of RoboSense RS-LiDAR-16 and RS-Helios.
 
 Sources: user manuals of the RS-LiDAR-16 and the RS-Helios-5515 (packets, return modes, appendix on
 times); decoder_RS16.hpp, decoder_RSHELIOS.hpp, chan_angles.hpp and basic_attr.hpp in rs_driver
@@ -53,7 +53,7 @@ _SIGNED_ANGLE = [("negative", "u1"), ("centidegrees", ">u2")]
 
 
 def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return a dtype of `size` bytes with fields {name: (offset, dtype)}."""
+    """Return a dtype of `size` bytes, given its fields as {name: (offset, dtype)}."""
     offsets, formats = zip(*fields.values(), strict=True)
     return np.dtype(
         {"names": list(fields), "offsets": offsets, "formats": formats, "itemsize": size}
@@ -215,7 +215,7 @@ class RobosenseEncoder(PacketEncoder):
         return Datagrams(_as_bytes(packets), due_ns, self.ports["msop"])
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots to blocks (n, 12) of `_BLOCK`."""
+        """Write azimuths and returns of shots to blocks of `_BLOCK`."""
         units = np.rint(shots.range_m / self._model.unit_m)
         fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype(np.uint16)
@@ -230,7 +230,7 @@ class RobosenseEncoder(PacketEncoder):
         blocks["azimuth"] = azimuths.reshape(len(blocks), self._firings)[:, firing]
 
     def _planes_in_order(self, shots: Shots) -> Ints:
-        """Return the return number (planes, n, lasers) that is stored in each plane of a packet."""
+        """Return the number of the return that is stored in each plane of a packet."""
         first = np.zeros((1, *shots.range_m.shape[1:]), np.int64)
         if self._planes == 1:
             return first
@@ -297,7 +297,7 @@ class RobosenseEncoder(PacketEncoder):
 
 
 def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
-    """Write times (n,) in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
+    """Write times in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
     micros = np.maximum(since_1970_ns + 500, 0) // 1000
     seconds, microseconds = np.divmod(micros, 1_000_000)
     if times.dtype == np.dtype(_SECONDS):
@@ -318,7 +318,7 @@ def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records (n,) as bytes (n, size)."""
+    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
 
 

@@ -219,7 +219,7 @@ def _close(file: IO[bytes] | None) -> None:
 
 
 def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
-    """Return datagrams preceded by their record headers, as an array (n, bytes)."""
+    """Return datagrams preceded by their record headers, with one row per datagram."""
     count, size = group.payloads.shape
     headers = np.zeros(count, _RECORD)
     headers["kind"] = DATAGRAM

@@ -1,8 +1,8 @@
-"""Process that sends datagrams at their due times, with records on stdin and reports on stdout.
+"""Script of the process that reads datagrams from stdin and sends them at their due times.
 
-`send.Sender` runs this file as a script. It imports only the standard library, so that it starts
-within milliseconds. It is a separate process, because a thread in the ray-casting process would
-share its lock and was 8 to 300 ms late.
+`send.Sender` runs this file as a script, which reports to stdout. It imports only the standard
+library, so that it starts within milliseconds. It is a separate process, because a thread in the
+ray-casting process would share the global interpreter lock and was 8 to 300 ms late.
 
 Each record begins with `HEADER`: its kind, the number of the sensor, the destination port, the
 source port (0 for any), the size of the content, and a time. A DATAGRAM record contains a payload
@@ -29,7 +29,7 @@ from typing import Any, NoReturn
 
 HEADER = Struct("<HHHHIq")  # kind, sensor, port, source port, size, time
 DATAGRAM, ROUTE, END = range(3)
-# Upper limits of lateness bins in milliseconds; a last bin counts all later datagrams.
+# Upper limits of lateness bins in milliseconds. A last bin counts all later datagrams.
 BINS_MS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 # Largest speed-up at which late datagrams of a sensor are sent, so that the receiver, whose buffers
 # hold only a few datagrams, does not lose any.
@@ -44,7 +44,7 @@ class Stop(Exception):  # noqa: N818 - not an error
 
 
 class Route:
-    """Where the datagrams of a sensor are sent, and when the last one was sent."""
+    """Destination of the datagrams of a sensor, and time of the last datagram."""
 
     def __init__(self) -> None:
         self.host = ""
@@ -65,13 +65,19 @@ class Route:
             self._source = values["source"]
 
     def open_from(self, port: int) -> socket.socket:
-        """Return the socket for a source port, where 0 means any; it is opened on first use."""
+        """Return the socket for a source port, which is opened on first use.
+
+        Port 0 stands for any port.
+        """
         if port not in self._sockets:
             self._sockets[port] = _open_socket(self._source, port)
         return self._sockets[port]
 
     def earliest_ns(self, due_ns: int) -> int:
-        """Return when a datagram may be sent: when it is due, or later if the last one was late."""
+        """Return the earliest time to send a datagram.
+
+        This is its due time, or a later time if the last datagram was late.
+        """
         return max(due_ns, self._sent_ns + (due_ns - self._due_ns) // _CATCH_UP)
 
     def mark_sent(self, due_ns: int) -> int:
@@ -130,7 +136,7 @@ class SendQueue:
         self._rest = content[start:]
 
     def next_ns(self) -> int | None:
-        """Return when the next datagram will be sent, or None if none is pending."""
+        """Return the time at which the next datagram will be sent, or None if none is pending."""
         if not self.waiting:
             return None
         due_ns, _, sensor, *_ = self.waiting[0]

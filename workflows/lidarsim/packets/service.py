@@ -15,10 +15,11 @@ _ANY_PORT = 9
 
 @dataclass(frozen=True)
 class Destination:
-    """Where the datagrams of a live sensor are sent."""
+    """Destination of the datagrams of a live sensor."""
 
     host: str  # IPv4 address
-    # {port of `Datagrams`: port of the host}. Other ports do not change; port 0 is not sent.
+    # {port of `Datagrams`: port of the host}. Other ports do not change. Datagrams for port 0 are
+    # not sent.
     ports: Mapping[int, int] = field(default_factory=dict)
 
 
@@ -57,14 +58,14 @@ class Service(ABC):
     def __init__(self, destination: Destination, send_to: Callable[[Destination], None]) -> None:
         self.destination = destination
         self.send_to = send_to
-        # Further names of this service in requests, besides the machine's names; set before the
-        # start.
+        # Further names of this service in requests, in addition to the machine's names. They must
+        # be set before the service starts.
         self.names: frozenset[str] = frozenset()
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """What a user needs to know to reach the service, shown when it is ready."""
+        """Instructions for reaching the service, which are shown when it is ready."""
 
     @abstractmethod
     def __enter__(self) -> Self:

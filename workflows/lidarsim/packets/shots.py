@@ -18,10 +18,10 @@ from ..sweeps.sweeps import Sweeps
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """n firings of c lasers in the manufacturer's order, each with up to r returns.
+    """Firings of lasers in the manufacturer's order, with up to r returns per laser.
 
-    The returns of a pulse have the same order as in the cloud, by range. A single return is the
-    first.
+    There are n firings of c lasers. The returns of a pulse have the same order as in the cloud, by
+    range. A single return is the first.
     """
 
     firings: Ints  # (n,): firing numbers since the start of the station
@@ -102,7 +102,7 @@ class Shots:
         shot = (image.plane * shape[1] + image.column) * shape[2] + lasers[image.row]
 
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
-            """Return point values (n,) as an array (r, n, c)."""
+            """Return point values as an array of shape (r, n, c)."""
             filled = np.full(shape, missing, values.dtype)
             filled.reshape(-1)[shot] = values
             return filled
@@ -134,7 +134,7 @@ _OF_FIRINGS = tuple(
 
 
 def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bools:
-    """Return whether firings (n,) of a sweep are in packets that are lost."""
+    """Return whether firings of a sweep are in packets that are lost."""
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
@@ -168,11 +168,11 @@ def settings_of(sensor: Sensor) -> PacketSettings:
 
 
 def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
-    """Return the last and the strongest returns for dual mode, as two arrays (n, c).
+    """Return the last and the strongest returns for dual mode.
 
-    `values` (r, n, c) are in the order of `Shots`, and `returned` (r, n, c) states whether each
-    return is sent. Where the last return is the strongest, the second array has the second
-    strongest return. A single return is in both arrays.
+    The results have shape (n, c). `values` (r, n, c) are in the order of `Shots`, and `returned`
+    (r, n, c) states whether each return is sent. Where the last return is the strongest, the second
+    array has the second strongest return. A single return is in both arrays.
     """
     if len(values) == 1:
         return [values[0], values[0]]
@@ -180,7 +180,10 @@ def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
 
 
 class CarryOver:
-    """Firings that do not fill a packet yet, because a revolution is not a multiple of packets."""
+    """Firings that do not fill a packet yet.
+
+    A revolution does not usually fill a whole number of packets.
+    """
 
     def __init__(self, firings_per_packet: int) -> None:
         self.firings_per_packet = firings_per_packet

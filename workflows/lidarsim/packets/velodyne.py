@@ -1,4 +1,4 @@
-"""Velodyne packets: VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and VLS-128.
+"""Packets of Velodyne VLP-16, Puck Hi-Res, VLP-32C, HDL-32E and VLS-128 sensors.
 
 Sources: user manuals of the VLP-16 (63-9243), VLP-32C and VLS-128; HDL-32E packet structure and
 timing (63-9277); packet_decoder.cpp in valgur/velodyne_decoder.
@@ -34,7 +34,8 @@ _AZIMUTHS = 36_000  # azimuth units per revolution
 _MAX_UNITS = 65_535
 _HOUR_US = 3_600_000_000
 _FLAG_BYTES = tuple(flag.tobytes() for flag in _FLAGS)  # possible first bytes of a packet
-# Laser of the VLS-128 whose time is the packet's time: the first of the fourth group of eight.
+# Laser of the VLS-128 whose time is the packet's time, which is the first laser in the fourth group
+# of eight.
 _STAMPED_LASER_OF_128 = 24
 
 _RETURN = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
@@ -120,7 +121,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return timestamps in µs of packets whose first firings start at `first_ns` (n,)."""
+        """Return the timestamps in µs of packets, given the start of their first firings."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
@@ -130,7 +131,7 @@ class VelodyneEncoder(PacketEncoder):
         return (stamps_ns + 500) // 1000 % _HOUR_US
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write flags, azimuths and returns of shots to blocks (n, 12) of `_BLOCK`."""
+        """Write flags, azimuths and returns of shots to blocks of `_BLOCK`."""
         channels = shots.range_m.shape[2]
         used = self._firings * channels * self._planes // _BLOCK_LASERS
         units = np.rint(shots.range_m / self._unit_m)
@@ -173,7 +174,10 @@ class VelodyneDecoder(PacketDecoder):
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram is a data packet. Position packets cannot be recognized."""
+        """Return whether a datagram is a data packet.
+
+        Position packets cannot be recognized.
+        """
         return len(payload) == _PACKET.itemsize and payload[:2] in _FLAG_BYTES
 
     def sweeps(self, sensor: int) -> Iterable[_Sweep]:

@@ -2,7 +2,8 @@
 
 Sources: user manual of the VLP-16 (63-9243), sections "Web Interface" and "Sensor Control with
 curl"; drivers that use the interface (Autoware's velodyne_monitor and nebula). Clients can only set
-the receiver and switch the laser; other properties of the simulated sensor cannot be changed.
+the receiver and switch the laser on or off. Other properties of the simulated sensor cannot be
+changed.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ class VelodyneState:
 
 
 class VelodyneApi(HttpService):
-    """Answers `cgi/status.json` and similar requests, and sets the receiver by `cgi/setting/host`.
+    """Service that answers requests such as `cgi/status.json` and `cgi/setting/host`.
+
+    The latter sets the receiver of the packets.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Velodyne position packets, which report the time of each second as an NMEA 0183 GPRMC sentence.
+"""Velodyne position packets, which report the time as an NMEA 0183 GPRMC sentence every second.
 
 Sources: user manual of the VLP-16 (63-9243), section 9.3.3, with the ratio of data to position
 packets; telemetry_packet.cpp in valgur/velodyne_decoder.
@@ -43,7 +43,9 @@ class Fix(NamedTuple):
 
 
 class PositionPackets:
-    """Position packets between the data packets of a sensor, one after every 14.
+    """Position packets between the data packets of a sensor.
+
+    There is one position packet for every 14 data packets.
 
     Each sentence belongs to the last full second. It contains the fix of the platform's GNSS
     receiver if latitudes are known, otherwise no fix. If the survey has no start time, the clock is
@@ -58,7 +60,7 @@ class PositionPackets:
         self._sentences: dict[int, bytes] = {}  # {second since 1970: sentence}
 
     def following(self, due_ns: Ints, stamps_ns: Ints) -> Datagrams:
-        """Return the position packets that follow data packets sent at `due_ns` (n,).
+        """Return the position packets that follow data packets sent at `due_ns`.
 
         `stamps_ns` (n,) are the same times on the sensor's clock.
         """
@@ -144,11 +146,11 @@ def gprmc(second: int, fix: Fix | None) -> bytes:
 
 
 def _angle(angle_deg: float, digits: int) -> str:
-    """Return an angle in the NMEA format of degrees, with `digits` digits, and minutes."""
+    """Return an angle in the NMEA format, with `digits` digits of degrees followed by minutes."""
     whole, rest = divmod(round(abs(angle_deg) * 60 * 100_000), 60 * 100_000)
     return f"{whole:0{digits}d}{rest / 100_000:08.5f}"
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records (n,) as bytes (n, size)."""
+    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)

@@ -10,7 +10,7 @@ from ..numerics.arrays import Floats
 
 
 def parse_rows(text: str, skip: int, columns: int) -> Floats:
-    """Return the numbers in the lines after a header, with shape (n, columns).
+    """Return the numbers in the lines after a header, with one row per line.
 
     `skip` is the number of header lines.
 

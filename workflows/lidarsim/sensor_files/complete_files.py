@@ -34,5 +34,5 @@ def write_complete_text(path: Path, text: str) -> None:
 
 
 def xml_comment(text: str) -> str:
-    """Return a text for an XML comment, which must not contain two consecutive hyphens."""
+    """Return a text for an XML comment, in which consecutive hyphens are separated."""
     return text.replace("--", "- -").rstrip("-")

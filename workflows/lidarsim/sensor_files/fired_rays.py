@@ -39,7 +39,7 @@ class RayList:
         int64 array (n,) of firing times in nanoseconds since the start of the list, or None if
         unknown.
     channels
-        int64 array (n,) with the channel of each ray; 0 is the lowest channel.
+        int64 array (n,) with the channel of each ray, where 0 is the lowest channel.
     origins
         float64 array (n, 3) of ray origins in meters, or None if all rays start at the sensor's
         center.
@@ -77,19 +77,19 @@ class RayList:
 
     @property
     def azimuths_deg(self) -> Floats:
-        """Azimuths (n,) in degrees within ±180, counterclockwise from x."""
+        """Azimuths in degrees within ±180, counterclockwise from x."""
         x, y, _ = self.directions.T
         return np.degrees(arctan2(y, x))
 
     @property
     def elevations_deg(self) -> Floats:
-        """Elevations (n,) in degrees above the xy plane."""
+        """Elevations in degrees above the xy plane."""
         x, y, z = self.directions.T
         return np.degrees(arctan2(z, np.sqrt(x * x + y * y)))
 
     @property
     def origins_or_center(self) -> Floats:
-        """Origins of the rays (n, 3) in meters, which are zero if all start at the center."""
+        """Origins of the rays in meters, which are zero if all start at the center."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
     def with_times(self) -> RayList:
@@ -102,7 +102,7 @@ class RayList:
 
 
 def directions_of(azimuths_deg: Floats, elevations_deg: Floats) -> Floats:
-    """Return the unit directions (n, 3) for azimuths and elevations (n,) in degrees."""
+    """Return the unit directions for azimuths and elevations in degrees."""
     up, level = sin_cos(np.radians(elevations_deg))
     sin, cos = sin_cos(np.radians(azimuths_deg))
     return np.column_stack([level * cos, level * sin, up])

@@ -18,7 +18,8 @@ from ..words import did_you_mean
 if TYPE_CHECKING:
     from .fired_rays import RayList
 
-# Properties besides directions that a format can store. {name: phrase for a missing property}
+# Properties other than directions that a format can store, as {name: phrase for a missing
+# property}.
 PROPERTIES = {
     "times": "times of the rays",
     "channels": "channels",
@@ -47,8 +48,8 @@ class SensorFormat:
         `write(path, rays, left_out)` writes rays and returns phrases for everything that the file
         does not store, starting with `left_out`, which come from `PROPERTIES`. Its function
         `read(path)` returns `RayList`, or None if the file has another format. If `describes` is
-        set, the function is `write(path, sensor, duration_s, left_out)` instead, for a pattern that
-        lasts `duration_s` seconds.
+        set, the function is `write(path, sensor, duration_s, left_out)` instead, which writes a
+        pattern that lasts `duration_s` seconds.
     words
         Short description.
     holds

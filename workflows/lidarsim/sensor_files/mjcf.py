@@ -1,6 +1,6 @@
-"""MuJoCo rangefinders (.xml): a body with a site and a rangefinder for each ray.
+"""MuJoCo models (.xml) that contain a body with a site and a rangefinder for each ray.
 
-A rangefinder measures along the z axis of its site in each simulation step, see
+A rangefinder measures along the z axis of its site in each simulation step. See
 https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
 """
 

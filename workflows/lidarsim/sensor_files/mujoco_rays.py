@@ -1,11 +1,11 @@
 """Angle arrays `theta` and `phi` for MuJoCo-LiDAR, in the form of its scan patterns.
 
-An .npz file contains the arrays. A Python file (.py) returns the arrays of a frame; it needs only
-NumPy.
+An .npz file contains the arrays. A Python file (.py) has a function that returns the arrays of a
+frame, and requires only NumPy.
 
 `theta` is the azimuth, counterclockwise from x, and `phi` the elevation above the xy plane. Both
 are in radians in the frame of a site, with x forward, y left and z up. MuJoCo-LiDAR casts all rays
-of a call at once; the times in the file are for programs that cast rays in parts.
+of a call at once. The times in the file are intended for programs that cast rays in parts.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _remark(rays: RayList, left_out: Sequence[str]) -> str:
-    """Return the comment in the file: the sensor, its axes, and missing properties."""
+    """Return the comment in the file, which states the sensor, its axes, and missing properties."""
     lacks = f" Not in this file: {'; '.join(left_out)}." if left_out else ""
     return f"{rays.name}. Axes: {AXES}; azimuths from x, counter-clockwise.{lacks}"
 

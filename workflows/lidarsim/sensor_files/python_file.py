@@ -1,4 +1,4 @@
-"""Python files (.py) that contain ray arrays by frame and need only NumPy."""
+"""Python files (.py) that contain ray arrays by frame and require only NumPy."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def python_text(
     functions
         Code of functions that return the rays of frame k, from _BOUNDS[k] to _BOUNDS[k + 1].
     arrays
-        Expressions for the arrays in the file. {name: code}
+        Expressions for the arrays in the file, as {name: code}.
     """
     assert rays.times_ns is not None and rays.cycle_ns is not None  # the caller sets both
     frames = max(round(rays.cycle_ns * rays.rate_hz / 1e9), 1)

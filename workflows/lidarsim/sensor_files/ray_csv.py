@@ -18,7 +18,7 @@ from .complete_files import write_complete_text
 from .fired_rays import RayList
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
 
-_DECIMALS = 9  # of angles; directions are written with all digits
+_DECIMALS = 9  # decimals of angles, whereas directions are written with all digits
 _TIMES = (*TIMES, "offset", "stamp", "fire_time")
 QUANTITIES = (
     Quantity("time_s", _TIMES, SECONDS, None),

@@ -1,4 +1,4 @@
-"""Header of ray files: name, ranges, rate and conventions, as plain values."""
+"""Header of ray files, with the name, ranges, rate and conventions as plain values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..words import printable
 from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, RayList, directions_of
 
 KIND = "rays of a sensor"
-# Column names of a table. Directions take precedence; the angles repeat them in degrees.
+# Column names of a table. Directions take precedence over the angles, which repeat them in degrees.
 TIME_COLUMN = "time_offset_ns"
 DIRECTION = ("direction_x", "direction_y", "direction_z")
 ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")

@@ -1,4 +1,4 @@
-"""Rays as NumPy arrays (.npz): a one-dimensional array for each column, and a JSON header."""
+"""Rays as NumPy arrays (.npz), with a one-dimensional array for each column and a JSON header."""
 
 from __future__ import annotations
 

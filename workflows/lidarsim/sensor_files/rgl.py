@@ -26,7 +26,7 @@ _STEEP = 0.9  # z component above which a ray is treated as vertical
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write arrays, each of which is the input of the node with its name."""
+    """Write arrays, each of which is named after the node that it is the input of."""
     times_ns = rays.with_times().times_ns
     assert times_ns is not None  # `with_times` sets the times
     header = {
@@ -54,7 +54,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _matrices(rays: RayList) -> Floats:
-    """Return matrices (n, 3, 4) that map the z axis to the rays.
+    """Return matrices that map the z axis to the rays.
 
     Their x axes are horizontal and point to the right of the rays, or to -y for vertical rays.
     """

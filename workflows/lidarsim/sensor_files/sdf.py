@@ -1,4 +1,4 @@
-"""Gazebo <gpu_lidar> sensors (.sdf), which must be regular grids.
+"""Gazebo <gpu_lidar> sensors (.sdf), whose rays must form regular grids.
 
 See http://sdformat.org/spec?ver=1.9&elem=sensor. Azimuths increase counterclockwise from x, and
 elevations are measured above the xy plane. Both are evenly spaced, in radians, including both ends.
@@ -120,7 +120,7 @@ class _Levels(NamedTuple):
 
 
 def _levels(angles_deg: Floats) -> _Levels:
-    """Return the distinct angles of rays (n,)."""
+    """Return the distinct angles of rays."""
     order = np.argsort(angles_deg, kind="stable")
     is_new = np.diff(angles_deg[order], prepend=-np.inf) > _SAME_DEG
     of_ray = np.empty(len(order), np.int64)
@@ -129,7 +129,7 @@ def _levels(angles_deg: Floats) -> _Levels:
 
 
 def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
-    """Return the ends and number of evenly spaced angles (k,).
+    """Return the ends and number of evenly spaced angles.
 
     Raises LidarError if the angles are not evenly spaced.
     """

@@ -1,7 +1,7 @@
 """Rays as a Python file (.py) for programs that cast rays with Warp, such as Isaac Lab.
 
-The file needs only NumPy. Its function `rays` returns origins, directions and times of the rays in
-a frame, in the sensor frame with x forward, y left and z up.
+The file requires only NumPy. Its function `rays` returns origins, directions and times of the rays
+in a frame, in the sensor frame with x forward, y left and z up.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class BodyPoses(NamedTuple):
 
     @property
     def moves(self) -> Bools:
-        """Boolean array of shape (k,), True for bodies that move during a sweep."""
+        """Mask of the bodies that move during a sweep. Shape (k,)."""
         return np.array([t is not None and t.moves for t in self.trajectories], np.bool_)
 
     def trajectory(self, number: int) -> Trajectory:
@@ -101,7 +101,7 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
 
 
 def check_matrices(matrices: Floats) -> None:
-    """Raise LidarError if matrices (k, 4, 4) are not rigid transforms."""
+    """Raise LidarError if matrices are not rigid transforms."""
     _check_finite(matrices)
     if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
         raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
@@ -131,7 +131,7 @@ def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
 
 
 def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPoses:
-    """Return poses of bodies that follow matrices (k, samples, 4, 4) at times (samples,)."""
+    """Return poses of bodies that follow matrices at times."""
     try:
         times = np.asarray(times_s, np.float64)
     except (TypeError, ValueError):
@@ -165,7 +165,7 @@ def _check_count(poses: int, names: int) -> None:
 
 
 def _check_finite(table: Floats) -> None:
-    """Raise LidarError with the index of the first pose that is not finite, if there is one."""
+    """Raise LidarError with the index of the first pose that is not finite, if any."""
     finite = np.isfinite(table).reshape(len(table), -1).all(axis=1)
     if not finite.all():
         first = int(finite.argmin())

@@ -21,21 +21,21 @@ from .steps.step_list import setup_of, steps_of
 
 MB = 1_000_000
 
-# Bytes, measured as the tracemalloc peak in `Rig.cast` and `columns_of` for a million rays that all
-# hit a sphere of 20,480 triangles. The measurement covered sensors with 128 beams and with a single
-# beam, a prism, static and moving platforms, all columns and none, 1 to 19 sub-rays, and a glass
-# sphere around the sensor. The "tiles" and "numpy" backends differed by at most 30 MB (2026-11-22,
-# Linux, NumPy 2.4). The estimate was 1.02 to 1.5 times the measured peak. If up to two returns may
-# be reported, it was 1.64 times the peak for pulses with one return, and 0.8 times the peak for
-# pulses with two. The process peak (VmHWM) was mostly below the tracemalloc peak, and at most
-# 16 % above it. tests/lidarsim/test_memory.py repeats a part of the measurement. The steps estimate
-# their memory on the same basis.
+# The sizes are in bytes and were measured as the tracemalloc peak in `Rig.cast` and `columns_of`
+# for a million rays that all hit a sphere of 20,480 triangles. The measurement covered sensors with
+# 128 beams and with a single beam, a prism, static and moving platforms, all columns and none, 1 to
+# 19 sub-rays, and a glass sphere around the sensor. The "tiles" and "numpy" backends differed by at
+# most 30 MB (2026-11-22, Linux, NumPy 2.4). The estimate was 1.02 to 1.5 times the measured peak.
+# If up to two returns may be reported, it was 1.64 times the peak for pulses with one return, and
+# 0.8 times the peak for pulses with two. The process peak (VmHWM) was mostly below the tracemalloc
+# peak, and at most 16 % above it. tests/lidarsim/test_memory.py repeats a part of the measurement.
+# The steps estimate their memory on the same basis.
 RAY = 28  # bytes per ray for its hit
-# Bytes per ray that is not cast repeatedly: while it is computed, and afterwards.
+# Bytes per ray that is not cast repeatedly, while it is computed and afterwards.
 COMPUTED_RAY = 92
 COMPUTED_RAY_RETAINED = 32
 RAY_AMONG_BODIES = 70  # bytes per ray in a scene with instances or actors
-# Bytes per pose of a firing: while it is computed, and afterwards.
+# Bytes per pose of a firing, while it is computed and afterwards.
 POSE = 140
 POSE_RETAINED = 100
 RETURNS = 1.5  # returns per pulse if all or two are reported; 1.1 to 1.6 in generated woods
@@ -65,7 +65,7 @@ PATTERN_RAY = 48  # bytes per ray in a period of the head, including its pattern
 
 
 def rig_bytes(scene: Scene, survey: Survey) -> int:
-    """Estimate the memory of a rig in bytes: the scene, its trees, and the stored ray patterns."""
+    """Estimate the memory in bytes of a rig's scene, trees, and stored ray patterns."""
     # Sensors for which different static objects are visible have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
@@ -91,7 +91,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
 
     The estimate assumes that all rays hit, and that all scans come from the sensor that needs the
     most memory. Columns computed by user functions count like built-in columns. Set `on_device` if
-    a CUDA device casts the rays; device memory, about 300 MB, is not included.
+    a CUDA device casts the rays. Device memory, about 300 MB, is not included.
     """
     setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
     on_device = on_device and not any(map(steps_of, setups))
@@ -156,7 +156,7 @@ def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
     if on_device and not needs_hits(setup.scene, survey):
         single_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
         return (PAGE_LOCKED + (0 if single_run else JOINED)) * columns
-    # NumPy computes all columns; columns from the device count once more.
+    # NumPy computes all columns. Columns that are copied from the device count once more.
     return POINT + POINT_BYTE * columns + columns * on_device
 
 

@@ -8,7 +8,7 @@ On a worker, a casting task turns scans into columns as follows:
    `PulseReturns` through the steps in the order of `step_list.py`:
 
    a. Steps aim the beams.
-   b. `CastStep` finds the hits of all sub-rays; `CastStep.apply` lists its passes. From here on,
+   b. `CastStep` finds the hits of all sub-rays. `CastStep.apply` lists its passes. From here on,
       `PulseReturns` has one row per hit.
    c. Steps add light that rain, spray and dirt scatter, as further hits.
    d. `SeparationStep` or `WaveformStep` combines hits into returns. The docstring of
@@ -153,7 +153,7 @@ class PulseCaster:
     def _within_range(self, scanned: ScannedReturns, scan_starts: Ints) -> ScannedReturns:
         """Remove the returns whose range, including noise, is outside the sensor's range limits.
 
-        If `keep_every` is 1, the removed returns are treated as undetected: counts and return
+        If `keep_every` is 1, the removed returns are treated as undetected, so counts and return
         numbers are adjusted. If it is larger, the returns have already been thinned out. Then the
         counts are reduced only by the removed returns among the kept ones, and the selection of
         kept returns does not change.
@@ -193,7 +193,9 @@ class PulseCaster:
         return returns
 
     def _cast_once(self, batch: PulseBatch, scan_starts: Ints, tally: bool) -> ScannedReturns:
-        """Cast rays that have at most one return each; the caster counts and thins out the hits.
+        """Cast rays that have at most one return each.
+
+        The caster counts and thins out the hits.
 
         Energies are computed here only if steps deflect beams before casting (`Role.AIMS`), and
         only for kept returns. Otherwise `BatchPoints` computes them from the reported directions.

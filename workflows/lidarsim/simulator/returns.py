@@ -30,7 +30,7 @@ SURFACE = CAUSES.index("surface")
 
 
 def select_rows(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
-    """Yield the selected rows of each column. A column that is None yields None."""
+    """Yield the selected rows of each column, or None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
             yield column.T.take(row_selection, axis=-1).T
@@ -63,7 +63,8 @@ class PulseReturns(NamedTuple):
     # Full width at half maximum of the pulse in ns, and its height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
-    # Recorded waveform (`columns.waveforms.record`); `BatchPoints` adds `location_ps` and `toward`.
+    # Recorded waveform (`columns.waveforms.record`), to which `BatchPoints` adds `location_ps` and
+    # `toward`.
     waveform: Records | None = None
     number: Bytes | None = None  # number among the reported returns of the pulse, starting at 1
     return_counts: Bytes | None = None  # number of reported returns of the pulse
@@ -76,7 +77,7 @@ class PulseReturns(NamedTuple):
 
     @classmethod
     def single_returns(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
-        """Return a table in which each ray (n,) has a single return without noise."""
+        """Return a table in which each ray has a single return without noise."""
         single = np.ones(len(ray), np.uint8)
         return cls(ray, distance, triangle, number=single, return_counts=single, reported=distance)
 

@@ -130,7 +130,10 @@ class Rig:
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
-        """Return a rig in which the actors follow new trajectories; trees are shared."""
+        """Return a rig in which the actors follow new trajectories.
+
+        Both rigs share their trees.
+        """
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
         rig._actor_trajectories = ActorTrajectories.from_actors(actors)
@@ -153,9 +156,9 @@ class Rig:
     def with_moved_instances(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
         """Return a rig in which the instances of the objects `owners` have moved to new poses.
 
-        `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations (k, 3,
-        3), as in `Scene.moved`. The trees are shared and modified, so this rig must
-        not be used afterwards, and no cast may be in progress.
+        `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations
+        (k, 3, 3), as in `Scene.moved`. The trees are shared and modified, so this rig must not be
+        used afterwards, and no cast may be in progress.
         """
         assert self.scene.instances is not None
         instance_indices, index = self.scene.instances.rows_of(owners)
@@ -315,7 +318,7 @@ class Rig:
 
         `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
         increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
-        from the platform frame to the scene frame; they are not checked here. The result is a
+        from the platform frame to the scene frame. They are not checked here. The result is a
         float32 array of shape (k, firings, channels) with the range of the nearest reported return
         in meters, or inf if there is no return.
         """

@@ -162,7 +162,7 @@ class _FewRays(Sensor):
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the sensor's ray for each firing (k,) of this sample."""
+        """Return the sensor's ray for each firing of this sample."""
         # Multiples of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)

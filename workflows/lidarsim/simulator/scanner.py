@@ -1,4 +1,4 @@
-"""`Scanner`, which simulates a sensor in a scene sweep by sweep."""
+"""The `Scanner` class, which simulates a sensor in a scene sweep by sweep."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 class Scanner:
     """A simulated sensor that scans a scene in the current process, without a cluster or files.
 
-    The results are bit-identical to those of a survey along the same trajectory: sweep `number` is
+    The results are bit-identical to those of a survey along the same trajectory. Sweep `number` is
     the revolution (or frame) of the survey with this number. The random numbers are also the same
     if the sensor is the first sensor of the survey. Scanners with the same name and the same noise
     seed use the same random numbers.
@@ -68,7 +68,7 @@ class Scanner:
         Name of the sensor, on which all of its random numbers depend. Use different names for the
         sensors of a robot. A `Mounted` lidar already has a name.
     unseen
-        Names of objects that are invisible to the sensor, as in `Mounted`; * and ? are wildcards.
+        Names of objects that are invisible to the sensor, as in `Mounted`. * and ? are wildcards.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
     fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
     spray_g_m3
@@ -566,7 +566,7 @@ def _trajectory_of(pose: Any) -> Trajectory:
 
 
 def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
-    """Return positions (k, 3), and rotations (k, 3, 3) or None if the poses are positions."""
+    """Return positions, and rotations or None if the poses are positions."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):

@@ -15,7 +15,7 @@ from .shot import SIZE
 from .theme import apply_colormap
 
 COLORS = "viridis"
-MAX_FIRINGS = 8  # firings that are drawn for sensors with several channels
+MAX_FIRINGS = 8  # number of firings that are drawn for sensors with several channels
 
 
 class _BeamPlot(NamedTuple):
@@ -29,9 +29,9 @@ class _BeamPlot(NamedTuple):
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, colored by time.
 
-    A sensor with several channels shows `MAX_FIRINGS` firings, a sensor with a single channel one
-    frame. A sensor that looks down shows two mirror cycles: its rays lie in a plane, so their angle
-    is plotted over time.
+    For a sensor with several channels, `MAX_FIRINGS` firings are drawn, and for a sensor with a
+    single channel one frame. For a sensor that looks down, two mirror cycles are drawn. Its rays
+    lie in a plane, so their angle is plotted over time.
     """
     page = Page(size)
     firings_per_revolution = round(getattr(sensor.head, "firings_per_turn", 1000))
@@ -68,13 +68,13 @@ def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
 
 
 def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
-    """Plot the angles of directions (n, 3) in a vertical plane over times (n,)."""
+    """Plot the angles of directions in a vertical plane over times."""
     _, y, z = directions.T
     return _BeamPlot(times, np.degrees(np.arctan2(y, -z)), (f"time, {unit}", "angle, degrees"))
 
 
 def _plot_directions(directions: Floats) -> _BeamPlot:
-    """Plot the azimuths and elevations of directions (n, 3)."""
+    """Plot the azimuths and elevations of directions."""
     x, y, z = directions.T
     middle = np.degrees(np.arctan2(y[0], x[0]))  # avoids a jump at 180 degrees
     azimuth = np.degrees(np.arctan2(y, x))

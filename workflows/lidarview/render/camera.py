@@ -20,18 +20,18 @@ class Camera:
 
     eye: Floats  # (3,) meters
     axes: Floats  # (3, 3) unit vectors to the right, up, and forward as rows
-    focal: float  # length in pixels
-    center: Floats  # (2,) principal point in pixels; it may lie outside the image
+    focal: float  # focal length in pixels
+    center: Floats  # (2,) principal point in pixels, which may lie outside the image
     size: tuple[int, int]  # width and height in pixels
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Return unit direction vectors (n, 3) through pixel coordinates (n, 2)."""
+        """Return unit direction vectors through pixel coordinates."""
         plane = (np.asarray(pixels, dtype=np.float64) - self.center) / self.focal
         rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
         return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the pixel coordinates (n, 2) of points (n, 3), and their distances from the eye.
+        """Return the pixel coordinates of points, and their distances from the eye.
 
         Points beside or behind the eye have the coordinates NaN.
         """
@@ -42,7 +42,7 @@ class Camera:
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def sample_image(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
-        """Return the values (n,) of an image at pixels (n, 2).
+        """Return the values of an image at pixels.
 
         Pixels outside the image have the value `outside`.
         """
@@ -94,7 +94,7 @@ def fit_camera(
 
 
 def _camera_axes(azimuth: float, elevation: float) -> Floats:
-    """Return `Camera.axes` (3, 3) for a camera in a direction from the scene, given in radians."""
+    """Return `Camera.axes` for a camera in a direction from the scene, given in radians."""
     horizontal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     back = horizontal * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
     right = np.array([-horizontal[1], horizontal[0], 0.0])

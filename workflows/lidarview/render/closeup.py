@@ -1,4 +1,4 @@
-"""Choose the part of a scene to show: around trajectories, and below a roof."""
+"""Choose the part of a scene to show, around trajectories and below a roof."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from raybeam import RayCaster
 
 from .surface import golden_spiral
 
-# The margin around a trajectory is the largest of a share of its length, a multiple of its height
-# above the lowest point of the scene, and a minimum in meters.
+# The margin around a trajectory is the largest of a fraction of its length, a multiple of its
+# height above the lowest point of the scene, and a minimum in meters.
 _MARGIN_SHARE = 0.35
 _MARGIN_HEIGHTS = 2.0
 _MIN_MARGIN_M = 25.0
-_MAX_SHARE = 0.5  # the whole scene is shown if the box covers a larger share of its area
+_MAX_SHARE = 0.5  # the whole scene is shown if the box covers a larger fraction of its area
 
-_MIN_ROOF_SHARE = 0.7  # share of steep upward rays that must hit the scene if there is a roof
+_MIN_ROOF_SHARE = 0.7  # minimum fraction of steep upward rays that hit the scene below a roof
 _STEEP_DEG = 60.0
 _RAYS = 64
 _MAX_SPREAD = 0.5  # heights above a sensor with a larger relative spread are a tree, not a roof
-_CONTACT = 1e-3  # rays start at this share of the diagonal, off the surface that a sensor is on
+_CONTACT = 1e-3  # distance of ray starts from a sensor's surface, as a fraction of the diagonal
 _MAX_POSITIONS = 8  # sensor positions from which rays are cast
 
 
 def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | None:
-    """Return a box (2, 3) around trajectories, or None if the box covers most of the scene.
+    """Return a box around trajectories, or None if the box covers most of the scene.
 
     `bounds` (2, 3) is the bounding box of the scene, and each trajectory has shape (k, 3), in
     meters. The box extends down to the lowest point of the scene.
@@ -53,10 +53,11 @@ def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | 
 def floor_and_cut_heights(
     scene: Scene, caster: RayCaster, positions: Floats
 ) -> tuple[float | None, float | None]:
-    """Return the height of the floor below positions, and the height of a cut that opens the scene.
+    """Return the height of the floor below positions, and the height at which to cut the scene.
 
-    `positions` has shape (p, 3); all values are in meters. The cut is halfway up to the roof, or
-    None if there is no roof. The floor is None if there is no surface below a position.
+    `positions` has shape (p, 3), and all values are in meters. The cut opens the scene halfway up
+    to the roof. It is None if there is no roof. The floor is None if there is no surface below a
+    position.
     """
     sampled = positions[
         np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POSITIONS)).astype(int)
@@ -83,7 +84,7 @@ def floor_and_cut_heights(
 
 
 def _relative_spread(heights: Floats) -> float:
-    """Return the interquartile range of heights (n,) divided by their median.
+    """Return the interquartile range of heights divided by their median.
 
     The result is 0 if there are no heights.
     """
@@ -99,7 +100,7 @@ class ScenePart:
 
     scene: Scene
     parents: Ints  # (f,) triangle of the uncut scene from which each triangle is cut
-    shares: Floats  # (f,) share of the parent's area
+    shares: Floats  # (f,) fraction of the parent's area
 
     @classmethod
     def from_scene(cls, scene: Scene) -> ScenePart:
@@ -107,7 +108,7 @@ class ScenePart:
         return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
 
     def cut(self, box: Floats) -> ScenePart:
-        """Return the part inside a box (2, 3), or this part if nothing is inside.
+        """Return the part inside a box, or this part if nothing is inside.
 
         Objects narrower than the box are kept completely if their center is inside. Wider objects,
         such as the ground, are cut at the sides of the box. All objects are cut at the top, because
@@ -154,8 +155,9 @@ def _clip_triangles(
 ) -> tuple[Floats, Ints, Ints]:
     """Clip triangles to the half-space ``sign * (coordinate - limit) <= 0``.
 
-    A triangle with one corner inside becomes a smaller triangle; a triangle with two corners inside
-    becomes two triangles. Returns vertices (v, 3), faces (f, 3), and the parent (f,) of each face.
+    A triangle with one corner inside becomes a smaller triangle, and a triangle with two corners
+    inside becomes two triangles. The result contains vertices (v, 3), faces (f, 3), and the parent
+    (f,) of each face.
     """
     beyond = sign * (vertices[:, axis] - limit)
     outside = beyond[faces] > 0  # (f, 3)
@@ -181,7 +183,7 @@ def _clip_triangles(
 
 
 def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floats:
-    """Return the points (n, 3) where the edges between vertices cross a plane.
+    """Return the points where the edges between vertices cross a plane.
 
     `beyond` (v,) are the signed distances of all vertices from the plane.
     """

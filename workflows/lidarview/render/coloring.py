@@ -1,4 +1,4 @@
-"""Choose the colors of points by one of their columns, and the matching legend."""
+"""Choose the colors of points by one of their columns, with a matching legend."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ NO_MATERIAL = "no material"
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a color scale
 _GRAY = 0.5
 # The scale of a column is logarithmic if the column allows it and either the values differ by the
-# first factor and the median is in this lowest share of their range, or the values differ by the
-# last factor. Columns such as heights do not allow it: for heights from 0.1 to 20 m, half of a
-# logarithmic scale would cover the lowest 1.4 m.
+# first factor and the median is in this lowest fraction of their range, or the values differ by the
+# last factor. Columns such as heights do not allow it, because for heights from 0.1 to 20 m, half
+# of a logarithmic scale would cover the lowest 1.4 m.
 _SKEWED_RATIO = 10.0
 _SKEWED_MEDIAN = 0.1
 _WIDE_RATIO = 30.0
@@ -48,18 +48,18 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 class Coloring:
     """Colors for the values of a column, with a scale between two limits or with labels."""
 
-    # Returns the colors (n, 3), from 0 to 1, of values (n,)
+    # Function that returns the colors (n, 3), from 0 to 1, of values (n,).
     paint: Callable[[AnyArray], Floats]
     name: str  # name of the column
     unit: str  # unit of the limits
     meaning: str
-    limits: tuple[float, float] | None = None  # ends of the scale; None for labels
+    limits: tuple[float, float] | None = None  # ends of the scale, or None for labels
     logarithmic: bool = False
-    # Name and color of each existing label, the most frequent first if there are many
+    # Name and color of each existing label, with the most frequent first if there are many.
     labels: tuple[tuple[str, Floats], ...] = ()
-    values: tuple[int, ...] = ()  # values of the column, one for each label
+    values: tuple[int, ...] = ()  # value of each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
-    divisor: float = 1.0  # divides values to get the unit of the limits
+    divisor: float = 1.0  # divisor that converts values to the unit of the limits
 
 
 def add_composed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -85,7 +85,7 @@ def column_values(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
 
 
 def normal_colors(normals: AnyArray) -> Bytes:
-    """Return the colors (n, 3) of unit normals (n, 3), gray for NaN.
+    """Return the colors of unit normals, with gray for NaN.
 
     Points that are not on a surface have the normal NaN.
     """
@@ -144,7 +144,7 @@ def make_coloring(
 
 
 def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Coloring:
-    """Return a color for each label (k,), in the order of the legend."""
+    """Return a color for each label, in the order of the legend."""
     count = max(len(names), int(labels.max(initial=0)) + 1)
     colors = object_colors(min(count, MAX_COLORS))
     gray = len(colors)
@@ -184,7 +184,7 @@ def _number_coloring(
     percentiles: tuple[float, float],
     chosen_limits: tuple[float, float] | None,
 ) -> Coloring:
-    """Return a scale for values (n,) between two percentiles or between given limits."""
+    """Return a scale for values between two percentiles or between given limits."""
     finite = np.isfinite(values)
     lower = 0.0
     middle = 0.5
@@ -226,7 +226,7 @@ def _number_coloring(
 def _scale_painter(
     limits: _Range, divisor: float, logarithmic: bool, scale: Floats
 ) -> Callable[[AnyArray], Floats]:
-    """Return a function that maps values (n,) to colors (n, 3) of a scale (256, 3).
+    """Return a function that maps values to the colors of a scale.
 
     The values are divided by `divisor` to get the unit of the limits.
     """

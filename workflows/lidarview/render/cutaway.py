@@ -12,19 +12,18 @@ from .surface import RenderMesh, dot, golden_spiral
 
 MAX_SENSORS = 8  # number of sensors whose surroundings are tested
 MAX_LAYERS = 12  # number of removed surfaces on a ray; walls have two faces, and roofs have beams
-ENCLOSED = 0.7  # minimum share of horizontal rays that hit the scene if sensors are indoors
-HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller share of the sensors' hits
+ENCLOSED = 0.7  # minimum fraction of horizontal rays that hit the scene if sensors are indoors
+HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller fraction of the sensors' hits
 
 
 @dataclass(frozen=True, eq=False)
 class Cutaway:
     """The rule that selects which surfaces are removed.
 
-    A hit is removed if three conditions hold: its object surrounds the sensors in plan view, the
-    hit is in the outer shell of the object, and its plane has the camera on one side and most
-    sensors on the other. Both faces of the walls in front and the roof are therefore removed, while
-    the walls at the back, the floor, and objects inside are kept, regardless of the winding and
-    grouping of triangles.
+    A hit is removed if its object surrounds the sensors in plan view, the hit is in the outer shell
+    of the object, and its plane has the camera on one side and most sensors on the other. Both
+    faces of the walls in front and the roof are therefore removed, while the walls at the back, the
+    floor, and objects inside are kept, regardless of the winding and grouping of triangles.
     """
 
     surface: RenderMesh
@@ -35,14 +34,14 @@ class Cutaway:
 
     @classmethod
     def from_sensors(cls, surface: RenderMesh, sensors: Floats, eye: Floats) -> Cutaway:
-        """Determine the surfaces that hide sensors at positions (p, 3) from a camera at `eye`."""
+        """Determine the surfaces that hide sensors at positions from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
         inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
         width = np.where(np.isfinite(core).all(axis=1), core[:, 1] - core[:, 0], 0.0)
         core[:, 0, :2] += 0.06 * width[:, :2]
         core[:, 1, :2] -= 0.06 * width[:, :2]
-        # The roof and objects below it: everything above the middle between sensors and top.
+        # The roof and objects below it are everything above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
         # Hills are not walls. An object below the sensors that only faces up is ground.
         facing = np.full(len(core), np.inf)
@@ -51,7 +50,7 @@ class Cutaway:
         return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
     def is_removed(self, points: Floats, triangle: Ints) -> Bools:
-        """Return a mask (n,) of the hits at points (n, 3) on triangles (n,) that are removed."""
+        """Return a mask of the hits at points on triangles that are removed."""
         owner = self.surface.scene.face_object[triangle]
         lower = self.core[owner, 0]
         upper = self.core[owner, 1]
@@ -67,7 +66,7 @@ class Cutaway:
 
 
 def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Return a cutaway that lets a camera see the surroundings of sensors at positions (p, 3).
+    """Return a cutaway that lets a camera see the surroundings of sensors at positions.
 
     Returns None if the sensors are outdoors, or if the camera sees enough without a cutaway.
     """
@@ -89,7 +88,7 @@ def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | N
 
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Return origins and directions (p * count, 3) of rays from sensors between two elevations."""
+    """Return origins and directions of rays from sensors between two elevations."""
     rays = golden_spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 
@@ -130,7 +129,7 @@ def cast_with_cutaway(
 def is_blocked(
     surface: RenderMesh, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Return a mask of the rays (n, 3) that hit a surface within `reach` meters.
+    """Return a mask of the rays that hit a surface within `reach` meters.
 
     Removed surfaces do not block rays.
     """

@@ -29,18 +29,20 @@ FOCAL_PX = 922.0  # focal length in pixels, for a field of view of 55 degrees
 _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
-_HEADING_SHARE = 0.12  # the heading is averaged over this share of the film before and after
-# A circling camera: its distance as a multiple of the size, and the tangent of its elevation.
+# The heading is averaged over this fraction of the film before and after each frame.
+_HEADING_SHARE = 0.12
+# Distance of a circling camera as a multiple of the size, and tangent of its elevation.
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
-# As multiples of the focus distance: closer surfaces are omitted, and distant surfaces fade.
+# Distances below which surfaces are omitted, and at which they fade, as multiples of the focus
+# distance.
 _MIN_FOCUS = 0.3
 _HAZE_FOCUS = 6.0
 # Brightness of old points, and the number of frames in which new points fade to it.
 _OLD_BRIGHTNESS = 0.42
 _FADE_FRAMES = 3.0
 _POINT_RADIUS = 2.3  # half pixels
-_NOISE = 0.02  # distance of a point from its surface, as a share of its range
+_NOISE = 0.02  # distance of a point from its surface, as a fraction of its range
 
 
 class _Shape(NamedTuple):
@@ -83,7 +85,7 @@ class _FilmPoints:
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Discard all points except those in a mask (n,)."""
+        """Discard all points except those in a mask."""
         self.positions = self.positions[chosen]
         self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]
@@ -97,9 +99,9 @@ class Film:
     """
 
     moments_ns: Floats  # (k,) times of the frames
-    # New points (n, 3) in each frame, and their RGBA colors (n, 4) from 0 to 1
+    # New points (n, 3) in each frame, and their RGBA colors (n, 4) from 0 to 1.
     new_points: Iterable[tuple[Floats, Floats]]
-    keep_share: float  # share of the points that later frames show as well
+    keep_share: float  # fraction of the points that later frames show as well
     scene_triangles: AnyFloats  # (f, 3, 3) corners of the scene's triangles
     top: float  # height above which the scene is cut open
     actors: Sequence[Actor]
@@ -110,7 +112,7 @@ class Film:
     range_m: float = 1.0  # typical range of the platform's points
 
     def frames(self) -> Iterator[Bytes]:
-        """Yield the frames, uint8 arrays of shape (height, width, 3).
+        """Yield the frames as uint8 arrays of shape (height, width, 3).
 
         New points are brighter than old points. Old points in front of all surfaces are omitted,
         because they show where an actor was in an earlier frame.
@@ -188,7 +190,7 @@ def _draw_points(
 
 
 def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
-    """Draw the positions (k, 3) of the platform as a line that ends in a disc."""
+    """Draw the positions of the platform as a line that ends in a disc."""
     pen = ImageDraw.Draw(frame)
     pixels, _ = camera.project(positions)
     line = [(float(x), float(y)) for x, y in pixels if max(abs(x), abs(y)) < _MAX_PIXEL]
@@ -198,7 +200,7 @@ def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> N
 
 
 def _shape(corners: AnyFloats, color: Floats) -> _Shape:
-    """Prepare triangles with corners (f, 3, 3) for ray casting."""
+    """Prepare triangles with corners for ray casting."""
     normals = normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, color)
@@ -207,7 +209,7 @@ def _shape(corners: AnyFloats, color: Floats) -> _Shape:
 def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces, and return the RGBA image (height, width, 4) and the depth (height, width).
+    """Draw surfaces, and return the RGBA image and the depth.
 
     The depth is in meters.
     """
@@ -234,7 +236,7 @@ def _draw_surfaces(
 
 
 def _edges(inverse_depth: Floats) -> Floats:
-    """Return the strength (height, width, 1) of the edges between surfaces.
+    """Return the strength of the edges between surfaces. Shape (height, width, 1).
 
     The inverse depth of a plane is linear in the image. Beyond an edge, it falls below this line.
     """

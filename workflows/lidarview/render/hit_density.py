@@ -105,9 +105,9 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square meter on triangles (f,), given the hits on each triangle.
+    """Return the hits per square meter on triangles, given the hits on each triangle.
 
-    If most triangles are so small that they have at most one hit, neighbors share their hits: each
+    If most triangles are so small that they have at most one hit, neighbors share their hits. Each
     triangle passes a third of its hits to each corner, and each corner distributes them by area.
     This is repeated until a density is estimated from a dozen hits. The total number of hits is
     preserved.
@@ -131,7 +131,7 @@ def _rounds(hit_counts: Floats) -> int:
 
 
 def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Floats:
-    """Distribute hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
+    """Distribute hits over the triangles that share a corner, in proportion to area."""
     corner_hits = np.zeros(vertices)
     corner_areas = np.zeros(vertices)
     for corner in faces.T:
@@ -141,12 +141,12 @@ def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Fl
         corner_hits, corner_areas, out=np.zeros_like(corner_hits), where=corner_areas > 0
     )
     shared = area * density[faces].sum(axis=1)
-    # Triangles without area have no density; they keep their hits.
+    # Triangles without area have no density and keep their hits.
     return np.where(area > 0, shared, hit_counts)
 
 
 def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale for densities on areas (f,).
+    """Choose the ends of a logarithmic scale for densities on areas.
 
     Few hits are on surfaces below the scale, and little area is above it.
     """
@@ -162,7 +162,7 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
 
 
 def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
-    """Return colors (..., 3) for densities (...,).
+    """Return colors for densities.
 
     Surfaces that only share the hits of their neighbors fade to gray at low densities. Surfaces
     with hits, marked by the mask `hit` (...,), never do.
@@ -177,7 +177,7 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
 def _divide(
     pieces: Floats32, hit: Bools, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, Floats]:
-    """Divide triangles with hits (f,) as long as the grid cells contain enough points.
+    """Divide triangles with hits as long as the grid cells contain enough points.
 
     Returns the pieces, their owners, their areas, and their points per square meter, which are NaN
     for undivided triangles.
@@ -224,7 +224,7 @@ def _divide(
 
 
 class _WeightGrid:
-    """Sums of the weights (n,) of positions (n, 3) in the cells of a grid."""
+    """Sums of the weights of positions in the cells of a grid."""
 
     def __init__(self, positions: Floats32, weights: Floats, width: float, lower: Floats32) -> None:
         self._width = width
@@ -234,7 +234,7 @@ class _WeightGrid:
         self._sums = np.bincount(cells, weights)
 
     def interpolate(self, positions: Floats32) -> Floats:
-        """Return sums (n,) at positions (n, 3), interpolated between the eight nearest cells."""
+        """Return sums at positions, interpolated between the eight nearest cells."""
         offsets = (positions - self._lower) / self._width - 0.5
         total = np.zeros(len(positions))
         cells = np.floor(offsets).astype(np.int64)
@@ -248,13 +248,13 @@ class _WeightGrid:
 
 
 def _keys(cells: Ints) -> Ints:
-    """Return a unique number (n,) for each cell (n, 3)."""
+    """Return a unique number for each cell."""
     cells = cells + 1  # so that neighbors of the lowest cell are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
 def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
-    """Return the index and the length of the longest edge of each piece, shape (k,)."""
+    """Return the index and the length of the longest edge of each piece. Shape (k,)."""
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 

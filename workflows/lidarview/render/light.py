@@ -21,7 +21,7 @@ ROTATIONS = (
     0.02,
 )  # rotation of the sky and sun lights between neighboring grid points, in radians
 SUN_RADIUS_RAD = 0.045  # ten times the real radius, for soft shadows
-SUN_SHARE = 0.4  # share of the sun in the light on open horizontal ground
+SUN_SHARE = 0.4  # fraction of the light on open horizontal ground that comes from the sun
 THIN_OPENNESS = 0.5  # openness of surfaces that are too thin to contain a grid point
 # Brightness of a surface that faces the light.
 AMBIENT = 0.24
@@ -35,14 +35,14 @@ class LightMap:
 
     camera: Camera
     sun: Floats  # (3,) unit vector toward the sun
-    openness: Floats32  # (rows, columns) unblocked share of the light, from 0 to 1
+    openness: Floats32  # (rows, columns) unblocked fraction of the light, from 0 to 1
     position: Floats32  # (rows, columns, 3) meters; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
 
     def brightness(
         self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
     ) -> Floats32:
-        """Return the brightness (n,) of points by Lambert's law and the visible part of the sky.
+        """Return the brightness of points by Lambert's law and the visible part of the sky.
 
         `pixels` (n, 2) are the pixel coordinates of the points, and `position` and `normal` (n, 3)
         their positions and normals. `ground` (n,) marks points on the ground, which keep their
@@ -54,7 +54,7 @@ class LightMap:
         return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
 
     def _openness_at(self, pixels: Floats, position: Floats32, normal: Floats32) -> Floats32:
-        """Interpolate the openness (n,) between nearby grid points on the same surface."""
+        """Interpolate the openness between nearby grid points on the same surface."""
         rows, columns = self.openness.shape
         tolerance = plane_tolerance(self.camera, position, STRIDE)
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
@@ -79,7 +79,7 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return how well points (n, 3) match the surface at other points, from 0 to 0.4.
+    """Return the similarity of points to the surface at other points, from 0 to 0.4.
 
     `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
     surface lie within `tolerance` (n,) meters of each other's plane.
@@ -90,14 +90,14 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance (n,) in meters for points on a plane that are `stride` pixels apart."""
+    """Return the tolerance in meters for points on a plane that are `stride` pixels apart."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
 
 
 def _sun_direction(camera: Camera) -> Floats:
-    """Return the direction (3,) of the sun.
+    """Return the direction of the sun.
 
     The sun is behind the camera on the left, so shadows fall to the right.
     """
@@ -149,7 +149,7 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return the number, 0 to 3, of each grid point with a surface in its block of two by two.
+    """Return the number (0 to 3) of each grid point with a surface in its block of two by two.
 
     `has_surface` has shape (rows, columns).
     """
@@ -158,7 +158,7 @@ def _quarters(has_surface: Bools) -> Ints:
 
 
 def _rotated(direction: Floats, rotation: float) -> Floats:
-    """Return a direction (3,) in four rotations about z, `rotation` radians apart."""
+    """Return a direction in four rotations about z, `rotation` radians apart."""
     x, y, z = direction
     angles = rotation * np.arange(4)
     cos = np.cos(angles)

@@ -1,4 +1,4 @@
-"""Draw a sensor's scan pattern: a frame, and the coverage of the field of view over time."""
+"""Draw a sensor's scan pattern, with a frame and the coverage of the field of view over time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CELL_DEG = 0.28  # width of a coverage cell, which is the beam width of Livox se
 FIELD_S = 4.0  # the cells that are hit within this time are the field of view
 CONVENTIONS = "azimuth in degrees from x (forward) to y (left); elevation above the xy plane"
 _COVERED = to_rgb(theme.OBJECT_COLORS[0])
-_FIRST_FIRINGS = 8  # firings that are drawn for sensors with several channels
+_FIRST_FIRINGS = 8  # number of firings that are drawn for sensors with several channels
 _MAX_FRAME_RAYS = 300_000  # longer frames are thinned out to every n-th firing
 _CHUNK_RAYS = 1_000_000
 _WIDE = 2.0  # charts are stacked if the field of view has a larger aspect ratio
@@ -74,8 +74,9 @@ def draw_pattern(path: Path, sensor: Sensor) -> None:
 def pattern_page(sensor: Sensor) -> Page:
     """Draw a sensor's frame, colored by time, and the coverage after each of `TIMES_S`.
 
-    For sensors with prisms, whose patterns do not repeat, the covered share of the field of view is
-    stated. For a sensor that looks down, the angle over time is drawn instead, as in `beam_page`.
+    For sensors with prisms, whose patterns do not repeat, the covered fraction of the field of view
+    is stated. For a sensor that looks down, the angle over time is drawn instead, as in
+    `beam_page`.
     """
     if isinstance(sensor, LineSensor):
         page = beam_page(sensor)
@@ -144,19 +145,19 @@ def _firings_per_second(sensor: Sensor) -> float:
 
 
 def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
-    """Return the azimuths and elevations (n,) of the rays in firings."""
+    """Return the azimuths and elevations of the rays in firings."""
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
     return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
 
 
 def _times_s(sensor: Sensor, firings: Ints) -> Floats:
-    """Return the times (n,) of the rays in firings, relative to the start of the sensor."""
+    """Return the times of the rays in firings, relative to the start of the sensor."""
     times_ns = sensor.times_ns(firings).reshape(-1).astype(np.float64)
     return (times_ns - sensor.start_ns) / 1e9
 
 
 def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
-    """Return the rows and columns (n,) of the cells that contain directions."""
+    """Return the rows and columns of the cells that contain directions."""
     rows = ((elevations_deg + 90) / CELL_DEG).astype(np.int64)
     return rows, ((azimuths_deg + 180) / CELL_DEG).astype(np.int64)
 
@@ -265,7 +266,7 @@ def _draw_rays(
     scale: _TimeScale,
     area: float,
 ) -> None:
-    """Draw rays as dots with an area, colored by their times (n,)."""
+    """Draw rays as dots with an area, colored by their times."""
     axes.scatter(
         *angles_deg,
         s=area * page.unit**2,

@@ -34,7 +34,7 @@ from .stage import make_axis, nice_step
 DPI = 200
 FONT = "DejaVu Sans"  # included in Matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are drawn as small dots
-MAX_PATH_POINTS = 200  # points on the drawn trajectory of a sensor
+MAX_PATH_POINTS = 200  # maximum number of points on the drawn trajectory of a sensor
 # Areas of markers with one and two digits, in square points for a picture 1600 pixels wide.
 _MARK = 62
 _MARK_OF_TWO_DIGITS = 92
@@ -54,7 +54,7 @@ MIN_AXIS = 36.0  # a shorter height axis has no tick labels
 
 
 class Page:
-    """A picture under construction, with a size (width, height) in pixels."""
+    """A picture under construction, whose size is its width and height in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -250,7 +250,7 @@ class Page:
     def draw_lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
     ) -> None:
-        """Draw the visible parts of line segments (n, 2, 3) in the color of sensors."""
+        """Draw the visible parts of line segments in the color of sensors."""
         runs = shot.visible_segments(segments, shot.project_visible)
         axes.add_collection(
             LineCollection(
@@ -405,7 +405,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a color bar with colors (n, 3) and a title in the right margin."""
+        """Draw a color bar with colors and a title in the right margin."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
@@ -487,7 +487,7 @@ def _label_in_full(axis: Axis) -> None:
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Return the grid lines (n, 2, 3) on the ground: its border, and a line at each tick."""
+    """Return the border of the ground, and a line at each tick. Shape (n, 2, 3)."""
     (x0, y0), (x1, y1) = shot.stage.ground.tolist()
     level = shot.stage.level
     x_ticks, y_ticks = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
@@ -498,7 +498,7 @@ def _grid(shot: SurfaceView) -> Floats:
 
 
 def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
-    """Return the ends (3,) and the outward direction (2,) in pixels of the x, y, and z axis."""
+    """Return the ends of the x, y, and z axes, and their outward directions in pixels."""
     corners = shot.stage.corners
     flat, _ = shot.camera.project(corners)
     middle, _ = shot.camera.project(corners.mean(axis=0)[None])

@@ -1,4 +1,4 @@
-"""Draw pictures of a scene: its objects, its hit density, and its points."""
+"""Draw pictures of the objects, the hit density, and the points of a scene."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from .picture_page import LEGEND_ROWS, Page, robot_name
 from .shot import SurfaceView
 
 MAX_POINTS = 1_000_000  # maximum number of drawn points; a picture has only a few more pixels
-MAX_HITS = 200_000  # hit points for estimating the density
-MAX_PIECES = 100_000  # additional triangles from dividing large ones
+MAX_HITS = 200_000  # number of hit points for estimating the density
+MAX_PIECES = 100_000  # maximum number of additional triangles from dividing large triangles
 SOLID_RADIUS = 5.0  # minimum radius in half pixels where gaps are closed
 # More rays from a trajectory would hide the surfaces.
 MAX_RAYS = 600
 MAX_RAYS_OF_PATHS = 150
-# An object that covers this share of the ground is a floor or a hall.
+# An object that covers this fraction of the ground is a floor or a hall.
 MIN_FLOOR_SHARE = 0.6
 
 
 def draw_scene(shot: SurfaceView, triangles: int) -> Page:
-    """Draw a scene with the sensors, each object in its own color.
+    """Draw a scene and its sensors, with a separate color for each object.
 
     If a scene has more objects than a legend has rows, copies of an object share a color. A scene
     with colors is drawn in these colors, without a legend. `triangles` is the number of triangles
@@ -108,7 +108,7 @@ def _sensor_label(shot: SurfaceView) -> str:
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
-    """Select some of the rays (n, 2, 3) that end in the picture."""
+    """Select some of the rays that end in the picture."""
     slack = 1e-3 * shot.stage.size
     lowest, highest = shot.stage.bounds
     ray_ends = sample_rays[:, 1]
@@ -190,7 +190,7 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
 
 
 def _object_colors(scene: Scene, kinds: Ints) -> Floats:
-    """Return the colors (objects, 3) of a scene's objects, one color for each group.
+    """Return the colors of a scene's objects, one color for each group.
 
     Floors and halls are gray, so that the objects inside stand out.
     """
@@ -209,9 +209,9 @@ def _object_colors(scene: Scene, kinds: Ints) -> Floats:
 def draw_points(
     image: Floats32, shot: SurfaceView, points: Floats, colors: Floats, solid: bool = False
 ) -> Floats32:
-    """Draw points (n, 3) as discs over an image.
+    """Draw points as discs over an image.
 
-    Only points on the visible surface of their pixel are drawn; all other points are hidden, or on
+    Only points on the visible surface of their pixel are drawn. All other points are hidden, or on
     a wall that has been removed. The points are lit like the surface. If `solid` is set, larger
     discs close the gaps between points.
     """
@@ -244,7 +244,7 @@ def draw_points(
 
 
 def draw_discs(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float) -> Floats32:
-    """Draw discs at pixels (n, 2) in RGBA colors (n, 4) from 0 to 1.
+    """Draw discs at pixels in RGBA colors from 0 to 1.
 
     `radius` is in half pixels. If discs overlap, the nearest center determines the color of a
     pixel.
@@ -278,5 +278,5 @@ def draw_discs(image: Floats32, pixels: Floats, colors: AnyFloats, radius: float
 
 
 def _pack_colors(colors: AnyFloats) -> UInts32:
-    """Pack RGBA colors (..., 4) from 0 to 1 into 32-bit integers (...,)."""
+    """Pack RGBA colors from 0 to 1 into 32-bit integers."""
     return np.round(255 * colors).astype(np.uint8).view(np.uint32)[..., 0]

@@ -24,7 +24,7 @@ from .light import STRIDE, LightMap, make_light_map, plane_tolerance, surface_si
 from .stage import PlotBox
 from .surface import RenderMesh, normalize, separate_objects
 
-SIZE = (1600, 1000)  # pixels of a finished picture
+SIZE = (1600, 1000)  # width and height of a finished picture in pixels
 # Frame of the scene. The title is above, and the legend or color bar is on the right.
 FRAME = (0.08, 0.115, 0.79, 0.91)
 # Values in place of a triangle index.
@@ -32,9 +32,9 @@ SKY = -1
 GROUND = -2
 # Offsets of the samples in an edge pixel from its center, in pixels.
 _EDGE_OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-STEPS = 700  # points along a line at which visibility is tested
-# Shares of the scene's diagonal: the gap between touching objects, and the distance at which rays
-# start in front of the pieces of a triangle.
+STEPS = 700  # number of points along a line at which visibility is tested
+# Gap between touching objects, and distance at which rays start in front of the pieces of a
+# triangle, as fractions of the scene's diagonal.
 _OBJECT_GAP = 5e-6
 _PIECE_GAP = 1e-6
 
@@ -50,7 +50,7 @@ class RaySamples:
     distance: Floats32  # (n,) in meters, infinite for the sky
     position: Floats32  # (n, 3) in meters, NaN for the sky
     normal: Floats32  # (n, 3) unit length, NaN for the sky
-    light: Floats32  # (n,) brightness, 1 on open ground
+    light: Floats32  # (n,) brightness, which is 1 on open ground
     weights: Floats32  # (n, 3) weights of the triangle's corners
 
     def scatter(self, which: Ints, count: int) -> RaySamples:
@@ -71,7 +71,7 @@ class RaySamples:
         return result
 
     def paint(self, face_colors: Floats, contrast: float) -> Floats32:
-        """Return the premultiplied RGBA colors (n, 4) of the samples.
+        """Return the premultiplied RGBA colors of the samples.
 
         `face_colors` has shape (f, 3), or (f, 3, 3) with colors at the corners. `contrast` is the
         strength of light and shade.
@@ -103,9 +103,9 @@ class SurfaceView:
     models: str  # sensor models, for a second caption
     stage: PlotBox
     camera: Camera
-    pixel_samples: RaySamples  # one through each pixel center
+    pixel_samples: RaySamples  # one sample through each pixel center
     edges: Ints  # (e,) pixels that show the edge of a surface
-    edge_samples: RaySamples  # several for each edge pixel, in the order of `edges`
+    edge_samples: RaySamples  # several samples for each edge pixel, in the order of `edges`
 
     @property
     def scene(self) -> Scene:
@@ -114,7 +114,7 @@ class SurfaceView:
 
     @property
     def depth(self) -> Floats32:
-        """Distance (height, width) from the camera to the surface in meters.
+        """Distance from the camera to the surface in meters. Shape (height, width).
 
         Pixels without a surface have an infinite distance.
         """
@@ -192,7 +192,7 @@ class SurfaceView:
     def visible_segments(
         self, segments: Floats, is_visible: Callable[[Floats], tuple[Floats, Bools]]
     ) -> list[Floats]:
-        """Split line segments (n, 2, 3) into their visible pieces.
+        """Split line segments into their visible pieces.
 
         `is_visible` returns the pixel coordinates of points and a visibility mask. The result
         contains the pixel coordinates (2, 2) of the ends of each piece.
@@ -301,7 +301,7 @@ class _OpenScene(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """Remark on the displayed part for a caption; empty if the whole scene is shown."""
+        """Remark on the displayed part for a caption, or an empty string for the whole scene."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)
@@ -345,7 +345,7 @@ class _Viewpoint:
     reach: float  # in meters; surfaces farther away cast no shadow on a point
 
     def sample(self, pixels: Floats) -> RaySamples:
-        """Cast rays through pixel coordinates (n, 2).
+        """Cast rays through pixel coordinates.
 
         The light of the samples is set to 1.
         """
@@ -379,7 +379,7 @@ class _Viewpoint:
 def _choose_viewpoint(
     surface: RenderMesh, stage: PlotBox, positions: Floats, size: tuple[int, int], has_motion: bool
 ) -> _Viewpoint:
-    """Place a camera, and remove the walls and roofs that hide sensors at positions (p, 3)."""
+    """Place a camera, and remove the walls and roofs that hide sensors at positions."""
     # Moving objects are on the ground between other objects, so the camera looks down more steeply.
     camera = _camera(stage, size, 48.0 if has_motion else 33.0)
     cutaway = plan_cutaway(surface, positions, camera.eye)
@@ -392,14 +392,14 @@ def _choose_viewpoint(
 
 
 def _pixel_centers(size: tuple[int, int]) -> Floats:
-    """Return the coordinates (pixels, 2) of all pixel centers."""
+    """Return the coordinates of all pixel centers."""
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     return np.asarray(grid.reshape(-1, 2) + 0.5)
 
 
 def _add_light(samples: RaySamples, pixels: Floats, light: LightMap) -> None:
-    """Set the light of samples at pixel coordinates (n, 2)."""
+    """Set the light of samples at pixel coordinates."""
     lit = np.flatnonzero(samples.triangle != SKY)
     is_ground = samples.triangle[lit] == GROUND
     samples.light[lit] = light.brightness(
@@ -428,7 +428,7 @@ def _camera(stage: PlotBox, size: tuple[int, int], elevation_deg: float) -> Came
 
 
 def _outline(stage: PlotBox, camera: Camera) -> Bools:
-    """Return a mask (pixels,) of the pixels that show the plot box."""
+    """Return a mask of the pixels that show the plot box."""
     limits = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
     flat, _ = camera.project(list(product(*limits)))
     image = Image.new("1", camera.size)
@@ -439,7 +439,7 @@ def _outline(stage: PlotBox, camera: Camera) -> Bools:
 
 
 def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
-    """Return the distances (n,) in meters from the eye to the ground along directions (n, 3)."""
+    """Return the distances in meters from the eye to the ground along directions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]
         position = eye[:2] + distance[:, None] * directions[:, :2]
@@ -448,7 +448,7 @@ def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
 
 
 def _edges(samples: RaySamples, scene: Scene, camera: Camera) -> Bools:
-    """Return a mask (pixels,) of the pixels whose surface differs from that of a neighbor."""
+    """Return a mask of the pixels whose surface differs from that of a neighbor."""
     width, height = camera.size
     kind = np.append(scene.face_object, [GROUND, SKY])[samples.triangle]
     number = np.arange(width * height).reshape(height, width)

@@ -1,4 +1,4 @@
-"""Define the box around a scene: the ground below it, and round ticks along its axes."""
+"""Define the plot box around a scene, with the ground below it and ticks along its axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Axis:
     """The ticks of an axis."""
 
     title: str  # name, offset of the labels, and unit
-    ticks: Floats  # (n,) local meters; round numbers in world coordinates
+    ticks: Floats  # (n,) local, in meters, at round world coordinates
     labels: tuple[str, ...]  # world coordinates minus the offset in the title
 
 
@@ -38,15 +38,15 @@ class PlotBox:
 
     @property
     def corners(self) -> Floats:
-        """Corners (4, 3) of the ground, counterclockwise from the lowest x and y."""
+        """Corners of the ground, counterclockwise from the lowest x and y. Shape (4, 3)."""
         (x0, y0), (x1, y1) = self.ground
         return np.array([[x, y, self.level] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
 
     @classmethod
     def from_bounds(cls, bounds: Floats, origin: Floats) -> PlotBox:
-        """Build the plot box for local bounds (2, 3), which may be flat or a single point.
+        """Build the plot box for local bounds, which may be flat or a single point.
 
-        `origin` (3,) is the world position of the local origin.
+        `bounds` has shape (2, 3), and `origin` (3,) is the world position of the local origin.
         """
         lower, upper = bounds
         widest = float((upper - lower).max()) or 1.0

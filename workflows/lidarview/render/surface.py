@@ -38,7 +38,7 @@ class RenderMesh:
         return cls(scene, caster, normalize(doubled), normalize(at_vertices))
 
     def normals(self, triangle: Ints, u: Floats, v: Floats, toward: Floats) -> Floats:
-        """Return the shading normals (n, 3) at hits, on the side that the ray comes from.
+        """Return the shading normals at hits, on the side that the ray comes from.
 
         The normals are interpolated between the corners (Phong 1975). At creases, the normal of the
         face replaces that of the corner. `toward` (n, 3) are the directions of the rays.
@@ -90,7 +90,7 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
 
 
 def _shared_corners(scene: Scene, objects: Integers) -> Ints:
-    """Return a number (v,) for each vertex, equal for vertices of an object at the same position.
+    """Return a number for each vertex, equal for vertices of an object at the same position.
 
     Files such as .stl store separate vertices for each triangle, which must not come apart.
     """
@@ -104,12 +104,12 @@ def _shared_corners(scene: Scene, objects: Integers) -> Ints:
 
 
 def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Return the dot products (...,) of vectors (..., 3)."""
+    """Return the dot products of vectors."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def golden_spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
-    """Distribute unit vectors (count, 3) evenly over the sphere between two values of z."""
+    """Distribute unit vectors evenly over the sphere between two values of z."""
     n = np.arange(count)
     azimuth = 2 * np.pi * 0.6180339887 * n
     height = lowest + (highest - lowest) * (n + 0.5) / count
@@ -118,6 +118,6 @@ def golden_spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floa
 
 
 def normalize(vectors: Floats) -> Floats:
-    """Scale vectors (n, 3) to unit length, except zero vectors."""
+    """Scale vectors to unit length, except zero vectors."""
     length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1.0)

@@ -19,7 +19,7 @@ MUTED = "#5d6876"
 CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
 SENSOR = "#e0182d"
-RANGE_COLORS = "viridis_r"  # colormap of range images; yellow is close
+RANGE_COLORS = "viridis_r"  # colormap of range images, in which short ranges are yellow
 VEIL = 0.085  # opacity of MUTED over the page, which is the color of the ground
 # In pictures within an HTML page, the style sheet of the page defines these colors.
 STYLED = {
@@ -27,8 +27,8 @@ STYLED = {
     SENSOR: "sensor",
 }  # fmt: skip
 
-# Distinct even for most color-blind readers. The colors follow the "bright" and "muted" sets by
-# Paul Tol (2021), in an order that keeps neighbors distinct.
+# The colors are distinct even for most color-blind readers. They follow the "bright" and "muted"
+# sets by Paul Tol (2021), in an order that keeps neighbors distinct.
 OBJECT_COLORS = (
     "#4477aa", "#ee7733", "#44aa77", "#cc6677", "#66b8d9", "#ccaa33",
     "#8a63b0", "#997755", "#88aa44", "#cc77b8", "#336688", "#b0574f",
@@ -41,7 +41,7 @@ def rgb(color: str) -> Floats:
 
 
 def object_colors(count: int) -> Floats:
-    """Return distinct colors for objects, shape (count, 3), with values from 0 to 1.
+    """Return distinct colors for objects, with values from 0 to 1. Shape (count, 3).
 
     The first twelve colors come from `OBJECT_COLORS`. Further colors are spread over the hues by
     the golden angle, with three levels of lightness.
@@ -55,5 +55,5 @@ def object_colors(count: int) -> Floats:
 
 
 def apply_colormap(name: str, fraction: ArrayLike) -> Floats:
-    """Return the colors (n, 3) of a Matplotlib colormap at fractions (n,) from 0 to 1."""
+    """Return the colors of a Matplotlib colormap at fractions from 0 to 1."""
     return np.asarray(matplotlib.colormaps[name](np.asarray(fraction)), dtype=np.float64)[..., :3]

@@ -18,16 +18,16 @@ from ..render.surface import separate_objects
 from ..render.theme import apply_colormap
 from .legends import Legend, make_legend, scale_legend
 
-# Surfaces are moved inward by this share of the scene's diagonal, but by at most 2 cm, the same
-# share of `_MAX_SIZE_M`.
+# Surfaces are moved inward by this fraction of the scene's diagonal, but by at most 2 cm, which is
+# the same fraction of `_MAX_SIZE_M`.
 _INWARD_SHARE = 1e-4
 _MAX_SIZE_M = 200.0
-HITS_SAMPLE = 500_000  # points for estimating the hit density on large triangles
+HITS_SAMPLE = 500_000  # number of points for estimating the hit density on large triangles
 
 # The page receives all triangles, 50 bytes each, whenever the coloring changes.
 MAX_TRIANGLES = 300_000
 
-MAX_PIECES = 60_000  # additional triangles from dividing large ones
+MAX_PIECES = 60_000  # maximum number of additional triangles from dividing large triangles
 
 
 class DisplayMesh:
@@ -41,7 +41,7 @@ class DisplayMesh:
     scene
         The scene.
     reflectance
-        (objects,) share of light that each object reflects, or None if unknown.
+        (objects,) fraction of light that each object reflects, or None if unknown.
     max_triangles
         Maximum number of triangles.
     face_materials

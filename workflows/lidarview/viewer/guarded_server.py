@@ -27,7 +27,7 @@ from tornado.httputil import (
 from tornado.iostream import IOStream
 from tornado.web import Application
 
-MAX_BODY_BYTES = 4096  # our pages send no bodies
+MAX_BODY_BYTES = 4096  # the pages of this package send no bodies
 MAX_CONNECTIONS = 64  # a browser opens six at a time
 REQUEST_WITHIN_S = 10.0  # time limit for a request, from the connection or the last response
 _MAX_BUFFER_BYTES = 256 << 10  # buffer of a connection, for 64 kB of headers and a body
@@ -49,7 +49,7 @@ Check = Callable[[RequestStartLine, HTTPHeaders], Refusal | None]
 
 
 def guarded_server(application: Application, check: Check) -> HTTPServer:
-    """Return a server that passes a request to the application only if `check` returns None."""
+    """Return a server that passes requests to the application only if `check` returns None."""
     server = _GuardedServer(
         application, max_body_size=MAX_BODY_BYTES, max_buffer_size=_MAX_BUFFER_BYTES
     )

@@ -19,7 +19,10 @@ Legend = dict[str, Any]  # sent to the page as JSON
 
 
 def make_legend(coloring: Coloring) -> Legend:
-    """Return the legend of a coloring: a scale with numbers, or labels with their values."""
+    """Return the legend of a coloring.
+
+    The legend is a scale with numbers, or labels with their values.
+    """
     if coloring.name in (RGB.name, NORMALS.name):
         return scale_legend(coloring.meaning, (), np.empty((0, 3)))
     if coloring.limits is None:

@@ -35,7 +35,7 @@ class PackedColumn(NamedTuple):
 
 
 def pack_column(values: AnyArray) -> PackedColumn:
-    """Pack the values (n,) of a column.
+    """Pack the values of a column.
 
     Integers are stored exactly unless their span exceeds 2**31. Floating-point values are quantized
     to 4,095 levels.
@@ -70,7 +70,7 @@ def pack_column(values: AnyArray) -> PackedColumn:
 
 
 def pack_positions(positions: Floats) -> tuple[PackedColumn, PackedColumn, PackedColumn]:
-    """Pack the x, y, and z coordinates of positions (n, 3).
+    """Pack the x, y, and z coordinates of positions.
 
     The step is 1/50,000 of the longest side of the points, ignoring outliers.
     """
@@ -89,7 +89,7 @@ def _pack_axis(values: Floats, step: float) -> PackedColumn:
 
 
 def byte_planes(codes: Ints) -> Bytes:
-    """Return the byte planes of the zigzag-encoded differences between neighboring codes (n,).
+    """Return the byte planes of the zigzag-encoded differences between neighboring codes.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Select points of a cloud for display: by scan, by column values, and for a camera."""
+"""Select points of a cloud for display by scan, by column values, and for a camera."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ STATION = Column("station", "int64", "", "station from which the point was scann
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK_ROWS = 1 << 15  # rows that are read at a time
-_SAMPLE_POINTS = 200_000  # points for estimating the number of points in each tile
+_SAMPLE_POINTS = 200_000  # number of points for estimating the number of points in each tile
 _TILE_COLUMNS = 48
 _TILE_ROWS = 27
-TILES = _TILE_COLUMNS * _TILE_ROWS  # tiles of an image
-_KEEP_SHARE = 0.8  # share of the points that is kept whenever there are too many
+TILES = _TILE_COLUMNS * _TILE_ROWS  # number of tiles of an image
+_KEEP_SHARE = 0.8  # fraction of the points that is kept whenever there are too many
 
 
 class InMemoryPoints:
@@ -77,7 +77,7 @@ class JoinedPoints:
     table: tuple[Column, ...]
 
     def __init__(self, results: Sequence[Points]) -> None:
-        # First row of each result, followed by the total number of rows
+        # First row of each result, followed by the total number of rows.
         self._firsts = np.cumsum([0, *map(len, results)])
         # (first row, points) of each result
         self.results = [*zip(self._firsts[:-1].tolist(), results, strict=True)]
@@ -105,7 +105,7 @@ class JoinedPoints:
 
 @dataclass(frozen=True, eq=False)
 class StationPoints:
-    """Points with an additional column: the station from which each point was scanned."""
+    """Points with an additional column for the station from which each point was scanned."""
 
     points: CloudFile | InMemoryPoints | JoinedPoints
     scans: Ints  # (n,) first scan of each sweep, ascending
@@ -207,7 +207,7 @@ class PointFilter:
         )
 
     def mask(self, points: Points, row_selection: Ints | slice) -> Bools:
-        """Return a mask (n,) of the selected rows with finite positions that pass the filter."""
+        """Return a mask of the selected rows with finite positions that pass the filter."""
         x, y, z = (points.values(axis, row_selection) for axis in AXES)
         is_kept = np.asarray(np.isfinite(x + y + z))
         for name, lower, upper in self.limits:
@@ -243,7 +243,7 @@ def parse_scans(text: str) -> ScanRanges:
 
 @dataclass(frozen=True, eq=False)
 class BrowserCamera:
-    """The camera of a page: a matrix (4, 4) from local coordinates to clip coordinates."""
+    """The camera of a page, which is a 4 x 4 matrix from local coordinates to clip coordinates."""
 
     matrix: Floats
 
@@ -259,7 +259,7 @@ class BrowserCamera:
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
-        """Project points (n, 3) to image coordinates from -1 to 1.
+        """Project points to image coordinates from -1 to 1.
 
         Returns the coordinates (n, 2), and a mask (n,) of the points inside the image.
         """
@@ -268,11 +268,11 @@ class BrowserCamera:
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
     def _clip(self, points: AnyFloats) -> AnyFloats:
-        """Return the clip coordinates (4, n) of points (n, 3)."""
+        """Return the clip coordinates of points."""
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:
-        """Return the image tile (n,) of each point (n, 3), or -1 for points outside the image."""
+        """Return the image tile of each point, or -1 for points outside the image."""
         projected, inside = self.project(points)
         x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
         column = (x_share * _TILE_COLUMNS).astype(np.int64)
@@ -280,32 +280,32 @@ class BrowserCamera:
         return np.where(inside, row * _TILE_COLUMNS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
-        """Return False if a box (2, 3) is certainly outside the image."""
+        """Return False if a box is certainly outside the image."""
         x, y, z, w = self._clip(box_corners(box))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
 
 
 def box_corners(box: Floats) -> Floats:
-    """Return the corners (8, 3) of a box (2, 3)."""
+    """Return the corners of a box. Shape (8, 3)."""
     return np.array(list(itertools.product(*box.T)))
 
 
 def even_shares(counts: AnyArray, max_points: int) -> Floats:
-    """Return the share of points to show in each tile so that all tiles show equally many.
+    """Return the fraction of points to show in each tile so that all tiles show equally many.
 
     Tiles with fewer points show all of them. All tiles together show `max_points`. `counts` and the
-    shares have shape (t,).
+    result have shape (t,).
     """
     ordered = np.sort(counts)
-    # All points of the smaller tiles, and equally many points of each larger tile.
+    # Show all points of the smaller tiles, and equally many points of each larger tile.
     shares = (max_points - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
     level = shares[(shares <= ordered).argmax()] if ordered.sum() > max_points else np.inf
     return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
 def read_positions(points: Points, row_selection: Ints | slice) -> Floats:
-    """Return the positions (n, 3) at selected rows, float64, in world coordinates."""
+    """Return the positions at selected rows as float64 world coordinates."""
     # The matrix product in a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 
@@ -414,9 +414,9 @@ class PointFinder:
     ) -> tuple[Ints, int]:
         """Read blocks one after another, and thin out the points whenever there are too many.
 
-        `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the shares of points to
-        keep in each tile of the camera's image. The other parameters and the results are the same
-        as in `find`.
+        `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the fractions of points
+        to keep in each tile of the camera's image. The other parameters and the results are the
+        same as in `find`.
         """
         random = np.random.default_rng(0)
         thin = 1.0

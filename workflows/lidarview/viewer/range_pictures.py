@@ -15,7 +15,7 @@ _IMAGE_WIDTH = 1024  # maximum number of columns
 
 _IMAGE_ROWS = 128  # number of rows unless rows are channels
 
-_COLUMN_SHARE = 0.9  # number of columns as a share of the sensor's azimuth steps
+_COLUMN_SHARE = 0.9  # number of columns as a fraction of the sensor's azimuth steps
 
 # A sensor with fewer or more channels gets elevation steps as rows.
 _MIN_CHANNELS = 4
@@ -91,7 +91,7 @@ def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[
 
 
 def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
-    """Return the RGBA colors (n, 4) of ranges (n,), clipped to the limits."""
+    """Return the RGBA colors of ranges, clipped to the limits."""
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
     colors = np.full((len(ranges), 4), 255, np.uint8)
@@ -100,7 +100,7 @@ def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def surround_object(sensors: Floats, bounds: Floats) -> bool:
-    """Return True if there are several sensors, all beside or above the bounds of an object.
+    """Return whether there are several sensors, all of which are beside or above an object.
 
     `sensors` has shape (n, 3) and `bounds` (2, 3).
     """

@@ -1,10 +1,10 @@
 """Serve a page to browsers on this machine.
 
 The page sends GET requests for files and data, and POST requests for commands. Its URL contains a
-random token; all other URLs return status 404. Websites, and other users of the machine who do not
-know the token, can therefore neither see the page nor send commands. Requests from other websites
-are always refused, except links to the page. All URLs within the page are relative, so the page
-also works behind a proxy.
+random token, and all other URLs return status 404. Websites, and other users of the machine who do
+not know the token, can therefore neither see the page nor send commands. Requests from other
+websites are always refused, except links to the page. All URLs within the page are relative, so the
+page also works behind a proxy.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from .guarded_server import Refusal, guarded_server
 from .point_selection import ClientDisconnected
 
 HOST = "127.0.0.1"
-PORT = 8080  # default; the next free port is used if it is taken
+PORT = 8080  # default port; if it is taken, the next free port is used
 VIEWER = "index.html"
 _PORTS_TRIED = 100
 
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable with the path of a JupyterHub user
 
-MAX_SLOW = 2  # slow requests of a kind that are answered at a time
-MAX_WAITING = 16  # slow requests of a kind that may wait; further requests get status 503
+MAX_SLOW = 2  # number of slow requests of a kind that are answered at a time
+MAX_WAITING = 16  # number of slow requests of a kind that may wait; further requests get status 503
 LARGE_POINTS = 1_000_000  # an answer with more points is large
 LONG_TEXT = 1_000  # a request is slow if its list of scans has more characters
 STALL_S = 20.0  # a connection is closed if the client reads nothing for this time
@@ -308,7 +308,7 @@ def page_server(
     source
         Computes the answers to the requests of the page.
     port
-        Port to use. If it is taken, the next free port is used; 0 selects any free port.
+        Port to use. If it is taken, the next free port is used. 0 selects any free port.
     stop
         Called if the user of the page stops the run.
     index
@@ -393,7 +393,7 @@ def announce_page(
 
 
 def notebook_html(page: PageServer, words: str) -> str:
-    """Return HTML for the cell of a notebook: a link with some text, and the page in a frame."""
+    """Return HTML for the cell of a notebook, with a link and with the page in a frame."""
     url = page.url
     words = escape(words)
     if hub := os.environ.get(_HUB):  # 127.0.0.1 would be the machine of the user's browser

@@ -1,4 +1,4 @@
-"""Export a view as a single file to share: a film, or a page that needs no server."""
+"""Export a view as a single file to share, which is a film or a page that needs no server."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .point_selection import PointFinder, ScanRanges, even_shares, read_position
 from .server import VIEWER, Answer, pack_answer
 from .view import View
 
-# Maximum number of frames, and the number of colors (.gif) or the quality (.webp).
+# Maximum number of frames, and number of colors (.gif) or quality (.webp).
 _FILMS = {".gif": (30, 96), ".webp": (40, 40)}
 _MIN_FRAMES = 30
 _FRAME_MS = 100
@@ -161,7 +161,7 @@ class _FilmSource:
     top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
-        """Return the local positions (n, 3) of a sample of the points below `top`."""
+        """Return the local positions of a sample of the points below `top`."""
         rows, _ = self.finder.find(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
@@ -169,7 +169,7 @@ class _FilmSource:
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return local positions (n, 3) and RGBA colors (n, 4) of a sample of the points.
+        """Return local positions and RGBA colors of a sample of the points.
 
         The colors span the height of `box`, which has shape (2, 3).
         """
@@ -319,8 +319,8 @@ def bundle_modules(folder: Traversable, name: str) -> str:
     """Combine a JavaScript module and its imports into a single script.
 
     Each module becomes a function that returns its exports. A page in a single file cannot use
-    imports: a content policy can allow inline scripts by their hashes, but imported modules only by
-    their addresses.
+    imports, because a content policy can allow inline scripts by their hashes, but imported modules
+    only by their addresses.
     """
     modules: dict[str, str] = {}  # {file: script}, imported modules first
 
@@ -364,7 +364,7 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 
 
 def _thinned(view: View, max_points: int) -> Answer:
-    """Sample points, with a lower share where they are dense, and pack all their columns."""
+    """Sample points, fewer of them where they are dense, and pack all their columns."""
     points = view.shown_points
     rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
     world = read_positions(points, rows)
@@ -383,7 +383,7 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Return an order of the points that compresses well: by sensor, then by channel."""
+    """Return an order of the points by sensor and channel, which compresses well."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 

@@ -63,10 +63,10 @@ from .server import Answer, Arguments
 
 MAX_POINTS = 20_000_000  # maximum number of points in an answer or a download
 MAX_RAYS = 150  # more rays would hide the surfaces
-_SAMPLE = 100_000  # points for estimating color scales and limits
+_SAMPLE = 100_000  # number of points for estimating color scales and limits
 _MAX_COUNTED = 20_000_000  # with more points, the labels are counted in a sample
 _CORNERS = 200  # directions in which the first view shows the outermost point of a cloud
-_MAX_BEYOND = 0.5  # outliers are this share of the central 99 % range or more outside of it
+_MAX_BEYOND = 0.5  # minimum distance of outliers from the central 99 % range, as a fraction of it
 _MAX_COLORINGS = 64  # number of color scales that are kept
 _MAX_NAMES = 2000  # maximum number of named values that a menu of the page lists
 _NS = 1e9
@@ -84,20 +84,20 @@ class DownloadFormats:
 
 @dataclass(eq=False)
 class View:
-    """A survey, or a cloud alone, as a page shows it.
+    """A survey, or a cloud without a survey, as shown by a page.
 
-    The page receives local coordinates: world coordinates minus `origin`. The scene is omitted if
-    the points are in the sensor frame.
+    The page receives local coordinates, which are world coordinates minus `origin`. The scene is
+    omitted if the points are in the sensor frame.
     """
 
     points: Points
     pictured: PictureContent | None = None  # scene, sensors, sample rays, and hit counts
     sweeps: Sweeps | None = None  # poses and scans of all sweeps
-    note: str = ""  # a note for the user
+    note: str = ""  # note for the user
     title: str = "lidarpool"
     results: Sequence[str] = ()  # names of the results if there are several
-    # Returns the current hits on each triangle during a run, the actors' triangles last. If None,
-    # the hits are `pictured.hit_counts`.
+    # Function that returns the current hits on each triangle during a run, with the actors'
+    # triangles last. If None, the hits are `pictured.hit_counts`.
     read_hit_counts: Callable[[], AnyArray] | None = None
     triangles: int = MAX_TRIANGLES  # maximum number of displayed triangles
     downloads: DownloadFormats | None = None  # None if points cannot be downloaded
@@ -187,7 +187,7 @@ class View:
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the coordinates, from the survey or else from the file; None if unknown."""
+        """EPSG code of the coordinates from the survey or the file, or None if unknown."""
         sweeps = self.sweeps
         if sweeps is None:
             return self.stated_epsg
@@ -242,10 +242,10 @@ class View:
     def _extent(self) -> tuple[Floats, Floats, Floats]:
         """Return the local origin, the bounding box, and points that the first view must show.
 
-        The origin (3,) is in world coordinates; the box (2, 3) and the points (k, 3) are local. The
-        points are the corners of the scene, the ends of a planned path, and the sensor positions
-        unless the sensors surround an object. They fit the image more tightly than the corners of
-        the box, which is mostly empty if the sensors surround an object.
+        The origin (3,) is in world coordinates, and the box (2, 3) and the points (k, 3) are local.
+        The points are the corners of the scene, the ends of a planned path, and the sensor
+        positions unless the sensors surround an object. They fit the image more tightly than the
+        corners of the box, which is mostly empty if the sensors surround an object.
         """
         if self.pictured is None:
             return _cloud_extent(self.points)
@@ -301,11 +301,11 @@ class View:
     def _state(self) -> Answer:
         """Return the description of the view, without points and surfaces.
 
-        In the header, "bounds" contain the scene, and "box" is the part to show first: the
-        surroundings of the trajectories in a large scene, in which case "cut" is the local z of the
-        top of the box. Lengths are in meters and times in seconds.
+        In the header, "bounds" contain the scene, and "box" is the part to show first. In a large
+        scene, this is the surroundings of the trajectories, and "cut" is the local z of the top of
+        the box. Lengths are in meters and times in seconds.
         """
-        # None if the page shows the whole scene
+        # None if the page shows the whole scene.
         shown_box = surrounding_box(
             self._bounds, moving_positions(self.sensors, self.actors, self.duration_ns)
         )
@@ -412,12 +412,12 @@ class View:
 
     @property
     def displayed_rays(self) -> Floats32:
-        """Local start and end points of at most `MAX_RAYS` sample rays, shape (n, 2, 3)."""
+        """Local start and end points of at most `MAX_RAYS` sample rays. Shape (n, 2, 3)."""
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
     def planned_path(self) -> dict[str, Any] | None:
-        """Corners of the planned path, and obstacles as discs; None without a path.
+        """Corners of the planned path, and obstacles as discs, or None without a path.
 
         A disc is (x, y, radius). All values are local, in meters.
         """
@@ -647,7 +647,7 @@ class View:
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
             rows, _ = self._finder.find(HITS_SAMPLE)
-            if "object" in self.columns:  # points on static objects only
+            if "object" in self.columns:  # only points on static objects
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             hit_points = (read_positions(self._finder.points, rows) - self.origin).astype(
@@ -718,7 +718,7 @@ def _read_limits(text: str) -> tuple[float, float]:
 
 
 def _add_counts(counts: Counter[int], values: AnyArray) -> None:
-    """Add the number of occurrences of each value (n,) to the counts."""
+    """Add the number of occurrences of each value to the counts."""
     labels, numbers = np.unique(values, return_counts=True)
     counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
 
@@ -726,7 +726,7 @@ def _add_counts(counts: Counter[int], values: AnyArray) -> None:
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     """Return a local origin for points, their box without outliers, and their outermost points.
 
-    The origin (3,) is in world coordinates; the box (2, 3) and the points (k, 3) are local. A
+    The origin (3,) is in world coordinates, and the box (2, 3) and the points (k, 3) are local. A
     coordinate of the origin is 0 unless the points are more than 10 km from 0, in which case it is
     rounded to whole meters.
     """
@@ -746,7 +746,7 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
 
 
 class ProgressiveView:
-    """A view of a sample of points, replaced by a view of all points once they have been read.
+    """A view of a sample of points, which is replaced by a view of all points once they are read.
 
     Parameters
     ----------
@@ -755,8 +755,9 @@ class ProgressiveView:
     total
         Number of all points.
     read
-        Returns the view of all points. It is called in a thread after the first request for points.
-        It receives a function that displays the points read so far, with their share of all points.
+        Function that returns the view of all points. It is called in a thread after the first
+        request for points. It receives a function that displays the points read so far, with their
+        fraction of all points.
     """
 
     def __init__(
@@ -767,7 +768,7 @@ class ProgressiveView:
         self._view = sample
         self._read = read
         self._complete = False
-        self._share = 0.0  # share of the points that has been read
+        self._share = 0.0  # fraction of the points that has been read
         self._error = ""
         self._reading: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -777,7 +778,7 @@ class ProgressiveView:
     ) -> Answer:
         """Answer a request of the page, as `View.answer` does.
 
-        The request "growth" returns the share of the points that has been read.
+        The request "growth" returns the fraction of the points that has been read.
         """
         if question == "growth":
             header = {"complete": self._complete, "error": self._error, "share": self._share}
@@ -809,6 +810,6 @@ class ProgressiveView:
         self._complete = True
 
     def _show(self, points: Points, share: float) -> None:
-        """Display the points that have been read so far, which are a share of all points."""
+        """Display the points that have been read so far, which are a fraction of all points."""
         self._share = share
         self._view.replace_points(points, keep_scales=True)

@@ -82,7 +82,7 @@ class Rosbag2(CloudFormat):
     - `ouster`: 48 bytes. Ring 0 is the highest beam, the range is in mm, t is in ns since the start
       of the sweep, and the intensity is the signal.
     - `hesai` and `robosense`: 26 bytes. The intensity is the reflectivity, timestamp is in seconds
-      since 1970, and rings are numbered as by the manufacturer.
+      since 1970, and rings have the manufacturer's numbers.
     - `livox`: 26 bytes, with timestamp in ns since 1970. `/NAME/livox` or `/livox` contains the
       same points as CustomMsg messages.
 
@@ -359,7 +359,7 @@ def _header_of(data: bytes) -> _Header:
 
 
 def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
-    """Return the poses of sweeps relative to the root of the frame tree, with shape (n, 4, 4).
+    """Return the poses of sweeps relative to the root of the frame tree.
 
     Parameters
     ----------
@@ -370,7 +370,8 @@ def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
 
     Returns
     -------
-    None if the bag does not contain poses for the times of all sweeps.
+    Matrices of shape (n, 4, 4), or None if the bag does not contain poses for the times of all
+    sweeps.
     """
     frames = {header.frame.lstrip("/") for header in headers}
     if len(frames) != 1:

@@ -256,7 +256,7 @@ class _Reflectivities(PointLayout):
 class HesaiLayout(_Reflectivities):
     """Layout of HesaiLidar_ROS_2.0.
 
-    Times are in seconds since 1970, and rings are numbered as by the manufacturer.
+    Times are in seconds since 1970, and rings have the manufacturer's numbers.
     """
 
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("timestamp", "<f8")])
@@ -310,7 +310,7 @@ LAYOUTS: dict[str, PointLayout] = {
 
 @dataclass(frozen=True)
 class MessageLayout:
-    """Layout of points in messages, and how the points are positioned and ordered."""
+    """Layout of points in messages, with the frame and the order of the points."""
 
     name: str  # name of the layout in `LAYOUTS`
     compensated: bool = False  # whether points are motion-compensated and have no times

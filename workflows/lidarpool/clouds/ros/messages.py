@@ -245,7 +245,7 @@ class SurveyMessages:
         return times_ns
 
     def _point_cloud(self, rows: Records, header: Any) -> Any:
-        """Return a PointCloud2 with points, which have the shape (height, width)."""
+        """Return a PointCloud2 with points in an array of shape (height, width)."""
         height, width = rows.shape
         (message,) = self._make.types_of("sensor_msgs", "PointCloud2")
         return message(
@@ -418,7 +418,7 @@ class _Messages:
         )
 
     def image(self, values: Floats32, header: Any) -> Any:
-        """Return an Image message with float32 values of shape (height, width)."""
+        """Return an Image message with float32 values."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
         image = self._types["sensor_msgs/msg/Image"]

@@ -63,7 +63,7 @@ def organized_rows(
 def _rays(
     message_layout: MessageLayout, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Return points for all rays as if none had a return, with shape (channels, firings)."""
+    """Return points for all rays as if none had a return. Shape (channels, firings)."""
     layout = message_layout.layout
     channels = np.arange(image.sensor.channels)
     rays = np.zeros((len(channels), len(image.firings)), row)

@@ -1,4 +1,4 @@
-"""Charts of a fit: curves, and values by ring, with their confidence intervals."""
+"""Charts of a fit, which show curves and values by ring with their confidence intervals."""
 
 from __future__ import annotations
 

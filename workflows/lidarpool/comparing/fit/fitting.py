@@ -191,7 +191,7 @@ def _with_performance(
     """Return a sensor whose performance is updated with `SensorMeasurement.estimates`.
 
     Parameters without an estimate keep their values. The parameters of range noise belong together:
-    an estimate of one of them replaces all of them, and `precision`.
+    an estimate of one of them replaces all of them, and also `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()

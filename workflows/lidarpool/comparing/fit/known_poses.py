@@ -25,7 +25,8 @@ from ..compared_sweep import compared_sweep, with_compared_columns
 from .standstill import Speed, sweep_period_ns
 
 _MAX_SWEEPS = 64  # maximum number of sweeps whose poses are read
-# Poses of a stationary sensor differ by less. Limits for exact poses and for localization.
+# Maximum differences between the poses of a stationary sensor, for exact poses and for
+# localization.
 _MIN_SHIFT_M = 0.001
 _MIN_TURN_DEG = 0.01
 _LOCALIZED_SHIFT_M = 0.05
@@ -46,7 +47,7 @@ class KnownPoses:
     def from_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
-        """Return the poses given by the user, otherwise the recording's poses, or None if unknown.
+        """Return the poses from the user or the recording, or None if they are unknown.
 
         Raises LidarError unless `pose` is a single pose or contains one pose for each sweep.
         """
@@ -126,7 +127,7 @@ class KnownPoses:
 
 
 def _given_matrices(pose: Any, recording: Recording) -> Floats:
-    """Return a single pose, or one pose for each sweep, as matrices of shape (n, 4, 4)."""
+    """Convert a single pose, or one pose for each sweep, to an array of matrices."""
     if isinstance(pose, np.ndarray) and pose.shape[-2:] == (4, 4):
         matrices = pose.astype(np.float64).reshape(-1, 4, 4)
         check_rotations(matrices[:, :3, :3])

@@ -1,4 +1,4 @@
-"""Measure a sensor from the rays of a recording: noise, losses, bias, and their curves."""
+"""Measure the noise, losses and bias of a sensor from the rays of a recording."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class SensorMeasurement:
         return np.asarray(variance - (direction_noise_rad * rays.slope) ** 2)
 
     def channels(self) -> list[dict[str, Any]]:
-        """Return the noise, bias and azimuth spread of each ring as dictionaries."""
+        """Return the noise, bias and azimuth spread of each ring, with one dictionary per ring."""
         stack = self.stack
         row_of_ray = self.rays.row
         range_variance = self._range_variances()

@@ -41,8 +41,9 @@ _MAX_PULSES = 1 << 17  # maximum number of pulses to fit, sampled evenly
 _SAME_RANGE_M = 1e-3  # maximum difference between ranges of the same return due to rounding
 # Maximum angle from a cell to the closest return of its ring, whose pose is used.
 _MAX_GAP_DEG = 2.0
-_MIN_LOST_STEPS = 1.5  # steps between two returns if a pulse between the two is lost
-_LIGHT_COLUMNS = 3  # cells on either side whose intensities count
+# Minimum number of azimuth steps between two returns if a pulse between them was lost.
+_MIN_LOST_STEPS = 1.5
+_LIGHT_COLUMNS = 3  # number of cells on either side whose intensities are averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +53,10 @@ class ScenePulses:
     row: Ints
     column: Ints
     expected: Floats  # range of the scene, meters
-    slope: Floats  # growth of the range with the direction, meters per radian
-    residual: Floats  # range less `expected`, meters; NaN of a lost pulse
-    intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
-    difference: Floats  # residual less the residual of the next pulse of the ring; NaN if unknown
+    slope: Floats  # gradient of the range with respect to the direction, meters per radian
+    residual: Floats  # range minus `expected` in meters; NaN for a lost pulse
+    intensity: Floats  # mean of the neighboring returns; NaN if unknown
+    difference: Floats  # residual minus the next residual in the ring; NaN if unknown
 
     def rough_sigma(self) -> Floats:
         """Estimate the standard deviation of each pulse's range in meters, to detect outliers."""
@@ -101,12 +102,15 @@ class SweepPulses(NamedTuple):
     """Pulses on smooth surfaces of the scene, from one sweep or from all sweeps."""
 
     pulses: ScenePulses
-    compared: int  # returns where the scene has a surface
-    near: int  # returns of these within `SCENE_TOLERANCE_M` of the surface
+    compared: int  # number of returns where the scene has a surface
+    near: int  # number of these returns within `SCENE_TOLERANCE_M` of the surface
 
     @classmethod
     def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
-        """Join the pulses of several sweeps. If there are too many, they are sampled evenly."""
+        """Join the pulses of several sweeps.
+
+        If there are too many pulses, they are sampled evenly.
+        """
         columns = zip(*(vars(sweep.pulses).values() for sweep in sweeps), strict=True)
         pulses = ScenePulses(*map(np.concatenate, columns))
         return cls(
@@ -135,11 +139,11 @@ def measure_pulses(
 class _CellReturns(NamedTuple):
     """The return of each cell in a sweep, or the closest return in azimuth on the same ring."""
 
-    points: Floats  # (r, c, 3): in the sensor frame at their firings, meters
+    points: Floats  # (r, c, 3): meters, in the sensor frame at the firing of each point
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
     own: Bools  # (r, c): whether the return belongs to the cell
     known: Bools  # (r, c): whether the pose of the cell's pulse is known
-    positions: Floats  # (r c, 3): of the sensor at the firings, scene frame, meters
+    positions: Floats  # (r c, 3): sensor positions at the firings in the scene frame, meters
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
 
     @classmethod
@@ -170,10 +174,10 @@ class _NearestReturns(NamedTuple):
     Distances are infinite in rings without a return.
     """
 
-    indices: Ints  # (r, c): of the nearest points
-    gap_deg: Floats  # (r, c): from the cell to the point in azimuth
-    sides: Ints  # (2, r, c): of the points before and after the cell
-    spacing_deg: Floats  # (r, c): between the points before and after the cell
+    indices: Ints  # (r, c): indices of the nearest points
+    gap_deg: Floats  # (r, c): azimuth difference between the cell and the point
+    sides: Ints  # (2, r, c): indices of the points before and after the cell
+    spacing_deg: Floats  # (r, c): azimuth difference between the points before and after the cell
 
     @classmethod
     def from_sweep(
@@ -226,7 +230,10 @@ class _NearestReturns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _RayPoses:
-    """A trajectory with one pose for each ray in a list. The time of ray i is i nanoseconds."""
+    """A trajectory with one pose for each ray in a list.
+
+    The time of ray i is i nanoseconds.
+    """
 
     positions: Floats  # (k, 3)
     rotations: Floats  # (k, 3, 3)
@@ -262,7 +269,7 @@ class _CellCaster:
         return cls(scanner, stack.directions)
 
     def surfaces(self, positions: Floats, rotations: Floats) -> _SceneSurfaces:
-        """Cast the rays of all cells from their positions (r c, 3) with rotations (r c, 3, 3)."""
+        """Cast the rays of all cells from the given positions and with the given rotations."""
         cloud = self.scanner.sweep(_RayPoses(positions, rotations), number=0)
         shape = self.directions.shape
         cell = np.unravel_index(cloud["ray"].astype(np.int64), shape[:2])
@@ -289,8 +296,8 @@ class _SceneSurfaces(NamedTuple):
     """Surfaces of a scene in the cells of a sweep."""
 
     distance: Floats  # (r, c): meters; NaN without a hit
-    slope: Floats  # (r, c): growth of the range with the direction, meters per radian
-    path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, meters
+    slope: Floats  # (r, c): gradient of the range with respect to the direction, meters per radian
+    path: Floats  # (r, c, 3): vector from the sensor to the surface in the scene frame, meters
     scaled_normal: Floats  # (r, c, 3): normal n, as n / (n · d) for the direction d
     smooth: Bools  # (r, c): whether the neighbors lie in one plane with the cell
 
@@ -346,7 +353,7 @@ def _pulses_of_sweep(
 
 
 def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
-    """Return the positions (k, 3) and rotations (k, 3, 3) of the sensor when points were fired."""
+    """Return the positions and rotations of the sensor when points were fired."""
     poses = fired.firing_poses
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)
@@ -357,7 +364,7 @@ def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
 
 
 def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors of shape (r, c, 3) by rotations of shape (r c, 3, 3)."""
+    """Rotate the vector of each cell by the rotation of the cell."""
     turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
     return np.asarray(turned.reshape(vectors.shape))
 

@@ -24,21 +24,23 @@ _PATCHES = 36
 _FRONTAL_TANGENT = 1.0  # tangent of incidence below which direction noise is negligible
 _MIN_FRONTAL_RAYS = 100
 _MIN_FRONTAL_SHARE = 0.05
-_MAX_HALF_INTERVAL = 0.75  # maximum half width of a noise parameter's interval, over its value
+# Maximum half width of a noise parameter's interval, relative to its value.
+_MAX_HALF_INTERVAL = 0.75
 _VARIANCE_ERROR = 0.03  # relative error of the variances of steep or distant rays
 _MAX_VARIANCE_RATIO = 3.0  # larger ratios of variance and expected variance are clipped
 # Minimum ratio of ranges, and minimum tangent of incidence, to determine how noise depends on them.
 _MIN_RANGE_RATIO = 2.0
 _MIN_TILT_TANGENT = 0.3
 
-# Lost pulses and false alarms
-_MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
+# Lost pulses and false alarms.
+_MIN_WEAK_RAYS = 30  # minimum number of rays with losses to estimate a threshold
 _LOG_STEP = 1e-3  # step of logarithms, for derivatives
 # Around a ray into the sky, no ray within this number of rings and degrees of azimuth returns
 # twice. Smaller gaps between leaves do not count as sky, because leaves may return once.
 _SKY_RINGS = 7
 _SKY_DEG = 36.0
-_MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
+# Minimum number of pulses into the sky to estimate the share of false alarms.
+_MIN_SKY_PULSES = 1000
 
 
 def has_frontal_rays(rays: SmoothRays) -> bool:
@@ -132,10 +134,10 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 class ScatterFit(NamedTuple):
     """Noise of ranges and directions, fitted to the variances of rays."""
 
-    # {`range_m`, `angle_deg` or the name of the increase, fields of `Noise`: estimate}
+    # {`range_m`, `angle_deg` or the name of the increase, which are fields of `Noise`: estimate}
     estimates: dict[str, Estimate]
     sigma: Floats  # (k,): fitted standard deviation of the range of each ray, meters
-    deviance: float  # deviance of the fit to all rays; a smaller deviance is likelier
+    deviance: float  # deviance of the fit to all rays; smaller is more likely
 
 
 class _VarianceSamples(NamedTuple):
@@ -143,27 +145,28 @@ class _VarianceSamples(NamedTuple):
 
     variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance
-    growth: Floats  # a quantity that noise of ranges grows with, such as the range
+    growth: Floats  # quantity with which range noise grows, such as the range
     slope: Floats  # meters per radian
     distance: Floats  # meters
-    patch: Ints  # number of the patch of neighboring rays, whose errors may be alike
+    patch: Ints  # number of the patch of neighboring rays, whose errors may be correlated
 
 
 @dataclass(frozen=True, eq=False)
 class _VarianceModel:
-    """Model of the range variance: range noise that grows with a quantity, plus direction noise.
+    """Model of the range variance due to range noise and direction noise.
 
-    The three parameters are relative to the typical variance v. The first is (σ / √v) to the power
-    `power`, where σ is the range noise at a growth of 0. The second is the increase of this term at
-    `growth_scale`. The third is the variance due to direction noise at `slope_scale`, divided by v.
-    Methods take only the parameters that are marked in `fitted`; the others are 0.
+    The range noise grows with a quantity. The three parameters are relative to the typical variance
+    v. The first is (σ / √v) to the power `power`, where σ is the range noise at a growth of 0. The
+    second is the increase of this term at `growth_scale`. The third is the variance due to
+    direction noise at `slope_scale`, divided by v. Methods accept only the parameters that are
+    marked in `fitted`. The others are 0.
     """
 
     power: int  # power of σ and of the growth: 1 if noise adds, 2 if variances add
     fitted: Bools  # (3,): which parameters are fitted
-    variance_scale: float  # usual variance v, square meters
-    growth_scale: float  # usual growth, in its unit
-    slope_scale: float  # usual slope, meters per radian
+    variance_scale: float  # typical variance v, square meters
+    growth_scale: float  # typical growth, in the unit of the quantity
+    slope_scale: float  # typical slope, meters per radian
 
     def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
         """Return the range variance of each ray in square meters."""

@@ -25,26 +25,27 @@ ARM_M = 10.0  # distance at which rotations are expressed in meters
 # Assumed range noise and motion for the weights of rays, in meters.
 _ASSUMED_NOISE_M = 0.02
 _ASSUMED_SHIFT_M = 0.5
-_MIN_EXPLAINED_SHARE = 0.5  # share of the rays that a motion changes
-_MAX_FACE_M = 0.3  # shift beyond which rays leave the faces of cars
-_VEHICLE_M = 4.0  # no front of a vehicle is as wide
+_MIN_EXPLAINED_SHARE = 0.5  # minimum fraction of affected rays that a motion must explain
+_MAX_FACE_M = 0.3  # maximum shift for which rays still hit the same faces of cars
+_VEHICLE_M = 4.0  # wider than the front of any vehicle
 _CALM_FACTOR = 4.0  # changes above this multiple of the median belong to moving objects
 _CALM_SIGMAS = 6.0
 # Changes of a range that may be noise: the minimum, and the change per meter of range.
 _STAYED_M = 0.05
 _STAYED_PER_M = 0.01
 
-# Creep
-_CREEP_SWEEPS = 24  # sweeps, at most
-_CREEP_RAYS = 20_000  # rays, at most
-_SECTORS = 36  # sectors of a revolution; errors of the rays of a sector are alike
-_CREEP_SIGMAS = 5.0  # standard deviations of a significant motion
+# Creep.
+_CREEP_SWEEPS = 24  # maximum number of sweeps
+_CREEP_RAYS = 20_000  # maximum number of rays
+_SECTORS = 36  # number of sectors in a revolution; errors within a sector are correlated
+_CREEP_SIGMAS = 5.0  # significance threshold for a motion, in standard deviations
 # Minimum fraction of a ray's returns that lie within a number of sigmas of their median.
 _MIN_NEAR_SHARE = 0.95
 _MAX_CREEP_SIGMAS = 10.0
-_TUKEY_LIMITS = (20.0, 10.0, 4.7, 4.7, 4.7)  # standard deviations beyond which rays do not count
-_PRIOR_M = 1.0  # standard deviation of motions that no ray shows
-_OFFSET = 6  # column of the offset of all ranges
+# Limits in standard deviations beyond which rays are ignored, for each iteration.
+_TUKEY_LIMITS = (20.0, 10.0, 4.7, 4.7, 4.7)
+_PRIOR_M = 1.0  # standard deviation assumed for motions that no ray constrains
+_OFFSET = 6  # column for the common offset of all ranges
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +53,11 @@ class RangeChanges:
     """Changes of the ranges of smooth surfaces between two sweeps."""
 
     surfaces: SmoothSurfaces  # surfaces of the first sweep
-    # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
+    # (r, c): rays that return in both sweeps, and hit smooth surfaces in the first sweep at angles
+    # of incidence that are not too large
     chosen: Bools
-    change: Floats  # (r, c): meters, second less first, without the change by shifted azimuths
-    points: Floats  # (r, c, 3): of the first sweep, meters
+    change: Floats  # (r, c): second range minus first range in meters, corrected for azimuth shifts
+    points: Floats  # (r, c, 3): points of the first sweep, meters
     sigma_m: Floats  # (r, c): rough standard deviation of ranges
 
     @classmethod
@@ -190,12 +192,13 @@ def range_scatter(stack: SweepStack, lag: int) -> float:
 
 
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a motion to changes in ranges: shift along x, y and z, and yaw at `ARM_M`, in meters.
+    """Fit a motion to changes in ranges.
 
-    A row of `design` contains the derivatives of a range with respect to the motion, and `noise` is
-    the noise of `change` in meters. Components along principal axes of the covariance are set to 0
-    if they are not significant. The fit uses Huber's estimator, which reduces the influence of rays
-    on moving objects.
+    The motion consists of the shift along x, y and z, and the yaw at `ARM_M`, in meters. A row of
+    `design` contains the derivatives of a range with respect to the motion, and `noise` is the
+    noise of `change` in meters. Components along principal axes of the covariance are set to 0 if
+    they are not significant. The fit uses Huber's estimator, which reduces the influence of rays on
+    moving objects.
     """
     motion: Floats = np.zeros(4)
     if len(change) < MIN_RAYS:
@@ -218,8 +221,8 @@ class Creep(NamedTuple):
 
     shift: Floats  # (3,): meters from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
-    spread_m: float  # standard deviation by the motion of the ranges that the motion changes
-    effect: float  # the same, over the standard deviation by noise
+    spread_m: float  # standard deviation that the motion causes in the affected ranges
+    effect: float  # `spread_m` divided by the standard deviation of the noise
 
 
 def fit_creep(stack: SweepStack) -> Creep:
@@ -229,8 +232,8 @@ def fit_creep(stack: SweepStack) -> Creep:
     biweight, which ignores rays on moving objects. The steady motion is the slope of these motions.
     Its error is derived from the noise, and from leaving out each sector of a revolution in turn
     (jackknife), so that a single moving object is not mistaken for a motion of the sensor.
-    Similarly, an offset that grows in all ranges is not a motion; it occurs, for example, while a
-    sensor warms up.
+    Similarly, a common offset of all ranges that grows over time is not a motion. It occurs, for
+    example, while a sensor warms up.
     """
     rays = _CreepRays.from_stack(stack)
     if len(rays.design) < MIN_RAYS:
@@ -257,8 +260,8 @@ class _SweepMotion(NamedTuple):
     """
 
     values: Floats  # (7,)
-    covariance: Floats  # (7, 7): by noise
-    replicates: Floats  # (sectors, 7): motions without the rays of each sector
+    covariance: Floats  # (7, 7): covariance due to noise
+    replicates: Floats  # (sectors, 7): motions estimated without the rays of each sector
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +269,10 @@ class _CreepRays:
     """Rays on smooth surfaces in the mean of all sweeps."""
 
     numbers: Ints  # (t,): numbers of the sweeps
-    # (k, 7): changes of ranges with the shift, with the rotation at `ARM_M`, and with the offset
+    # (k, 7): derivatives of ranges with respect to the shift, the rotation at `ARM_M`, and the
+    # offset
     design: Floats
-    change: Floats  # (t, k): ranges less their medians, meters; NaN without a return
+    change: Floats  # (t, k): ranges minus their medians, meters; NaN without a return
     sigma: Floats  # (k,): standard deviation of noise, meters
     sector: Ints  # (k,)
 
@@ -313,7 +317,7 @@ class _CreepRays:
         )
 
     def _sweep_motion(self, change: Floats) -> _SweepMotion:
-        """Fit the motion of a sweep to the changes of its ranges (k,)."""
+        """Fit the motion of a sweep to the changes of its ranges."""
         returned = np.isfinite(change)
         design = self.design[returned] / self.sigma[returned, None]
         values = change[returned] / self.sigma[returned]

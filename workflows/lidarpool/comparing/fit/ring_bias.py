@@ -18,14 +18,18 @@ _PLANE_TOLERANCE_M = 0.05
 _MIN_PLANE_RAYS = 300
 _MAX_PLANE_POINTS = 20_000
 _MIN_RING_RAYS = 20  # minimum number of rays of a ring on a plane
-_MAX_MEDIAN_OFFSET = 0.4  # median distance of points from their plane, over the tolerance
+# Maximum median distance of points from their plane, relative to the tolerance.
+_MAX_MEDIAN_OFFSET = 0.4
 _MAX_DIRECTION_GAP = 0.1  # distance of neighboring directions of one piece of a plane
 _OUTLIER_SIGMAS = 4.0  # points beyond this limit do not belong to their plane
 _STRICT_SIGMAS = 2.0  # stricter limit; the change in the solution is used as an error of the planes
 
 
 class _PlaneRays(NamedTuple):
-    """Rays on large planes that several rings cross. Both arrays have shape (n,)."""
+    """Rays on large planes that several rings cross.
+
+    Both arrays have shape (n,).
+    """
 
     rays: Indices  # indices into the rays
     plane: Ints  # numbers of the planes
@@ -68,7 +72,7 @@ def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
     indices = even_indices(len(rays.row), _MAX_PLANE_POINTS)
     plane = _segment_planes(rays.distance[indices, None] * directions[indices])
     count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)
-    np.add.at(count, (rays.row[indices], plane), 1)  # the last column is of points in no plane
+    np.add.at(count, (rays.row[indices], plane), 1)  # the last column is for points in no plane
     crosses_planes = (count[:, :-1] >= _MIN_RING_RAYS).sum(axis=1) > 1
     chosen = (plane >= 0) & crosses_planes[rays.row[indices]]
     return _PlaneRays(indices[chosen], plane[chosen])

@@ -22,7 +22,7 @@ _SIMILAR_SHARE = 0.95  # minimum ratio of the scores of similar motions
 _MAX_SPEED_M_S = 70.0
 _MAX_SHIFT_M = 12.0
 _FIRST_SHIFT_M = 0.05
-_SHIFT_STEP = 0.05  # relative
+_SHIFT_STEP = 0.05  # relative step
 _DIRECTIONS = 36  # number of candidate directions in a plane of two free axes
 _FREE_SHARE = 0.02  # maximum fraction of a free axis (see `RangeChanges.axes`)
 _MAX_YAW_DEG = 45.0
@@ -30,7 +30,7 @@ _YAW_STEP_DEG = 0.25
 _COARSE_POINTS = 120
 _CANDIDATES = 20
 _BATCH = 2000  # number of motions that are scored at once
-_REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, meters at a distance of `ARM_M`
+_REFINEMENTS_M = (0.1, 0.05, 0.02)  # step sizes in meters at a distance of `ARM_M`
 _FINE_POINTS = 600
 _CENTER_STEPS = 15  # number of steps of the smallest size to either side
 _SIMILAR_POINTS = 10  # maximum difference between the scores of similar motions
@@ -115,9 +115,9 @@ def _best_motion(pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 
 
 def _free_axes(changes: RangeChanges) -> Floats:
-    """Return the axes along which a shift of the sensor would change few ranges, with shape (m, 3).
+    """Return the axes along which a shift of the sensor would change few ranges.
 
-    If there are none, the two axes with the smallest changes are returned.
+    If there are no such axes, the two axes with the smallest changes are returned.
     """
     axes, shares = changes.axes()
     free = int((shares < _FREE_SHARE).sum())
@@ -125,7 +125,7 @@ def _free_axes(changes: RangeChanges) -> Floats:
 
 
 def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
-    """Return candidate motions: rotations in place, and shifts along one or two axes."""
+    """Return candidate motions, which are rotations in place and shifts along one or two axes."""
     yaw_rad = np.radians(np.arange(_YAW_STEP_DEG, _MAX_YAW_DEG, _YAW_STEP_DEG))
     directions = axes[:1]
     if len(axes) > 1:
@@ -151,13 +151,19 @@ def _select_motions(motions: RigidMotion, index: Any) -> RigidMotion:
 def _select_best(
     pair: VisibilityPair, motions: RigidMotion, sample: tuple[Floats, Floats]
 ) -> tuple[RigidMotion, int]:
-    """Return the motion with the highest score, and its score. The first motion wins ties."""
+    """Return the motion with the highest score, and its score.
+
+    The first motion wins ties.
+    """
     scores = pair.score(motions, *sample)
     return _select_motions(motions, scores.argmax()), int(scores.max())
 
 
 def _add_offsets(motion: RigidMotion, offsets: Floats) -> RigidMotion:
-    """Add offsets of shape (…, 4) to a motion: shifts, and yaw at `ARM_M`, in meters."""
+    """Add offsets to a motion.
+
+    The offsets have shape (…, 4) and contain the shifts and the yaw at `ARM_M`, in meters.
+    """
     return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
 
 

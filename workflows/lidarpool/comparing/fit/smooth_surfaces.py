@@ -11,14 +11,14 @@ from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 
 from .stack import MAX_KINK_M, SweepStack, finite_median
 
-MIN_RANGE_M = 0.1  # closer points are on the sensor's cover
+MIN_RANGE_M = 0.1  # closer points lie on the sensor's cover
 _MAX_BEAM_ORIGIN_M = 0.1  # maximum distance of the beams' intersection from the sensor's origin
 # Tangents of the angle of incidence. Beyond the first, a beam hits several surfaces. Beyond the
 # second, direction noise increases mean ranges.
 MAX_TANGENT = 5.7
 FLAT_TANGENT = 1.7
 MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each meter of range
-SCENE_TOLERANCE_M = 0.3  # how far surfaces may be from the scene's
+SCENE_TOLERANCE_M = 0.3  # maximum distance of recorded surfaces from those of the scene
 # Direction noise that is assumed for outlier detection until it has been estimated.
 ASSUMED_DIRECTION_NOISE_RAD = 0.002
 MAX_SIGMAS = 6.0  # returns beyond this limit belong to moving objects
@@ -26,16 +26,22 @@ MIN_RETURN_SHARE = 0.8  # minimum fraction of a ray's returns that belong to the
 
 
 class SmoothSurfaces(NamedTuple):
-    """Local surfaces in the cells of a range image. Arrays have shape (r, c)."""
+    """Local surfaces in the cells of a range image.
 
-    azimuth_slope: Floats  # growth of the range with the azimuth, meters per radian
-    slope: Floats  # growth of the range with the direction of steepest growth, meters per radian
+    Arrays have shape (r, c).
+    """
+
+    azimuth_slope: Floats  # derivative of the range with respect to the azimuth, meters per radian
+    slope: Floats  # gradient of the range with respect to the direction, meters per radian
     smooth: Bools  # whether the neighbors lie in one plane with the cell
     scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
 class CellNeighbors(NamedTuple):
-    """Points in the cells beside each cell of a range image, in meters. Shape (r, c, 3) each."""
+    """Points in the cells beside each cell of a range image, in meters.
+
+    Each array has shape (r, c, 3).
+    """
 
     next_1: Floats
     previous_1: Floats
@@ -77,7 +83,10 @@ class CellNeighbors(NamedTuple):
 
 
 def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> SmoothSurfaces:
-    """Find slopes and edges in a range image. `error_m` is the error of each range in meters."""
+    """Find slopes and edges in a range image.
+
+    `error_m` is the error of each range in meters.
+    """
     points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _beam_origins(points)
@@ -124,7 +133,7 @@ class SmoothRays(NamedTuple):
     return_counts: Ints  # number of sweeps with a return
     trials: Ints  # number of sweeps that cover the ray, see `SweepStack`
     variance: Floats  # variance of the range over all sweeps, in square meters
-    freedom: Ints  # degrees of freedom of the variance: its returns, less 1
+    freedom: Ints  # degrees of freedom of the variance, which is the number of returns minus 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
         """Select rays by mask or index."""

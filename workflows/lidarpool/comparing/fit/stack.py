@@ -36,7 +36,10 @@ MAX_KINK_M = 0.01  # maximum distance of a surface from its plane within four co
 
 @dataclass(frozen=True, eq=False)
 class SweepStack:
-    """Returns of all sweeps on common cells, by descending ring elevation, NaN without a return."""
+    """Returns of all sweeps on common cells, by descending ring elevation.
+
+    Values are NaN in cells without a return.
+    """
 
     numbers: Ints  # (s,): numbers of the sweeps in the recording
     rings: Ints  # (r,): numbers of the rings
@@ -121,15 +124,18 @@ def check_sweeps(recording: Recording) -> None:
 
 @dataclass(eq=False)
 class _CommonCells:
-    """Cells that are filled sweep by sweep. A ring is added with its first return."""
+    """Cells that are filled sweep by sweep.
 
-    numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
-    reference: Sweep  # the sweep whose rings and steps of azimuth define the cells
-    ring_notes: list[str]  # how its rings were found
+    A ring is added with its first return.
+    """
+
+    numbers: Ints  # (s,): numbers of the sweeps that are read from the recording
+    reference: Sweep  # sweep whose rings and azimuth steps define the cells
+    ring_notes: list[str]  # notes on how the rings of the reference were determined
     images: RangeImages  # range images of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
-    values: Floats32  # (4, s, r, c): range, meters; intensity; azimuth and elevation, degrees
+    values: Floats32  # (4, s, r, c): range in meters, intensity, azimuth and elevation in degrees
 
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep]) -> _CommonCells:
@@ -264,11 +270,12 @@ def rough_scatter(ranges: Floats32) -> Floats:
 
 
 def covered_cells(returned: Bools) -> Bools:
-    """Return a mask of the cells into which a sweep sent a pulse, with shape (s, r, c).
+    """Return a mask of the cells into which a sweep sent a pulse.
 
-    The other cells are gaps due to lost packets or incomplete sweeps. `returned` marks the cells
-    with a return. A run of cells without a return, in one ring or in all rings, is considered a gap
-    if independent losses of pulses are very unlikely to produce such a run.
+    The mask has shape (s, r, c). The other cells are gaps due to lost packets or incomplete sweeps.
+    `returned` marks the cells with a return. A run of cells without a return, in one ring or in all
+    rings, is considered a gap if independent losses of pulses are very unlikely to produce such a
+    run.
     """
     share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
     log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)

@@ -1,4 +1,7 @@
-"""Determine whether a sensor is stationary during a recording: motion, creep and range drift."""
+"""Determine whether a sensor is stationary during a recording.
+
+The module detects motion, creep and range drift.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ _MAX_CHANGE_M = 0.1  # maximum median range change between consecutive sweeps of
 _DRIFT_FACTOR = 1.5
 _DRIFT_M = 0.002
 _MIN_CREEP_M = 0.0015  # minimum standard deviation of ranges due to creep
-_MIN_CREEP_EFFECT = 0.15  # minimum ratio to the noise, which would be overestimated by 1 %
+_MIN_CREEP_EFFECT = 0.15  # minimum ratio to the noise, at which the noise is overestimated by 1 %
 
 
 class Speed(NamedTuple):
@@ -31,7 +34,7 @@ class Speed(NamedTuple):
 
     shift_m: float
     turn_deg: float
-    period_ns: float | None  # time from sweep to sweep, if known
+    period_ns: float | None  # time between consecutive sweeps, if known
 
 
 def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
@@ -72,7 +75,10 @@ def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
 
 
 def moving_message(name: str, speed: Speed, advice: str) -> str:
-    """Return the error message for a moving sensor. `advice` is the first suggested remedy."""
+    """Return the error message for a moving sensor.
+
+    `advice` is the first suggested remedy.
+    """
     amounts = []
     if speed.shift_m > 0:
         by_time = ""

@@ -1,9 +1,9 @@
-"""Evidence of a sensor's motion: whether one sweep sees the points of another.
+"""Evidence of a sensor's motion from the visibility of one sweep's points in another sweep.
 
 In a street, a sensor that moves parallel to the walls measures nearly the same ranges in each
 sweep. Only parked cars and posts appear to move. Cars that drive past a stationary sensor look
-similar. Therefore a motion is judged by all objects that both sweeps see: objects that the motion
-aligns, objects that are aligned without the motion, and objects that neither explains.
+similar. Therefore, a motion is judged by all objects that both sweeps see. These are objects that
+the motion aligns, objects that are aligned without the motion, and objects that neither explains.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MIN_CLUSTER_POINTS = 3
 _LONGEST_VEHICLE_M = 20.0  # longer objects do not move
 _OWN_VEHICLE_M = 2.5  # distance from the sensor to its vehicle
 _STAYED = 1  # index of the field of `Evidence`
-WALL_OBJECTS = 3  # objects that a wall counts as
+WALL_OBJECTS = 3  # number of objects that a wall counts as
 
 # Classes of a point in another sweep: on a surface, unknown, or in empty space that a ray passed.
 _SURFACE = 1
@@ -53,18 +53,24 @@ class RigidMotion(NamedTuple):
     yaw_rad: Floats  # (…)
 
     def to_first(self, points: Floats) -> Floats:
-        """Convert points of the second sweep to the frame of the first: (n, 3) to (…, n, 3)."""
+        """Convert points of the second sweep to the frame of the first.
+
+        Points of shape (n, 3) are converted to shape (…, n, 3).
+        """
         return np.asarray(
             _rotate_about_z(points, self.yaw_rad[..., None]) + self.shift[..., None, :]
         )
 
     def to_second(self, points: Floats) -> Floats:
-        """Convert points of the first sweep to the frame of the second: (n, 3) to (…, n, 3)."""
+        """Convert points of the first sweep to the frame of the second.
+
+        Points of shape (n, 3) are converted to shape (…, n, 3).
+        """
         return _rotate_about_z(points - self.shift[..., None, :], -self.yaw_rad[..., None])
 
 
 def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
-    """Rotate points of shape (…, 3) about the z axis by angles of shape (…)."""
+    """Rotate points about the z axis by angles."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
@@ -75,9 +81,9 @@ def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
 class VisibilityImage:
     """Closest and farthest surfaces of a sweep around each direction."""
 
-    elevation_rad: Floats  # (r,): of the rows, descending
+    elevation_rad: Floats  # (r,): elevations of the rows, descending
     step_rad: float  # width of a column
-    row_phase: Floats  # (r,): azimuths of pulses less azimuths of columns, in steps
+    row_phase: Floats  # (r,): azimuths of pulses minus azimuths of columns, in steps
     points: Floats  # (n, 3): points on objects wider than a column, meters
     # (r - 1, c), meters: smallest and largest range in rows i and i + 1 and in the adjacent
     # columns. The range is inf if rays passed without a return, and -inf if it is unknown.
@@ -151,9 +157,9 @@ def _reduce_neighbors(values: Floats, reduce: np.ufunc) -> Floats:
 
 
 def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values of shape (r, c) over adjacent rows, to shape (r - 1, c).
+    """Reduce values over adjacent rows.
 
-    A single row is returned as it is.
+    The result has shape (r - 1, c). A single row is returned unchanged.
     """
     return np.asarray(reduce(values[:-1], values[1:])) if len(values) > 1 else values
 
@@ -180,16 +186,19 @@ def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
 
 
 class Evidence(NamedTuple):
-    """Numbers of objects that both sweeps see, by the explanation for it."""
+    """Numbers of objects that both sweeps see, by the motion that explains them."""
 
     moved: int  # explained only by the motion
     stayed: int  # explained only by a stationary sensor
-    unexplained: int  # explained by neither
+    unexplained: int  # explained by neither of them
 
 
 @dataclass(frozen=True, eq=False)
 class VisibilityPair:
-    """Two sweeps, and how each classifies the points of the other if the sensor is stationary."""
+    """Two sweeps, and the classes of each sweep's points in the other sweep.
+
+    The classes apply if the sensor is stationary.
+    """
 
     first: VisibilityImage
     second: VisibilityImage
@@ -240,7 +249,7 @@ class VisibilityPair:
         )
 
     def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
-        """Return how each sweep classifies the other's points if the sensor moves."""
+        """Classify each sweep's points by the other sweep for a moving sensor."""
         in_second = motion.to_second(self.first.points)
         in_first = motion.to_first(self.second.points)
         return self.second.classify_points(in_second), self.first.classify_points(in_first)

@@ -16,7 +16,10 @@ _NO_ROWS = np.zeros(0, np.intp)
 
 
 class DeformedCorners(NamedTuple):
-    """Corners of triangles of deforming actors, in the actors' frames. Each has shape (n, 3, 3)."""
+    """Corners of triangles of deforming actors, in the actors' frames.
+
+    All arrays have shape (n, 3, 3).
+    """
 
     corners: Floats  # meters
     velocities: Floats  # m/s
@@ -59,7 +62,7 @@ class ActorSurfaces:
     def _actor_rows(
         self, triangle: Integers, trajectories: ActorTrajectories
     ) -> tuple[Indices, Integers]:
-        """Return which of the given triangles belong to actors, and to which actors.
+        """Find the triangles that belong to actors, and return their indices and their actors.
 
         The result is a pair of arrays (k,): indices into `triangle`, and actor numbers. Both are
         empty if there are no trajectories.
@@ -81,7 +84,7 @@ class ActorSurfaces:
         """Transform points on actors to the actors' undeformed meshes, in place.
 
         `points` (n, 3) are in the scene frame. Points on actors are replaced by the corresponding
-        points in the actors' frames; other points do not change. `triangle` (n,) are the triangles
+        points in the actors' frames. Other points do not change. `triangle` (n,) are the triangles
         of all points, `triangle_indices` (n,) are the rows of the stored triangles, and `times`
         (n,) are in nanoseconds.
         """
@@ -156,7 +159,7 @@ class ActorSurfaces:
 
 
 def _weights(corners: Floats, points: Floats) -> Floats:
-    """Return the barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3)."""
+    """Return the barycentric coordinates of points in triangles."""
     a, b, c = corners.transpose(1, 2, 0)
     edge_1 = b - a
     edge_2 = c - a

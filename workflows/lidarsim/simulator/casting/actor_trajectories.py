@@ -1,4 +1,7 @@
-"""Compute the poses of all actors at once; one by one would take longer than casting."""
+"""Compute the poses of all actors at once.
+
+Computing them one actor at a time would take longer than casting the rays.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,10 @@ if TYPE_CHECKING:
 
 
 class _StraightTracks(NamedTuple):
-    """Piecewise linear tracks of n actors. A stationary actor has a single segment."""
+    """Piecewise linear tracks of n actors.
+
+    The track of a stationary actor has a single segment.
+    """
 
     actors: Sequence[int]  # (n,): actor numbers
     counts: Ints  # (n,): number of segments of each track
@@ -109,7 +115,7 @@ def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightT
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of all actors by actor number, or the trajectory of a platform alone.
+    """Trajectories of all actors by actor number, or of a single platform.
 
     Only trajectories made by `from_actors` have deforming actors in `animated`.
     """
@@ -159,11 +165,12 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """Return the poses of trajectories at given times, as an array of shape (12, n).
+        """Return the poses of trajectories at given times.
 
         `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds since the start of
-        the trajectory, which for actors is the start of the survey. Each pose is a position in
-        meters and a rotation matrix in row-major order, bit-identical to `Trajectory.poses`.
+        the trajectory, which for actors is the start of the survey. The result has shape (12, n).
+        Each pose is a position in meters and a rotation matrix in row-major order, bit-identical to
+        `Trajectory.poses`.
 
         Raises
         ------
@@ -192,7 +199,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the positions (n, 3) and rotations (n, 3, 3) of trajectories at given times.
+        """Return the positions and rotations of trajectories at given times.
 
         `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds.
 
@@ -209,7 +216,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
         A run consists of consecutive rows with the same trajectory and time, which therefore have
         the same pose. The poses have shape (12, m), as in `table`. Rows with a negative number have
-        no trajectory; they get run -1 and do not interrupt a run.
+        no trajectory. They get run -1 and do not interrupt a run.
         """
         from . import surface_loops
 

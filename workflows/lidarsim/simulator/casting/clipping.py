@@ -2,7 +2,7 @@
 
 Ray casters compute in single precision relative to the size of the scene. Ground planes that extend
 to ± 200 km would make a cast 140 times slower. Within the box, the clipped triangles cover the same
-points; the relative error of new corners is about 1e-16 of the triangle's size.
+points, and the error of new corners is about 1e-16 of the triangle's size.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ClippedMesh(NamedTuple):
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
     """Return the six planes that bound a box.
 
-    `region` has the lower and upper corner. Each row of the result has a normal and an offset; a
-    point p is inside the box if ``normal @ p <= offset`` for all rows. If `transform` (3, 4) maps a
-    mesh frame to the frame of the box, the planes are in the mesh frame.
+    `region` has the lower and upper corner. Each row of the result has a normal and an offset, and
+    a point p is inside the box if ``normal @ p <= offset`` for all rows. If `transform` (3, 4) maps
+    a mesh frame to the frame of the box, the planes are in the mesh frame.
     """
     matrix = np.eye(3, 4) if transform is None else transform
     lower, upper = region
@@ -41,7 +41,7 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
 
 
 def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> ClippedMesh | None:
-    """Clip triangles (f, 3) to the inside of all planes, or return None if none is cut."""
+    """Clip triangles to the inside of all planes, or return None if none is cut."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
@@ -72,7 +72,7 @@ class _Part(NamedTuple):
 
 
 def _outside(vertices: Floats, planes: Floats) -> Bools:
-    """Return for each vertex (v, 3) and plane (6, 4) whether the vertex is outside the plane."""
+    """Return whether each vertex is outside each plane."""
     x, y, z = vertices.T[:, :, None]
     a, b, c, offset = planes.T
     return np.asarray(a * x + b * y + c * z > offset)
@@ -101,7 +101,7 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the point where an edge crosses a plane, from corners with their signed heights.
+    """Return the point where an edge crosses a plane, given its corners with signed heights.
 
     The corners are sorted so that both triangles that share the edge get the same point.
     """

@@ -1,4 +1,4 @@
-"""Bodies that contain a medium: closed surfaces of water, glass or leaves."""
+"""Bodies that contain a medium, which are closed surfaces of water, glass or leaves."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ class MediaBodies:
             a, b, c = positions[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[kind] else 1)
             normals /= np.maximum(norm(normals)[:, None], 1e-300)
-            # Least squares: move each vertex so that all its triangles are `by_m` further out.
+            # Move each vertex so that all its triangles are `by_m` farther out, in the
+            # least-squares sense.
             squares = np.zeros((len(positions), 3, 3))
             sums = np.zeros((len(positions), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
@@ -97,7 +98,7 @@ class MediaBodies:
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:
-    """Return whether a surface is closed: each edge joins two consistently wound triangles."""
+    """Return whether each edge of a surface joins two consistently wound triangles."""
     vertex_rows, corners = np.unique(faces, return_inverse=True)
     # With flat shading, triangles share positions but not vertices.
     _, vertex_position = np.unique(vertices[vertex_rows], axis=0, return_inverse=True)

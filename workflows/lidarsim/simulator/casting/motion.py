@@ -37,7 +37,7 @@ class FiringClock:
     subrays: int = 1  # number of sub-rays per ray
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of sub-rays (n,) in nanoseconds.
+        """Return the firing times of sub-rays in nanoseconds.
 
         Sub-ray k belongs to ray ``start + k // subrays``.
         """
@@ -76,7 +76,7 @@ class Firings:
         return cls(sensor, numbers, specs[0])
 
     def times(self, ray: Integers) -> Ints:
-        """Return the firing times of rays (n,) in nanoseconds since the start of the survey.
+        """Return the firing times of rays in nanoseconds since the start of the survey.
 
         Rays are numbered from 0 at the first firing.
         """
@@ -156,7 +156,7 @@ class CastPoses:
         )
 
     def platform_velocities(self, ray: Integers, origins: Floats) -> Floats:
-        """Return the velocities in m/s that the platform's motion gives to the origins of rays.
+        """Return the velocities of ray origins in m/s due to the motion of the platform.
 
         `ray` (n,) are ray numbers, which determine the times, and `origins` have shape (n, 3).
         Origins and velocities are in the scene frame. The velocities are zero if the platform is
@@ -172,7 +172,7 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays (n,) of a pattern, in the scene frame.
+        """Return origins and directions of rays of a pattern, in the scene frame.
 
         Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`). Both
         arrays have shape (n, 3), but the origins have shape (1, 3) if all rays share one.
@@ -272,7 +272,7 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Multiply rotations (k, 3, 3) by rotations about z with cosines and sines `spins` (2, k)."""
+    """Multiply rotations by rotations about z, given the cosines and sines of the angles."""
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
@@ -287,8 +287,9 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
     """Return the rotation vectors in radians between pairs of nearly equal rotations.
 
-    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each is half the
-    sum of the cross products of corresponding axes; its length is the sine of the rotation angle.
+    The vectors (k, 3) are in the scene frame, the target frame of the matrices. Each vector is half
+    the sum of the cross products of corresponding axes, and its length is the sine of the rotation
+    angle.
     """
     vectors = np.empty((3, len(earlier))).T
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Cast rays against a whole scene: its faces, its instances and its moving actors.
+"""Cast rays against the faces, the instances and the moving actors of a scene.
 
 Each ray is transformed into the frame of an actor at the firing time of the ray, so trees are never
 rebuilt (`raybeam.moving`).
@@ -105,8 +105,7 @@ class SceneCaster:
         Trees of the static bodies, and shapes of the actors.
     range_m
         Largest range of the sensors in meters. In a scene of hundreds of kilometers, bodies far
-        beyond this range are omitted. Call `ensure_trees` before
-        each scan.
+        beyond this range are omitted. Call `ensure_trees` before each scan.
     unseen
         (objects,): True for objects that rays pass through. `bodies` does not contain the static
         objects among them. None if all objects are visible.
@@ -145,13 +144,13 @@ class SceneCaster:
     def update_instances(self, surfaces: SceneSurfaces, instances: Instances) -> None:
         """Update the surfaces and instances after instances of the scene have moved.
 
-        This does not update the trees; use the function `move_instances` for that.
+        The trees are not updated. To update them, use the function `move_instances`.
         """
         self._surfaces = surfaces
         self._instances = instances
 
     def ensure_trees(self, positions: Floats) -> None:
-        """Build any missing trees of bodies within range of sensors at positions (p, 3)."""
+        """Build any missing trees of bodies within range of sensors at positions."""
         self._static.ensure_trees(positions, self._range_m)
 
     @property
@@ -164,9 +163,9 @@ class SceneCaster:
 
         The table is an int64 array (bodies, 2). A hit on triangle t of body i increments counter
         ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the scene,
-        if any, with one counter per triangle; then each instance, with a single counter; and
-        finally all actors as one body, whose triangles are numbered after the faces of the scene.
-        Bodies that the caster omits have no row.
+        if any, with one counter per triangle, followed by each instance with a single counter, and
+        finally by all actors as one body, whose triangles are numbered after the faces of the
+        scene. Bodies that the caster omits have no row.
         """
         instance_count = 0 if self._instances is None else len(self._instances)
         table = [[0, 1]] * bool(self._face_count) + [
@@ -217,8 +216,8 @@ class SceneCaster:
         The arguments are those of `RayCaster.scan`. If there are actors, `poses` must have a clock.
         `window` has the start and stop of the pattern rows to cast, by default all rows. Hits are
         accepted at distances from `t_min` to `t_max` in meters. Of each group of rays, every
-        `keep_every`-th hit is returned; `groups` has the first ray of each group. The origins and
-        directions of all rays are written to `out` (6, n). Without actors, `out` can also have
+        `keep_every`-th hit is returned. `groups` contains the first ray of each group. The origins
+        and directions of all rays are written to `out` (6, n). Without actors, `out` can also have
         shape (3, n) and then receives only directions.
 
         Returns
@@ -274,7 +273,7 @@ class SceneCaster:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Return whether points are visible from origins (n, 3) in the scene frame.
+        """Return whether points are visible from origins in the scene frame.
 
         `towards` (n, 3) are vectors from the origins to the points, and `distance` (n,) their
         lengths in meters. `times` (n,) determine the poses of actors, in nanoseconds since the
@@ -384,7 +383,7 @@ def casters_of_sensors(
         return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
-        """Return the bodies of the scene without the static objects in a mask (objects,)."""
+        """Return the bodies of the scene without the static objects in a mask."""
         objects = static_key(scene, unseen)
         key = media, objects
         if key not in static_bodies:
@@ -415,7 +414,9 @@ def move_instances(
     instances: Instances,
     instance_indices: Indices,
 ) -> None:
-    """Move instances to their transforms in `instances`; no scan may be in progress.
+    """Move instances to their transforms in `instances`.
+
+    No scan may be in progress.
 
     Parameters
     ----------
@@ -442,7 +443,7 @@ def _clearance_m(scene: Scene) -> float:
 
 
 def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
-    """Return the first and then every n-th row of groups that have `counts` (g,) hits."""
+    """Return the first and then every n-th row of groups that have `counts` hits."""
     starts = np.cumsum(counts) - counts
     number_in_group = np.arange(int(counts.sum())) - np.repeat(starts, counts)
     return np.flatnonzero(number_in_group % keep_every == 0)

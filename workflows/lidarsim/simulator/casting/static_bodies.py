@@ -81,7 +81,7 @@ class _Trees(NamedTuple):
         return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
-        """Return the triangles of hits (k,) in the numbering of the scene."""
+        """Return the triangles of hits in the numbering of the scene."""
         triangle = hits.triangle
         if self.origins:
             triangle = triangle.copy()
@@ -166,7 +166,7 @@ class StaticBodies:
         return not self._may_cut and self.trees.caster.on_device
 
     def ensure_trees(self, positions: Floats, range_m: float) -> None:
-        """Build trees of all bodies within range of sensors at positions (p, 3), if needed.
+        """Build trees of all bodies within range of sensors at positions, if needed.
 
         Casts in progress can continue to use the trees of an earlier region.
         """
@@ -189,7 +189,7 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move(self, instances: Instances, instance_indices: Indices) -> None:
-        """Move instances, given by their rows (m,), to their transforms in `instances`.
+        """Move instances, given by their rows, to their transforms in `instances`.
 
         No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
         that sensors can reach, as a body that falls forever does, or if it was clipped.
@@ -310,9 +310,9 @@ def _parts_in(
 ) -> Iterator[tuple[int, ClippedMesh | None]]:
     """Yield the rows of visible instances within a region, with the clipped mesh or None.
 
-    `is_seen` (n,) states which instances are visible; None means all. Parts with an opacity mask
-    are not clipped, because rounding their texture coordinates to single precision would shift the
-    mask.
+    `is_seen` (n,) is a mask of the visible instances, or None if all are visible. Parts with an
+    opacity mask are not clipped, because rounding their texture coordinates to single precision
+    would shift the mask.
     """
     if region is None:
         instance_indices = (

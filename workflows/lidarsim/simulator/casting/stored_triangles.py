@@ -25,7 +25,7 @@ class StoredTriangles:
 
     Triangles are numbered in this order: the faces of the scene, the triangles of each instance,
     and the triangles of each actor. Stored triangles are the faces of the scene, the distinct
-    meshes of actors, and the distinct mesh parts of instances; instances of the same part share its
+    meshes of actors, and the distinct mesh parts of instances. Instances of the same part share its
     stored triangles. The objects of actors are numbered after the static objects.
     """
 
@@ -49,14 +49,14 @@ class StoredTriangles:
         owners = np.arange(
             self.static_objects, self.static_objects + len(actor_sizes), dtype=np.int32
         )
-        # Objects that the triangles of faces and actors belong to; the last entry is for no
+        # Objects that the triangles of faces and actors belong to. The last entry is for no
         # triangle.
         objects = [scene.face_object, np.repeat(owners, actor_sizes), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(objects)
 
     @cached_property
     def normal_matrices(self) -> Floats:
-        """Matrices (n, 3, 3) from normals of parts to unnormalized normals of instances."""
+        """Matrices from normals of parts to unnormalized normals of instances. Shape (n, 3, 3)."""
         instances = self._scene.instances
         if instances is None:
             return np.zeros((0, 3, 3))
@@ -70,7 +70,7 @@ class StoredTriangles:
         return triangles
 
     def locate(self, triangle: Integers) -> TriangleOwners:
-        """Return the stored rows, objects and instances of triangles (n,)."""
+        """Return the stored rows, objects and instances of triangles."""
         from . import surface_loops  # imported here because numba takes half a second to import
 
         count = len(triangle)
@@ -129,17 +129,17 @@ class StoredTriangles:
         return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
 
     def objects(self, triangle: Integers) -> Ints32:
-        """Return the objects that triangles (n,) belong to, or -1 for `NO_SURFACE`."""
+        """Return the objects that triangles belong to, or -1 for `NO_SURFACE`."""
         if self._scene.instances is None:
             return self.owners[triangle]
         return self.locate(triangle).object
 
     def instances(self, triangle: Integers) -> Indices:
-        """Return the instances of triangles (n,), all of which must belong to instances."""
+        """Return the instances of triangles, all of which must belong to instances."""
         return np.searchsorted(self.instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
-        """Return the hit counter of each triangle (n,).
+        """Return the hit counter of each triangle.
 
         The counters are sorted as in `Scene.counters`: one for each face of the scene, then one for
         each instance, which counts the hits on all of its triangles, then one for each triangle of
@@ -155,7 +155,7 @@ class StoredTriangles:
         return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def count(self, triangle: Integers) -> Ints:
-        """Count the hits on triangles (n,) by hit counter. Shape (counters,)."""
+        """Count the hits on triangles by hit counter. Shape (counters,)."""
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property
@@ -193,7 +193,7 @@ class StoredTriangles:
 
 
 def normals_of(corners: Floats) -> Floats32:
-    """Return the unit normals of triangles (n, 3, 3) in single precision."""
+    """Return the unit normals of triangles in single precision."""
     a, b, c = corners.transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     return (normals / np.maximum(norm(normals)[:, None], 1e-300)).astype(np.float32)

@@ -22,7 +22,7 @@ within_water = inlined(within_water_of_arrays)
 
 
 class TriangleNumbers(NamedTuple):
-    """Numbering of triangles: the scene's faces, then instances, then actors."""
+    """Numbering of the triangles of the scene's faces, followed by instances and actors."""
 
     instance_starts: Ints  # (i + 1,): first triangle of each instance, then of the actors
     # (f + a + 1,): objects of the triangles of faces and actors; the last is -1, for `NO_SURFACE`
@@ -167,7 +167,7 @@ def _instance_of(t, instance_starts):
 
 @compiled()
 def find_owners(triangle, numbers, output):
-    """Write the stored rows, objects and instances of triangles (n,) to `output`.
+    """Write the stored rows, objects and instances of triangles to `output`.
 
     `numbers` is a `TriangleNumbers`, and `output` a `TriangleOwners`.
     """
@@ -207,7 +207,7 @@ def _instance_normal(matrices, i, x, y, z):
 
 @inlined
 def _actor_normal(poses, run, x, y, z):
-    """Return a normal rotated by column `run` of the poses (12, m)."""
+    """Return a normal rotated by column `run` of the poses."""
     a = _product(poses[3, run], poses[4, run], poses[5, run], x, y, z)
     b = _product(poses[6, run], poses[7, run], poses[8, run], x, y, z)
     c = _product(poses[9, run], poses[10, run], poses[11, run], x, y, z)
@@ -216,7 +216,7 @@ def _actor_normal(poses, run, x, y, z):
 
 @compiled()
 def compute_incidence(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
-    """Write to `output` how rays with directions (3, n) meet surfaces.
+    """Write to `output` how rays with directions meet surfaces.
 
     `hits` is a `HitSurfaces`, `tables` a `NormalTables`, and `output` an `Incidence`. `reflectance`
     and `retro` have one value per kind of surface. The reflected light is computed for surfaces
@@ -275,7 +275,7 @@ def at_right_angles(distance, extinction):
 
 @compiled()
 def attenuate_energies(distance, extinction, energy):
-    """Multiply energies (n,) by `at_right_angles` at the given distances (n,)."""
+    """Multiply energies by `at_right_angles` at the given distances."""
     for k in range(len(energy)):
         energy[k] *= at_right_angles(distance[k], extinction)
 
@@ -307,8 +307,8 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
     `row_indices` (k,) are rows of the hits, `reflected` (k,) is True for light that the surface
     reflects and False for light that it transmits, and `shares` (k,) are the shares of light that
     the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits` an
-    `OnwardLimits`. Surfaces of refracting media do not divide light here; `LightInMedia.cross` does
-    that.
+    `OnwardLimits`. Surfaces of refracting media do not divide light here, because
+    `LightInMedia.cross` does that.
 
     The function overwrites `row_indices` and `reflected` with the light that is bright enough,
     writes its share of the energy to `onward_share`, and returns the number of remaining rows. The
@@ -344,7 +344,7 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
 
 @compiled()
 def start_behind(origins, directions, step_m, clear_m, starts, onward):
-    """Write where light continues, `clear_m` (n,) beyond its ends, and normalize its directions.
+    """Write where light continues, `clear_m` beyond its ends, and normalize its directions.
 
     The light ends at distances `step_m` (n,) from `origins` along `directions`. It continues from
     `starts` along `onward`, which is normalized in place. Vectors have shape (3, n).
@@ -369,7 +369,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of sub-rays `ray` (n,) to `times`, in nanoseconds.
+    """Write the firing times of sub-rays `ray` to `times`, in nanoseconds.
 
     Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
     start times of firings, and `delays` are the delays of beams within a firing.
@@ -464,7 +464,7 @@ def _write_pose(tracks, segment, elapsed_s, poses, k):
 
 @compiled()
 def poses_on_tracks(trajectory, times_ns, tracks, poses):
-    """Write the poses (12, n) of trajectories on piecewise linear tracks.
+    """Write the poses of trajectories on piecewise linear tracks.
 
     The operations are those of `Track.poses`. `trajectory` (n,) are trajectory numbers, and
     `tracks` is a `TrackTable`. Columns of curved trajectories are not written. Returns the first

@@ -1,4 +1,4 @@
-"""Surfaces of a scene: normals, colors, and the light that materials reflect."""
+"""Surfaces of a scene with their normals, colors, and the light that their materials reflect."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class SceneSurfaces:
     def normals(
         self, triangle: Integers, times: Floats | Ints, trajectories: ActorTrajectories
     ) -> Floats:
-        """Return the unit normals of triangles (n,) in the scene frame, as float64.
+        """Return the unit normals of triangles in the scene frame, as float64.
 
         The normals are accurate to single precision. Normals of actors are rotated by the actors'
         poses at `times` (n,) in nanoseconds.
@@ -139,7 +139,7 @@ class SceneSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> tuple[Incidence, Ints32]:
-        """Return how rays meet triangles (n,), and the kinds of the triangles' surfaces (n,).
+        """Return the incidence of rays on triangles, and the kinds of the triangles' surfaces.
 
         `directions` (n, 3) are in the scene frame. `times` (n,) determine the poses of actors, in
         nanoseconds. `Incidence.back`, the energy received from 10 m, is valid for surfaces that are
@@ -228,7 +228,7 @@ class SceneSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> UInts32:
-        """Return the packed colors of points (n, 3) on triangles (n,).
+        """Return the packed colors of points on triangles.
 
         Points are in the scene frame in meters. If the scene has no colors, all points are gray.
         Actors have their poses at `times` (n,) in nanoseconds.
@@ -279,7 +279,7 @@ class SceneSurfaces:
         return Lookup(colors, corners)
 
     def kinds(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,), or -1 for `NO_SURFACE`."""
+        """Return the kinds of surfaces of triangles, or -1 for `NO_SURFACE`."""
         return self.triangle_kinds.of_triangles(triangle)
 
     def energy(
@@ -290,7 +290,7 @@ class SceneSurfaces:
         sensor_light: SensorLight,
         colors: UInts32 | None = None,
     ) -> Floats:
-        """Return the received energy of rays that end on triangles (n,) at distances in meters.
+        """Return the received energy of rays that end on triangles at distances in meters.
 
         The energy is ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction *
         distance)``. For a retroreflector, a gain replaces the cosine. Rough surfaces add gloss.

@@ -32,7 +32,7 @@ class TriangleKinds:
         self.material_kinds = kinds
 
     def of_triangles(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,), or -1 for `NO_SURFACE`.
+        """Return the kinds of surfaces of triangles, or -1 for `NO_SURFACE`.
 
         If several material names of an object match the same material of the survey, they are one
         kind.
@@ -43,7 +43,7 @@ class TriangleKinds:
         return self.of_rows(triangle_indices, objects)
 
     def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
-        """Return the kinds of surfaces from rows of the stored triangles (n,) and objects (n,).
+        """Return the kinds of surfaces from rows of the stored triangles and objects.
 
         Objects are required because instances of different objects can share stored triangles.
         """
@@ -111,7 +111,7 @@ class TriangleKinds:
         return order, np.searchsorted(owners[order], np.arange(self._triangles.static_objects + 1))
 
     def faces_of(self, kind: int) -> Integers:
-        """Return the faces (f, 3) of the scene that have a kind of surface."""
+        """Return the faces of the scene that have a kind of surface."""
         order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[kind])
         face_indices = order[starts[owner] : starts[owner + 1]]
@@ -121,7 +121,7 @@ class TriangleKinds:
         return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
-        """Select the faces that have a kind of surface from the faces (f, 3) of an object."""
+        """Select the faces that have a kind of surface from the faces of an object."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds

@@ -41,7 +41,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
 
 
 def static_key(scene: Scene, unseen: Bools | None) -> bytes:
-    """Return a key that is equal for masks (objects,) with the same unseen static objects.
+    """Return a key that is equal for masks with the same unseen static objects.
 
     The key is empty if all static objects are visible.
     """
@@ -53,7 +53,7 @@ def static_key(scene: Scene, unseen: Bools | None) -> bytes:
 def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
     """Return a scene with only the visible static objects, or None if no object is left.
 
-    `unseen` is a mask (objects,). Objects keep their numbers; colors, materials and actors are
+    `unseen` is a mask (objects,). Objects keep their numbers. Colors, materials and actors are
     omitted.
     """
     faces = np.flatnonzero(~unseen[scene.face_object])

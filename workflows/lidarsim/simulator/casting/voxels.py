@@ -25,7 +25,9 @@ class GridPassage(NamedTuple):
 
 
 class _GridRays(NamedTuple):
-    """Rays of light in the voxels of k grids. Rays are along the last axis of all arrays.
+    """Rays of light in the voxels of k grids.
+
+    The last axis of each array is the axis of the rays.
 
     Rays are removed when they hit a leaf or reach the end of their path.
     """
@@ -51,7 +53,10 @@ class _GridRays(NamedTuple):
 
 
 class Grids:
-    """Voxel grids of the instances in a scene. The densities of each part are stored once."""
+    """Voxel grids of the instances in a scene.
+
+    The densities of each part are stored once.
+    """
 
     def __init__(self, shared: Instances) -> None:
         voxels = [part.voxels for part in shared.mesh_parts]

@@ -79,7 +79,7 @@ class BatchPoints:
         return column.make(self)
 
     def positions_of(self, row_indices: Ints) -> Floats:
-        """Return the positions (k, 3) of the returns in the given rows."""
+        """Return the positions of the returns in the given rows."""
         return self.positions[row_indices]
 
     # -- the ray -----------------------------------------------------------------------------
@@ -160,7 +160,10 @@ class BatchPoints:
 
     @cached_property
     def _rays(self) -> tuple[Floats, Floats]:
-        """Origins, (n, 3) or (3,), and directions (n, 3) of the rays in the scene frame."""
+        """Origins and directions of the rays in the scene frame.
+
+        The directions have shape (n, 3), and the origins (n, 3) or (3,).
+        """
         return self._poses.rays(self._pattern, self.pulse_returns.ray, self._start)
 
     @property
@@ -188,7 +191,7 @@ class BatchPoints:
         return self._moved_with_frozen_sensor(self._scene_positions)
 
     def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
-        """Move points (n, 3) with a frozen sensor from the old sweep to the sweep that it replaces.
+        """Move points with a frozen sensor from the old sweep to the sweep that it replaces.
 
         Points are in the scene frame. If the sensor is not frozen, they are returned unchanged.
         """
@@ -290,7 +293,7 @@ class BatchPoints:
         return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
-        """Rotate vectors (n, 3), one per return, from the pattern frame to the sensor frame.
+        """Rotate one vector per return from the pattern frame to the sensor frame.
 
         The pattern is in the head frame if it is a single firing that each pose rotates
         (`CastPoses.by_head`), otherwise in the platform frame.
@@ -306,7 +309,7 @@ class BatchPoints:
         return rotate(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
-        """Rotate vectors (n, 3) from the scene frame to the sensor frame at the firing."""
+        """Rotate vectors from the scene frame to the sensor frame at the firing."""
         in_platform = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
@@ -497,7 +500,10 @@ class BatchPoints:
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """Rate of change of the range in m/s with noise; NaN for returns added by the receiver."""
+        """Rate of change of the range in m/s with noise.
+
+        The rate is NaN for returns that the receiver added.
+        """
         returns = self.pulse_returns
         velocity = returns.velocity
         if velocity is None:

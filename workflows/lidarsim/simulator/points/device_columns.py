@@ -108,7 +108,7 @@ class DevicePoints:
         return np.full(len(self), value, column.dtype)
 
     def positions_of(self, row_indices: Ints) -> Floats:
-        """Return the positions (k, 3) of the points in the given rows, in meters.
+        """Return the positions of the points in the given rows, in meters.
 
         Positions are rounded to the precision of the survey unless NumPy computes columns.
         """
@@ -152,7 +152,7 @@ class DeviceColumns:
             column for column in _DEVICE_COLUMNS if column.name in stored & computable
         ]
         self.energies = [column for column in self.device_columns if column.name in _ENERGIES]
-        # Whether NumPy computes the energies of hits on actors; the device computes all others.
+        # Whether NumPy computes the energies of hits on actors. The device computes all others.
         self.needs_actor_hits = bool(scene.actors and self.energies)
         bodies, _ = surfaces.triangles.bodies()
         seen = {caster: VisibleBodies(caster, bodies) for caster in dict.fromkeys(casters)}
@@ -239,7 +239,7 @@ class DeviceColumns:
     def write_ranges(
         self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges in meters of the rays of a sensor to `image` (n,).
+        """Write the ranges in meters of the rays of a sensor to `image`.
 
         Ray i is row ``i % len(pattern)`` of the pattern. The caller fills `image` with inf, which
         remains where a ray has no return.

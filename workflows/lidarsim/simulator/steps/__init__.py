@@ -1,1 +1,4 @@
-"""The simulation steps. Each module implements one effect; its compiled loops are beside it."""
+"""The simulation steps, with one module per effect.
+
+The compiled loops of a step are in a separate module in this folder.
+"""

@@ -1,4 +1,4 @@
-"""Errors of the emitted beam directions; the reported directions contain no errors."""
+"""Errors of the emitted beam directions, which do not affect the reported directions."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Cast sub-rays, and follow their light through glass and off mirrors.
+"""Cast sub-rays, and follow their light through glass and its reflection from mirrors.
 
-A surface can reflect, transmit and scatter parts of the light; each part continues separately.
+A surface can reflect, transmit and scatter parts of the light. Each part continues separately.
 """
 
 from __future__ import annotations
@@ -88,7 +88,10 @@ class CastLight(NamedTuple):
 
 
 class SurfaceHits(NamedTuple):
-    """Surface hits, one for each row of light. Arrays (n,), vectors (n, 3)."""
+    """Surface hits, with one row for each row of light.
+
+    Arrays have shape (n,), and arrays of vectors have shape (n, 3).
+    """
 
     step_m: Floats  # distance from the origin of the last segment, meters
     triangle: Ints32  # for a hit on a leaf, the triangle where the light entered the crown
@@ -113,9 +116,10 @@ class VisibleHits(NamedTuple):
 
 
 class SurfaceCrossings(NamedTuple):
-    """Surfaces that transmit or reflect light. Arrays (n,), vectors (n, 3).
+    """Surfaces that transmit or reflect light.
 
-    A surface that does both has two rows.
+    A surface that does both has two rows. Arrays have shape (n,), and arrays of vectors have shape
+    (n, 3).
     """
 
     step_m: Floats  # distance from the origin, meters
@@ -129,7 +133,10 @@ class SurfaceCrossings(NamedTuple):
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues, as arrays (k,). Divided light has two rows."""
+    """Rows of light that continues, as arrays of shape (k,).
+
+    Light that is divided has two rows.
+    """
 
     row_indices: Indices
     reflected: Bools  # True if the light of the row is reflected, False if it is transmitted
@@ -137,7 +144,10 @@ class OnwardRows(NamedTuple):
 
 
 class Deflection(NamedTuple):
-    """Light behind surfaces that refract or reflect it. Arrays (n,), vectors (n, 3)."""
+    """Light behind surfaces that refract or reflect it.
+
+    Arrays have shape (n,), and arrays of vectors have shape (n, 3).
+    """
 
     directions: Floats
     share: Floats  # share behind the surface, as in `LightPaths.share`
@@ -146,7 +156,10 @@ class Deflection(NamedTuple):
 
 
 class OnwardLight(NamedTuple):
-    """Light behind the surfaces of its last hits, before the next cast, as arrays (n,)."""
+    """Light behind the surfaces of its last hits, before the next cast.
+
+    All arrays have shape (n,).
+    """
 
     light: LightPaths
     start_m: Floats  # positions of these surfaces along the light, meters, at or below 0
@@ -224,7 +237,9 @@ class CastStep(PulseStep):
         return Memory(casting=casting, counting=75 * sizes.return_count + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch's sub-rays; the argument `returns` is not used.
+        """Return the hits of a batch's sub-rays.
+
+        The argument `returns` is not used.
 
         A pass casts light and determines what happens to it at the hits:
 
@@ -237,9 +252,7 @@ class CastStep(PulseStep):
         4. `_continue` takes the marked rows (`OnwardRows`), twice if light is both transmitted and
            reflected, and refracts or reflects the light (`Deflection`). The result is
            `OnwardLight`. If no rows are marked, this was the last pass.
-        5. `_cast_again` casts this light and returns the `CastLight` of the next pass, which
-           continues
-           with 2.
+        5. `_cast_again` casts this light and returns the `CastLight` for step 2 of the next pass.
         6. `_join` sorts the hits of all passes by sub-ray.
 
         For example, two sub-rays hit a pane of glass at 4 m with a wall behind it at 9 m. Pass 1
@@ -275,7 +288,7 @@ class CastStep(PulseStep):
         return np.inf if self._leafy else self.setup.sensor.max_range_m
 
     def _draw(self, batch: PulseBatch) -> Draw:
-        """Return a function `draw(purpose, ray)` that returns random bits for sub-rays (n,)."""
+        """Return a function `draw(purpose, ray)` that returns random bits for sub-rays."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
             scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
@@ -310,7 +323,7 @@ class CastStep(PulseStep):
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light, at the sensor, of sub-rays `ray` (n,) that hit a surface.
+        """Return the light, at the sensor, of sub-rays `ray` that hit a surface.
 
         `rays` has all sub-rays of the batch (`_cast_first`).
         """
@@ -411,7 +424,7 @@ class CastStep(PulseStep):
     def _leaf_energy(
         self, leaves: Leaves, triangle: Ints32, distance: Floats, color: UInts32 | None
     ) -> Floats:
-        """Return the received energies of leaves (k,).
+        """Return the received energies of leaves.
 
         `triangle`, `distance` (meters) and `color` belong to all hits (n,), including hits on
         leaves.
@@ -433,7 +446,7 @@ class CastStep(PulseStep):
         triangle: Ints32,
         actor_trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities in m/s of surfaces at hits, with shape (0, 3) if not needed."""
+        """Return the velocities in m/s of surfaces at hits, or no rows if they are not needed."""
         if light.range_rate is None:
             return np.zeros((0, 3))
         return velocities_of_ends(
@@ -722,7 +735,7 @@ def _range_rate_behind(
 def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
-    """Return rays that start `clear_m` (n,) beyond the ends of light, and their origins (n, 3).
+    """Return rays that start `clear_m` beyond the ends of light, and their origins.
 
     The light ends at distances `step_m` (n,) in meters from its origins. `outgoing` (n, 3) are the
     directions of the rays, whose lengths must be close to 1.

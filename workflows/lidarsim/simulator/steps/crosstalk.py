@@ -1,4 +1,4 @@
-"""Crosstalk: a receiver cannot distinguish pulses of other sensors from its own pulses."""
+"""Crosstalk between sensors, whose receivers cannot distinguish foreign pulses from their own."""
 
 from __future__ import annotations
 
@@ -52,7 +52,10 @@ class ReceivedPulses(NamedTuple):
 
 
 class _WaitingRays(NamedTuple):
-    """Rays whose receiver waits for light. Arrays (n,), vectors (n, 3) in the scene frame."""
+    """Rays whose receiver waits for light.
+
+    Arrays have shape (n,). Arrays of vectors have shape (n, 3) and are in the scene frame.
+    """
 
     fired: Floats  # firing times, nanoseconds since the start of the station
     order: Indices  # rows of the rays, sorted by firing time
@@ -146,7 +149,7 @@ class CrosstalkStep(PulseStep):
     def receive(
         self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: CastPoses
     ) -> ReceivedPulses:
-        """Return the foreign pulses that consecutive rays (n,) receive.
+        """Return the foreign pulses that consecutive rays receive.
 
         `rays` are numbers counted from the first ray of scan `scan`. `origins` (n, 3) in meters and
         unit `directions` (n, 3) are in the scene frame.
@@ -236,9 +239,10 @@ class CrosstalkStep(PulseStep):
         return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
 
     def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Return the axes (c, 3) and opening angles (c,) in radians of cones of consecutive rays.
+        """Return the axes and opening angles of cones around consecutive rays.
 
-        Consecutive rays lie in a narrow cone, which few spots are in.
+        The axes have shape (c, 3), and the angles (c,) are in radians. Consecutive rays lie in a
+        narrow cone, which contains few spots.
         """
         cell_starts = np.arange(0, len(directions), CELL_RAYS)
         sums = np.add.reduceat(directions, cell_starts, axis=0)
@@ -329,7 +333,10 @@ def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
 
 
 def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
-    """Return start and stop of the firings with beams in an interval, in ns from station start."""
+    """Return the start and stop of the firings that have beams in a time interval.
+
+    The interval is in nanoseconds since the start of the station.
+    """
     firings = range(sensor.firings(steps - 1)[1])
     start_of = partial(firing_start_ns, sensor)
     slowest_ns = float(sensor.beams.time_ns.max())

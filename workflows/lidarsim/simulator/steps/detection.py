@@ -1,4 +1,4 @@
-"""Detection: which signals exceed the threshold of a receiver, and which returns drop out."""
+"""Detection of the signals that exceed a receiver's threshold, and random loss of returns."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ class DetectionStep(PulseStep):
 def detected(
     noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
 ) -> Bools:
-    """Return whether returns (n,) with the given energies are detected.
+    """Return whether returns with the given energies are detected.
 
     `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (the ray's
     number in its scan) and `number` (the return's number in its ray, from 0) are the keys of the
     random numbers.
 
     The signal with normally distributed noise must exceed a threshold. If the energy equals the
-    threshold, half of the returns are detected; at 1.4 times this energy, 97.7 %; and at a fifth of
-    it, 3 in 100,000.
+    threshold, half of the returns are detected. At 1.4 times this energy, 97.7 % are detected, and
+    at a fifth of it, 3 in 100,000.
     """
     detected_mask = uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
     if noise.detection_range_m is not None:
@@ -66,7 +66,7 @@ def exceeds_threshold(
     ray: Integers,
     number: ArrayLike = 0,
 ) -> Bools:
-    """Return whether signals (n,) with noise exceed the threshold.
+    """Return whether signals with noise exceed the threshold.
 
     The arguments are the same as in `detected`, with a purpose for the random numbers.
     """

@@ -1,8 +1,9 @@
-"""Radial velocities: the rate of change of each return's range, as a coherent lidar measures it.
+"""Radial velocities, which are the rates of change of ranges that a coherent lidar measures.
 
-This is the velocity of the hit point minus the velocity of the ray's origin, projected on the ray.
-FMCW lidars measure it from the Doppler shift 2 v / wavelength (Hexsel, Vhavle and Chen 2022). Both
-velocities are derivatives of trajectories (`lidarsim.motion.trajectory.velocities`).
+A radial velocity is the velocity of the hit point minus the velocity of the ray's origin, projected
+on the ray. FMCW lidars measure it from the Doppler shift 2 v / wavelength
+(Hexsel, Vhavle and Chen 2022). Both velocities are derivatives of trajectories
+(`lidarsim.motion.trajectory.velocities`).
 """
 
 from __future__ import annotations

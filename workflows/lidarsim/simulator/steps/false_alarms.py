@@ -1,4 +1,4 @@
-"""False alarms: receiver noise that exceeds the detection threshold."""
+"""False alarms, which occur when receiver noise exceeds the detection threshold."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ class FalseAlarmStep(PulseStep):
 
 
 def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> FalseAlarms:
-    """Sample false alarms of rays (n,) whose receivers are open for `gate_s` seconds.
+    """Sample false alarms of rays whose receivers are open for `gate_s` seconds.
 
     False alarms occur at a constant rate. Each is a maximum of the receiver noise above the
-    threshold; maxima of normally distributed narrowband noise follow a Rayleigh distribution
-    (Rice 1944).
+    threshold. Maxima of normally distributed narrowband noise follow a Rayleigh distribution (Rice
+    1944).
     """
     ray_indices = np.arange(len(ray))
     since_s = np.zeros(len(ray))

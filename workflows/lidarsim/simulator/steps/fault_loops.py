@@ -1,4 +1,4 @@
-"""Compiled loop that drops returns lost to sensor faults, see losses.py."""
+"""Compiled loop that drops returns lost to sensor faults (losses.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 

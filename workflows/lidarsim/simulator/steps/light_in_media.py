@@ -1,4 +1,4 @@
-"""Media within closed surfaces: refraction, attenuation, and leaves that light hits at random.
+"""Refraction, attenuation and random leaf hits of light in media within closed surfaces.
 
 Directions follow Snell's law. Energies follow Fresnel's equations, the Beer-Lambert law, and the
 divergence of the beam, for which ray differentials (Igehy 1999) track the cross-section of a cone
@@ -54,7 +54,10 @@ class MediaRays(NamedTuple):
 
 @dataclass
 class MediaStack:
-    """Media around the light of sub-rays, innermost first. Shape (n, MAX_MEDIA); -1 for none."""
+    """Media around the light of sub-rays, innermost first.
+
+    The arrays have shape (n, MAX_MEDIA), with -1 for no medium.
+    """
 
     kinds: Ints32  # kinds of the media's surfaces
     triangles: Ints32  # triangles through which the light entered
@@ -110,7 +113,7 @@ class RayDifferentials:
 
     @classmethod
     def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
-        """Return the differentials of light at its origin, from its directions (n, 3)."""
+        """Return the differentials of light at its origin, from its directions."""
         derivatives = np.stack([axis.T for axis in perpendicular_axes(directions.T)], axis=1)
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
@@ -120,7 +123,7 @@ class RayDifferentials:
         return RayDifferentials(*select_rows(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
-        """Advance the light by steps (n,) in meters through an attenuation (n,) in 1/m."""
+        """Advance the light by steps in meters through an attenuation in 1/m."""
         shift = step[:, None, None] * self.direction_derivatives
         self.position_derivatives = self.position_derivatives + shift
         self.attenuation_depth = self.attenuation_depth + attenuation * step
@@ -129,8 +132,9 @@ class RayDifferentials:
         """Return the energy relative to light on a straight path of the same length in air.
 
         Light scattered at the end of a path reaches the receiver in proportion to the receiver's
-        area divided by the area of the cone of scattered light there. By reciprocity, the latter is
-        the area of the cone of outgoing light times the square of the refractive index.
+        area divided by the area of the cone of scattered light there. By reciprocity, the area of
+        this cone is the area of the cone of outgoing light times the square of the refractive
+        index.
         """
         first_axis, second_axis = self.position_derivatives.transpose(1, 2, 0)
         a, b, c = directions.T
@@ -188,7 +192,7 @@ class Media:
         self.grids = surfaces.grids
         self.instances = surfaces.triangles.instances
         owners = surfaces.triangle_kinds.material_kinds.object
-        # (kinds + 1,): whether the leaves are in voxel grids; the last entry is for kind -1.
+        # (kinds + 1,): whether the leaves are in voxel grids. The last entry is for kind -1.
         self.gridded = np.append(scene.has_voxels[owners], False)
         self._angles = table.leaf_angles
         # The last entry, for kind -1 (no surface), is 0.
@@ -219,7 +223,7 @@ class Media:
                 projection(angle, np.ones(1))  # computes and caches the table for this angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
-        """Return whether light enters bodies, given the cosines between normals and light (n,)."""
+        """Return whether light enters bodies, given the cosines between normals and light."""
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
     def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
@@ -256,7 +260,7 @@ class Media:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> MediaStack:
-        """Find the media around origins (n, 3) by casting rays upwards.
+        """Find the media around origins by casting rays upwards.
 
         If a ray leaves a medium that it has not entered, its origin is inside this medium.
         """
@@ -327,7 +331,7 @@ class Media:
     def stack_behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
-        """Return the media behind surfaces (n,), given the cosines between normals and light."""
+        """Return the media behind surfaces, given the cosines between normals and light."""
         behind = stack[np.arange(len(kinds))]
         enters = self.enters(kinds, cosines)
         filled = self.filled[kinds]
@@ -374,7 +378,10 @@ class LightInGrids(NamedTuple):
 
 
 class Refraction(NamedTuple):
-    """Light behind surfaces. Arrays (n,), vectors (n, 3)."""
+    """Light behind surfaces.
+
+    Arrays have shape (n,), and arrays of vectors have shape (n, 3).
+    """
 
     directions: Floats
     # Share of the light, one way: transmitted light, or reflected light where light is reflected.
@@ -393,7 +400,10 @@ class Leaves(NamedTuple):
 
 @dataclass
 class LightInMedia:
-    """State of light in media: media stack, refraction, and remaining optical depth to a leaf."""
+    """State of light in media.
+
+    It consists of the media stack, the refraction and the remaining optical depth to a leaf.
+    """
 
     media: Media
     stack: MediaStack
@@ -413,7 +423,7 @@ class LightInMedia:
         return 1.0 if self.differentials is None else self.differentials.index
 
     def optical_length(self, step: Floats) -> Floats:
-        """Return the optical path lengths of steps (n,) in meters."""
+        """Return the optical path lengths of steps in meters."""
         return step if self.differentials is None else step * self.differentials.index
 
     def meet_leaves(
@@ -453,9 +463,10 @@ class LightInMedia:
     def _advance_to_leaves(
         self, density: Floats, length: Floats, passage: LightInGrids | None
     ) -> tuple[Indices, Floats]:
-        """Reduce the remaining depth along paths of length (n,) in meters and density (n,) in 1/m.
+        """Reduce the remaining depth along paths, and find the light that hits leaves.
 
-        Returns the rows of light that hits a leaf, and the distances to the leaves in meters.
+        The lengths of the paths are in meters, and the densities are in 1/m. The result contains
+        the rows of light that hits a leaf, and the distances to the leaves in meters.
         """
         assert self.remaining_depth is not None
         depth = density * length
@@ -478,8 +489,8 @@ class LightInMedia:
     ) -> LightInGrids:
         """Follow light through voxel grids, and return the passage with updated densities.
 
-        The light starts at `starts` (n, 3) and travels `length` (n,) meters. `density` (n,
-        MAX_MEDIA) is the optical depth per meter; for a grid, it is given for a leaf area density
+        The light starts at `starts` (n, 3) and travels `length` (n,) meters. `density`
+        (n, MAX_MEDIA) is the optical depth per meter. For a grid, it applies to a leaf area density
         of 1 m²/m³.
         """
         grids = self.media.grids
@@ -511,7 +522,7 @@ class LightInMedia:
         return LightInGrids(row_indices, meters, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
-        """Advance the light by steps (n,) in meters."""
+        """Advance the light by steps in meters."""
         if self.differentials is not None:
             self.differentials.advance(step, self.media.attenuation(self.stack))
 
@@ -530,7 +541,7 @@ class LightInMedia:
         cosines: Floats,
         reflected: Bools,
     ) -> Refraction:
-        """Transmit light through surfaces (n,), or reflect it where `reflected` is True.
+        """Transmit light through surfaces, or reflect it where `reflected` is True.
 
         `cosines` are cosines between normals and directions. This updates the media stacks:
         transmitted light enters or leaves a medium, while reflected light stays in its media. The
@@ -553,7 +564,7 @@ class LightInMedia:
         return Refraction(outgoing, shares, refraction.totally_reflected)
 
     def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
-        """Update the differentials at flat surfaces that change directions (n, 3)."""
+        """Update the differentials at flat surfaces that change directions."""
         if self.differentials is not None:
             self.differentials.deflect(
                 incoming, outgoing, normals, mirrored, self.media.index(self.stack)
@@ -590,7 +601,7 @@ def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
 
 
 def random_depths(bits: NDArray[np.uint64]) -> Floats:
-    """Convert random bits (n,) to exponentially distributed numbers with mean 1.
+    """Convert random bits to exponentially distributed numbers with mean 1.
 
     For speed, the logarithm is computed from the binary exponent and a table of 32,768 logarithms.
     """

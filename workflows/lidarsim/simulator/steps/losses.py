@@ -1,4 +1,4 @@
-"""Sensor faults: dirt on the window, and channels, packets and scans without returns."""
+"""Sensor faults such as dirt on the window, dead channels, lost packets and frozen sweeps."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class DirtStep(PulseStep):
 
 
 def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
-    """Return whether unit directions (n,) in the sensor frame pass through the dirt of a fault."""
+    """Return whether unit directions in the sensor frame pass through the dirt of a fault."""
     begin, end = fault.azimuth_deg or (0, 360)
     half = ((end - begin) % 360 or 360) / 2
     lowest, highest = fault.elevation_deg or (-90, 90)

@@ -1,4 +1,4 @@
-"""Compiled loops that sample the particles and the fog that beams meet, see particles.py."""
+"""Compiled loops that sample the particles and the fog that beams meet (particles.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -89,9 +89,9 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
 def sample_fog(subrays, tables, keys, reach, hits):
     """Sample the fog return of each beam into `hits`, and return the number of returns.
 
-    `tables` is a `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
-    from the cell with the highest peak in front of its surface, which is the surface hit by its
-    first, central sub-ray. A beam whose surface is within the first cell returns nothing.
+    `tables` is a `FogTables`, and `keys` and `reach` are as in `sample_particles`. A beam returns
+    light from the cell with the highest peak in front of its surface, which is the surface hit by
+    its first, central sub-ray. A beam whose surface is within the first cell returns nothing.
     """
     cells = len(tables.energies)
     count = 0

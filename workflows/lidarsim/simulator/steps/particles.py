@@ -1,8 +1,8 @@
-"""Hits in the air: drops, flakes, fog and dust in front of surfaces.
+"""Hits on rain, snow, fog and dust in front of surfaces.
 
 The particles that a beam meets depend only on the random numbers of its pulse. Only particles that
-the sensor may detect are sampled: their number from a Poisson distribution, and their ranges and
-diameters as quantiles.
+the sensor may detect are sampled. Their number is drawn from a Poisson distribution, and their
+ranges and diameters are drawn as quantiles.
 """
 
 from __future__ import annotations
@@ -159,9 +159,9 @@ class WeatherStep(PulseStep):
         """Sample hits on particles and fog in the air in front of surfaces.
 
         `beams` are the number of the first beam and one past the last, as in `keys`. `hits` are the
-        surface hits of these beams; each beam has `subrays` sub-rays. The result is sorted by ray,
-        where rays are sub-rays numbered from the first sub-ray of the first beam. It is None if
-        neither particles nor fog can be detected.
+        surface hits of these beams, each of which has `subrays` sub-rays. The result is sorted by
+        ray, where rays are sub-rays numbered from the first sub-ray of the first beam. It is None
+        if neither particles nor fog can be detected.
         """
         first, stop = beams
         count = (stop - first) * subrays
@@ -200,7 +200,7 @@ class WeatherStep(PulseStep):
         )
 
     def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether points at distances (n,) along rays are inside water or glass."""
+        """Return whether points at distances along rays are inside water or glass."""
         row_indices = self._refracting(hits)
         surface_ray = hits.ray[row_indices]
         surface_distance = hits.distance[row_indices]
@@ -297,7 +297,7 @@ def room_for_hits(size: int) -> SampledHits:
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,) in meters."""
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` in meters."""
     from . import particle_loops  # imported here: numba takes half a second
 
     beams = len(reach) // subrays
@@ -423,7 +423,7 @@ def highest_probabilities(signals: Floats) -> Floats:
     """Return cumulative probabilities that each signal is the highest of the first n.
 
     `signals` (k,) are descending, with noise of standard deviation 1. Row n of the result (k + 1,
-    k) is for the first n signals; row 0 is 1.
+    k) is for the first n signals, and row 0 is 1.
     """
     count = len(signals)
     probabilities = np.ones((count + 1, count))

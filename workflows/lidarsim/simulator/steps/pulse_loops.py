@@ -1,4 +1,7 @@
-"""Functions shared by the compiled loops over pulses. Each loop is compiled on first use."""
+"""Functions shared by the compiled loops over pulses.
+
+Each loop is compiled on first use.
+"""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -75,7 +78,7 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
     Scans begin at the rays `scan_starts`, and their counts are added to `hit_counts`. For each kept
     return, the function writes the row to `row_indices`, the number in the pulse (from 1) to
-    `number`, and the number of returns of the pulse to `return_counts`; the last two are at most
+    `number`, and the number of returns of the pulse to `return_counts`. Both numbers are limited to
     255. Returns the number of kept returns.
     """
     count = 0
@@ -101,7 +104,8 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 def _half_way(hit, neighbor, inverse_distance, neighbors):
     """Return the range in meters of the plane of a hit, half-way to a neighboring hit.
 
-    `hit` and `neighbor` are rows in `SubrayNeighbors`; `inverse_distance` belongs to `hit`, in 1/m.
+    `hit` and `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in
+    1/m.
     """
     normals = neighbors.normals
     directions = neighbors.directions
@@ -123,7 +127,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
     """Clear `marks.starts_surface` where a hit of a beam continues the previous hit's surface.
 
     The hits of the beam are rows `begin` to `stop` of `hits`, a `PulseHits`, and of `marks`, a
-    `SurfaceMarks`; only `solid` hits are considered. Two neighboring sub-rays hit the same surface
+    `SurfaceMarks`. Only `solid` hits are considered. Two neighboring sub-rays hit the same surface
     if the planes through their hits meet half-way between the hits, within `gap_m` or within half
     of the distance between the hits. The inverse range of a plane is linear in the ray's direction,
     so two hits on one plane always meet, whatever the angle. The tolerance of half the distance

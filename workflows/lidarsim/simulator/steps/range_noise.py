@@ -1,4 +1,7 @@
-"""Range errors: noise, which is larger for weak returns, range walk, and lasting errors."""
+"""Range errors, which comprise noise, range walk, and lasting errors.
+
+The noise is larger for weak returns.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +54,7 @@ def noisy_ranges(
     ray: Integers,
     number: Integers,
 ) -> Floats:
-    """Return the reported ranges of returns (n,) in meters, which are at least 0.
+    """Return the reported ranges of returns in meters, which are at least 0.
 
     `distance` (n,) is in meters. `energy` (n,) is the energy, or the height of the return in a
     waveform. It may be None if neither noise nor range walk depends on it. `scan`, `ray` and
@@ -69,7 +72,7 @@ def noisy_ranges(
 
 
 def range_walk(noise: Noise, energy: Floats) -> Floats:
-    """Return by how many meters returns (n,) appear closer than a return at the threshold.
+    """Return the range walk of returns in meters, relative to a return at the threshold.
 
     A Gaussian pulse whose height is ``energy / threshold`` times a fixed threshold crosses the
     threshold √(2 ln(energy / threshold)) standard deviations before its maximum.

@@ -1,4 +1,4 @@
-"""Saturation: pulses that saturate the receiver are clipped and widened, and hide near returns."""
+"""Saturation of the receiver, which clips and widens pulses and hides nearby returns."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SaturationStep(PulseStep):
 
 
 def apply_saturation(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:
-    """Clip returns (n,) at the height `full`, and merge returns that overlap clipped returns.
+    """Clip returns at the height `full`, and merge returns that overlap clipped returns.
 
     A Gaussian pulse of height A, clipped at S, exceeds S / 2 for √(1 + log2(A / S)) of its full
     width at half maximum. This width is `pulse_ns` unless a return has its own width, as in

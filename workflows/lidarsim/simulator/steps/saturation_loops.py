@@ -1,4 +1,4 @@
-"""Compiled loop that merges saturating pulses with the pulses they hide, see saturation.py."""
+"""Compiled loop that merges saturating pulses with the pulses they hide (saturation.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 

@@ -1,4 +1,4 @@
-"""Compiled loops that make, detect and select the returns of hits, see separation.py."""
+"""Compiled loops that create, detect and select returns (separation.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -394,7 +394,9 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
 
 @noinline
 def _mark(energy, begin, stop, mode, shown):
-    """Mark which returns of a pulse a mode reports, preferring near returns of equal strength.
+    """Mark the returns of a pulse that a mode reports.
+
+    Among returns of equal strength, the closest one is preferred.
 
     "Dual" reports the strongest and the last return. If the strongest return is the last, it also
     reports the second strongest. "Two strongest" reports the strongest and the second strongest.
@@ -436,7 +438,7 @@ def _keep_reported(begin, stop, mode, scratch, output):
 
 @compiled()
 def mark_reported(ray, energy, mode, shown):
-    """Mark in `shown` (n,) which returns, sorted by ray, a mode reports."""
+    """Mark in `shown` which returns, sorted by ray, a mode reports."""
     begin = 0
     while begin < len(ray):
         stop = begin + 1
@@ -452,8 +454,8 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
 
     `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
     `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
-    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0;
-    beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
+    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0,
+    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
     """
     subrays = receiver.subrays
     size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)

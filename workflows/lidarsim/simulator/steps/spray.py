@@ -1,4 +1,4 @@
-"""Spray: clumps of drops that vehicles leave behind on wet ground.
+"""Spray, which consists of clumps of drops that vehicles leave behind on wet ground.
 
 Every tenth of a second, each vehicle leaves a box of spray that is as wide and high as the vehicle,
 and as long as the distance that it has driven. A box stays in place while its drops fall to the
@@ -165,7 +165,7 @@ class SprayStep(PulseStep):
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> BoxCrossings:
-        """Return where the central rays of beams cross boxes.
+        """Return the crossings of the central rays of beams with boxes.
 
         `reach_m` (beams,) is the range in meters at which each beam ends. The crossings of a beam
         are consecutive, sorted by vehicle and then by the time at which the vehicle leaves the box.
@@ -228,7 +228,7 @@ class SprayStep(PulseStep):
     def _boxes_of(
         self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, pose_ns: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the boxes that actors leave at `created_ns` (b,), and the actors' speeds in m/s.
+        """Return the boxes that actors leave at `created_ns`, and the actors' speeds in m/s.
 
         Each row of the boxes (b, 12) is a center and three vectors, half of the box's sides, in
         meters in the scene frame. A box starts at the rear of the actor. Along the actor's x axis,

@@ -1,4 +1,4 @@
-"""Compiled loops over pulses that cross boxes of spray, see spray.py."""
+"""Compiled loops over pulses that cross boxes of spray (spray.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -32,7 +32,8 @@ class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
     boxes: Floats  # (b, 12): center and half of the sides as vectors, in the scene frame, meters
-    # (b, 2): first and last time of each box; the last is `lasts_ns` after the box was created.
+    # (b, 2): first and last time of each box. The last time is `lasts_ns` after the box was
+    # created.
     presence_ns: Floats
     # (b,): density when the box is created, as a multiple of `Survey.spray_g_m3`.
     density: Floats
@@ -41,7 +42,10 @@ class SprayBoxes(NamedTuple):
 
 
 class BoxCrossings(NamedTuple):
-    """BoxCrossings of beams and boxes. The crossings of a beam are consecutive."""
+    """Crossings of beams and boxes.
+
+    The crossings of a beam are consecutive.
+    """
 
     beam: Ints  # (k,): number of the beam in the batch
     # (3, k): ranges in meters at which the beam enters and leaves the box, and the density of the
@@ -60,7 +64,7 @@ class ClumpTables(NamedTuple):
 
 @noinline
 def _ball_radii(boxes):
-    """Return the radii in meters of the bounding spheres of boxes (b, 12)."""
+    """Return the radii in meters of the bounding spheres of boxes."""
     radii = np.zeros(len(boxes))
     for b in range(len(boxes)):
         for side in range(3, 12):
@@ -71,9 +75,10 @@ def _ball_radii(boxes):
 
 @inlined
 def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
-    """Return where a ray enters and leaves a box, in meters, ascending only if it meets the box.
+    """Return the distances at which a ray enters and leaves a box, in meters.
 
-    `to_middle` is the vector from the ray's origin to the center of the box.
+    The distances are ascending only if the ray meets the box. `to_middle` is the vector from the
+    ray's origin to the center of the box.
     """
     p, q, r = to_middle
     u, v, w = direction
@@ -162,8 +167,8 @@ def _column(ranges, guide, part_m, distance):
     """Return the first column at the given distance or farther.
 
     `ranges` are the ascending ranges of the columns in meters. The search starts at the column that
-    `guide` has for the distance (`_guide`); `part_m` is the length of a guide part. A search by
-    numba would take long to compile.
+    `guide` has for the distance (`_guide`), where `part_m` is the length of a guide part. A search
+    by numba would take long to compile.
     """
     column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
     while column < len(ranges) and ranges[column] < distance:

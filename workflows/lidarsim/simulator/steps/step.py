@@ -1,4 +1,4 @@
-"""Interface of the simulation steps. A step is one effect on the pulses of a sensor.
+"""Interface of the simulation steps, each of which is one effect on the pulses of a sensor.
 
 `step_list.py` lists the steps in their order. A step is a class that declares its role, when it
 applies, the columns that it reads and writes, its random numbers and its memory. Nothing else
@@ -33,14 +33,17 @@ from ..returns import Keys, Planes, PulseReturns
 
 
 class Role(Flag):
-    """Kinds of effects on pulses. Each step declares one or more flags."""
+    """Kinds of effects on pulses.
+
+    Each step declares one or more flags.
+    """
 
     AIMS = auto()  # deflects beams before they are cast
     ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation, not horizontally and vertically
     CHANGES = auto()  # can remove or add returns, change energies, or add waveforms
-    # like CHANGES, for returns that the receiver adds or merges before `SelectionStep`
+    # Like CHANGES, for returns that the receiver adds or merges before `SelectionStep`.
     RECEIVES = auto()
-    # acts once on the selected, thinned-out returns of all pulses that are cast together
+    # Acts once on the selected, thinned-out returns of all pulses that are cast together.
     ON_REPORTED = auto()
     FRAME = auto()  # casts rays, combines hits into returns, or selects returns
 
@@ -231,10 +234,10 @@ class PulseBatch:
     air: PulseReturns | None = None  # hits in the air that are not among `hits`
 
     def deflect(self, offsets: Floats) -> None:
-        """Add angles (n, 2) in radians to the directions of the batch's beams before casting.
+        """Add angles to the directions of the batch's beams before casting.
 
-        With `Role.ABOUT_AXIS`, the angles are azimuth and elevation, otherwise horizontal and
-        vertical.
+        The angles have shape (n, 2) and are in radians. With `Role.ABOUT_AXIS`, they are azimuth
+        and elevation, otherwise horizontal and vertical.
         """
         earlier = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
         self.offsets = earlier + offsets
@@ -285,7 +288,7 @@ class PulseBatch:
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins (n, 3) in meters and directions (n, 3) of the central sub-ray of each beam.
+        """Origins in meters and directions of the central sub-ray of each beam. Shape (n, 3).
 
         The central sub-ray is the first of each beam. Both arrays are in the scene frame.
         """

@@ -128,7 +128,7 @@ def remove_step(step: type[PulseStep]) -> None:
     STEPS.remove(step)
 
 
-# {role: step before which a step with this role is inserted}; the first match applies.
+# {role: step before which a step with this role is inserted}. The first match applies.
 _POSITIONS = (
     (Role.AIMS, CastStep),
     (Role.RECEIVES, SaturationStep),

@@ -1,4 +1,4 @@
-"""Stray light: a receiver gets a small part of the light of retroreflectors beside its beam."""
+"""Stray light that a receiver gets from retroreflectors beside its beam."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ class StrayLightStep(PulseStep):
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether beams `ray` (n,) have a return close to the given distances (n,).
+        """Return whether beams `ray` have a return close to the given distances.
 
         Two returns are close if they are within half a pulse length, so that the receiver cannot
         separate them.
@@ -156,7 +156,7 @@ class StrayLightStep(PulseStep):
 
 
 def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
-    """Return rays (n, 3) for compiled loops, with cones around cells of consecutive rays."""
+    """Return rays for compiled loops, with cones around cells of consecutive rays."""
     from . import stray_loops
 
     cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
@@ -235,7 +235,7 @@ def _retro_clusters(
 def _clusters(
     triangles: Integers, corners: Floats, actor: int | None = None
 ) -> Iterator[_RetroCluster]:
-    """Divide triangles with corners (k, 3, 3) into clusters by the cells of a grid."""
+    """Divide triangles with corners into clusters by the cells of a grid."""
     if not len(triangles):
         return
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)

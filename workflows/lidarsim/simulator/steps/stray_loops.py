@@ -1,4 +1,4 @@
-"""Compiled loops over rays that receive other light, see stray_light.py and crosstalk.py."""
+"""Compiled loops for stray light and crosstalk (stray_light.py and crosstalk.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -119,7 +119,7 @@ def _angle(cosine):
 
 @compiled()
 def bound_cells(origins, directions, cones):
-    """Write cones (c, 5) around cells of rays (3, n), for `RayCells`."""
+    """Write the cones around cells of rays for `RayCells`."""
     count = origins.shape[1]
     for c in range(len(cones)):
         first = c * CELL_RAYS
@@ -150,7 +150,7 @@ def bound_cells(origins, directions, cones):
 
 @noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
-    """Return the tangent of the angle between a ray and a triangle, and the point nearest by angle.
+    """Return the tangent of the angle between a ray and a triangle, and the closest point by angle.
 
     `ray` is an origin and a direction. The point is a vector from the ray's origin. The tangent is
     0 if the ray hits the triangle, and -1 if the triangle is not in front of the ray.
@@ -279,8 +279,8 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
 
     `rays` is a `RayCells`, `triangles` a `RetroTriangles` in the frame of the rays, `limits` a
     `StrayLimits`, and `strongest` a `StrayLight`. The light comes from the point on the triangles
-    that is nearest to a ray by angle. Only the triangles nearest to a ray are compared with it;
-    their number is the length of `chosen`, which is scratch memory.
+    that is nearest to a ray by angle. Only the triangles nearest to a ray are compared with it.
+    Their number is the length of `chosen`, which is scratch memory.
     """
     center = triangles.center
     origins = rays.origins

@@ -1,4 +1,4 @@
-"""Compiled loops that sample waveforms and find returns in the samples, see waveform.py."""
+"""Compiled loops that sample waveforms and find returns in the samples (waveform.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -16,18 +16,17 @@ from ...numerics.elementary_loops import exp, log
 from ...sensor.optics import CUT
 from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 
-# In standard deviations of the system waveform:
-# hits within this distance form one Gaussian in closed form, with errors of 1e-3 in position and
-# height
+# The following lengths are in standard deviations of the system waveform. Hits within this distance
+# form one Gaussian in closed form, with errors of 1e-3 in position and height.
 NARROW = 0.25
-# two neighboring hits are on one surface if their planes meet within this distance
-# (`continue_surfaces`)
+# Two neighboring hits are on one surface if their planes meet within this distance
+# (`continue_surfaces`).
 MEET = 1.0
-# Gaussians that are farther apart are fitted separately
+# Gaussians that are farther apart are fitted separately.
 APART = 6.0
-# Gaussians that are closer form one return
+# Gaussians that are closer form one return.
 CLOSE = 1.0
-# largest distance that a fit may move a Gaussian from its initial position
+# Largest distance that a fit may move a Gaussian from its initial position.
 MOVES = 2.0
 
 FAINT = 0.01  # lowest peak that is found, as a share of the waveform's highest sample
@@ -51,7 +50,7 @@ class WaveMarks(NamedTuple):
     starts: Bools
     starts_surface: Bools  # False if the surface of the previous hit continues at the hit
     searched: Bools  # whether the hit is `solid` in a waveform that is too wide for the closed form
-    # Always True; before a search, `continue_surfaces` treats each hit as a return.
+    # Always True, because `continue_surfaces` treats each hit as a return before a search.
     all_start: Bools
 
 
@@ -117,10 +116,10 @@ class FitScratch(NamedTuple):
     system waveform.
     """
 
-    # (3, TOGETHER): heights, positions and widths, first of the guess, then of the fit.
+    # (3, TOGETHER): heights, positions and widths, initially of the guess and finally of the fit.
     best: Floats
-    guess: Floats  # (3, TOGETHER): the same for the guess
-    trial: Floats  # (3, TOGETHER): the same after the current trial step
+    guess: Floats  # (3, TOGETHER): heights, positions and widths of the guess
+    trial: Floats  # (3, TOGETHER): heights, positions and widths after the current trial step
     lower: Floats  # (3 * TOGETHER, 3 * TOGETHER): lower triangle of the Cholesky factor
     slopes: Floats  # (3 * TOGETHER, length): derivatives of the sum with respect to each parameter
     new_slopes: Floats  # (3 * TOGETHER, length)
@@ -130,7 +129,10 @@ class FitScratch(NamedTuple):
 
 
 class GaussianScratch(NamedTuple):
-    """Scratch memory to decompose `length` samples into Gaussians; arrays of shape (length,)."""
+    """Scratch memory to decompose `length` samples into Gaussians.
+
+    All arrays have shape (length,).
+    """
 
     curvature: Floats  # second differences of the samples
     minima: Ints  # samples at which the curvature has a minimum
@@ -246,9 +248,9 @@ def _peaks(wave, stops, peaks):
 
 @noinline
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
-    """Write residual and derivatives of a sum of `count` Gaussians, and return the sum of squares.
+    """Write the residual and derivatives of a sum of Gaussians, and return the sum of squares.
 
-    `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
+    `x` and `y` are `GaussianScratch.x` and `.y`. `gaussians`, `residual` and `slopes` are arrays of
     a `FitScratch`.
     """
     for s in range(sample_count):
@@ -507,7 +509,7 @@ def _gaussians(wave, scratch, stops, peaks):
     """
     minima = scratch.minima
     count = _find_minima(wave, scratch)
-    # Each piece is fitted separately; `begin` is its first Gaussian, and `first` its first sample.
+    # Each piece is fitted separately. `begin` is its first Gaussian, and `first` its first sample.
     begin = 0
     first = 0
     while begin < count:
@@ -656,7 +658,7 @@ def scratch_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return which of `count` peaks a hit at a given time belongs to."""
+    """Return the peak, out of `count` peaks, that a hit at a given time belongs to."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
@@ -705,10 +707,10 @@ def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noq
     """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
     `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.SubrayNeighbors`, and
-    `output` a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in
-    range. A return starts at each mark in `starts`, unless the hit continues a surface; these marks
-    are cleared. Hits of a return form one Gaussian with their mean and variance. Returns the number
-    of returns.
+    `output` a `WaveReturnArrays`. `sigma_m` is the standard deviation of the system waveform in
+    range. A return starts at each mark in `starts`, unless the hit continues a surface, in which
+    case the mark is cleared. Hits of a return form one Gaussian with their mean and variance.
+    Returns the number of returns.
 
     Arrays are read from their tuples only once, because numba counts references at each access.
     """

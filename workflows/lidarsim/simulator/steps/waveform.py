@@ -1,9 +1,9 @@
-"""Waveforms: the light of a pulse that a receiver records over time, and the returns in it.
+"""Waveforms, which record the light of a pulse over time, and the returns found in them.
 
 Pulse and receiver response are Gaussian, so a waveform is a sum of Gaussians, one for each hit of a
 sub-ray. Each is as wide as the pulse appears to the receiver, which is the system waveform (Wagner
-et al. 2006). Heights are in units of energy: a return that is not stretched by a slope is as high
-as its energy.
+et al. 2006). Heights are in units of energy, so a return that is not stretched by a slope is as
+high as its energy.
 
 The loops in wave_loops.py find returns pulse by pulse, so batches do not affect the result.
 """
@@ -81,11 +81,11 @@ class Digitizer:
         return 2 / LIGHT_M_NS / self.sample_ns
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
-        """Return the heights of returns (n,) with the given energies and widths.
+        """Return the heights of returns with the given energies and widths.
 
         `width` is the full width at half maximum in ns. A return as wide as the system waveform is
-        as high as its energy. A width of 0 means that the width is unknown; it is then assumed to
-        be the width of the system waveform.
+        as high as its energy. A width of 0 means that the width is unknown, in which case it is
+        assumed to be the width of the system waveform.
         """
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
@@ -153,7 +153,7 @@ def returns_in(
 def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
     """Return the hits that have energy, sorted by beam and distance, for compiled loops.
 
-    `marks.solid` and `marks.all_start` are filled in; loops write the other marks.
+    `marks.solid` and `marks.all_start` are filled in, and loops write the other marks.
     """
     from . import pulse_loops, wave_loops
 

@@ -82,7 +82,7 @@ class RecordingStep(PulseStep):
         return returns._replace(waveform=records)
 
     def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
-        """Add receiver noise to samples (windows, count) in place, and clip the samples."""
+        """Add receiver noise to samples in place, and clip the samples."""
         noise = self.setup.noise
         if noise.threshold:
             keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
@@ -151,7 +151,7 @@ def _signal_samples(
 
 
 def digitize(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples (n, k) to integers around `ZERO`, with a power-of-two step for each row.
+    """Round samples to integers around `ZERO`, with a power-of-two step for each row.
 
     Returns the integers as uint16 (n, k), and the exponents of the steps (n,).
     """
