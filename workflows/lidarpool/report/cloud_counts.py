@@ -21,7 +21,7 @@ _MIN_DENSITY_SQUARES = 16  # grids of at most this size are not coarsened for th
 
 
 class Density(NamedTuple):
-    """Points per square meter in the horizontal plane, over the grid squares that contain points."""
+    """Horizontal point density in points per square meter, over the squares that contain points."""
 
     mean: float  # number of points divided by the total area of the squares
     median: float  # median over the squares
@@ -155,7 +155,7 @@ class CloudCounts:
 
     @property
     def density(self) -> Density | None:
-        """Points per square meter in the horizontal plane, or None if there are no points.
+        """Horizontal point density, or None if there are no points.
 
         The grid is coarsened until the median square with points contains at least 30 points.
         Smaller squares would exclude the gaps between sparse points from the area.
