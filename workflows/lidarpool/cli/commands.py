@@ -1,7 +1,7 @@
-"""The command `lidarpool`.
+"""The `lidarpool` command.
 
-The modules of commands import within functions, so that help and completion are
-immediate: the imports of a run take a second.
+Command modules import heavy dependencies inside functions, so that help and shell completion
+respond immediately.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from .terminal import Terminal
 
 PROGRAM = "lidarpool"
-PLUGINS = "lidarpool.commands"  # each is a click.Command
+PLUGINS = "lidarpool.commands"  # entry point group for click.Command objects
 
-# Common options of `demo` and `run`; each is a field of RunOptions.
+# Options of both `demo` and `run`. Many of them are fields of RunOptions.
 _common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
     click.option(
@@ -104,9 +104,9 @@ def _seconds(text: str) -> float:
 
 
 def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Pass a Terminal and RunOptions to a command, and further options by their names.
+    """Pass a Terminal and RunOptions to a command, and all other options as keyword arguments.
 
-    The modules that workers need are imported meanwhile in the background.
+    A fork server imports the modules that workers require in the background.
     """
 
     @wraps(command)
@@ -148,7 +148,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             if cluster is not None:
                 run_settings = {"cluster": ClusterFile.load(cluster), "startup_timeout_s": QUEUE_S}
                 run_settings["worker_timeout_s"] = QUEUE_S
-            # A scenario may give the backend, too.
+            # The backend is passed separately, because the scenario may also specify it.
             names = {field.name for field in fields(RunOptions)} - {"backend"}
             run_settings |= {
                 name: value
@@ -168,11 +168,12 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class _LiveCommand(click.Command):
-    """A command whose option --live may stand alone, also before an argument."""
+    """A command with an option --live whose value is optional, even before an argument."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the words of the command line, or for completion the words before the last."""
-        if ctx.resilient_parsing and args[-1:] == ["--live"]:  # the last may be its value
+        """Parse the arguments, inserting the default value of --live if it has no value."""
+        # The word that is being completed may be the value of --live.
+        if ctx.resilient_parsing and args[-1:] == ["--live"]:
             args = args[:-1]
         values = {PAGE, *VIEWERS}
         followers = [*args[1:], ""][: len(args)]
@@ -186,12 +187,15 @@ class _LiveCommand(click.Command):
 
 
 class _Commands(click.Group):
-    """The commands of this package, and the commands of plug-ins."""
+    """A command group that includes the commands of plug-ins."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a name.
+        """Return the command with this name, or None if there is none.
 
-        LidarError if the plug-in of the command cannot be used.
+        Raises
+        ------
+        LidarError
+            If the command belongs to a plug-in that cannot be used.
         """
         command = super().get_command(ctx, cmd_name)
         if command is None and (plugin := find_plugin(PLUGINS, cmd_name)) is not None:
@@ -199,18 +203,12 @@ class _Commands(click.Group):
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a command or option.
-
-        Plug-ins are named, and not imported.
-        """
+        """Complete the name of a command or option, without importing plug-ins."""
         items = super().shell_complete(ctx, incomplete)
         return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands for the help.
-
-        Plug-ins are named, and not imported.
-        """
+        """Write the list of commands in the help text, without importing plug-ins."""
         super().format_commands(ctx, formatter)
         rows = [
             (name, " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in plugins))
@@ -248,7 +246,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
     Examples:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..scenario.demo import demo_scenario
     from .run_command import run_scenario
 
@@ -327,7 +325,7 @@ def run(
       lidarpool run examples/campaign.yaml --out dataset
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarsim.io.storage import Storage
 
     from ..report.campaign_output import verify
@@ -392,7 +390,7 @@ def merge(
     Examples:
       lidarpool merge part-* --out dataset
       lidarpool merge s3://lab/part-1 s3://lab/part-2 --out s3://lab/dataset
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..report.merging import merge as merge_shards
     from .terminal import Terminal
 
@@ -415,7 +413,7 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     Examples:
       lidarpool doctor
       lidarpool doctor --scheduler tcp://127.0.0.1:8786
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from poolpart import Pool
 
     from ..run.cluster.connection import connected
@@ -450,7 +448,11 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command and exit: 0 done, 1 --strict, 2 an error of the user's, 130 interrupted."""
+    """Run the command and exit the process.
+
+    The exit code is 0 for success, 1 for warnings with --strict, 2 for errors that the user can
+    correct, and 130 for an interrupt. Other exceptions are defects and are not caught.
+    """
     interrupt_on_signals()
     set_logs(shown=False)
     try:
@@ -467,16 +469,16 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _explanation(error: Exception) -> str | None:
-    """Return the message for an error that users can correct, or None for a defect."""
+    """Return the message for an error that the user can correct, or None for a defect."""
     match error:
         case click.MissingParameter():
             usage = error.ctx.get_usage() if error.ctx else ""
-            message = " ".join(error.format_message().split())  # click gives each choice a line
+            message = " ".join(error.format_message().split())  # Click lists choices on new lines
             return f"{message}\n{usage}"
         case click.ClickException():
             return error.format_message()
         case OSError(filename=str() | Path() as name):
-            # No file can have this name, or its folder may not be read.
+            # The file name is invalid, or access was denied.
             return f"{name} cannot be accessed: {error.strerror}. Use another file or folder."
         case MemoryError():
             return "Not enough memory. Use a smaller scene, fewer scans or a larger keep_every."
@@ -490,7 +492,7 @@ def _explanation(error: Exception) -> str | None:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """Return the notes of an error or its cause: on kept results, and on how to continue."""
+    """Return the notes of an error or of its cause, such as how to resume the run."""
     while error is not None:
         if notes := getattr(error, "__notes__", []):
             return list(notes)
@@ -499,9 +501,9 @@ def _notes(error: BaseException | None) -> list[str]:
 
 
 def _die(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
-    """Print a message with the notes of an error, and end the process."""
+    """Print a message and the notes of an error to stderr, and exit the process."""
     message = " ".join([message, *_notes(error)])
-    # Names may come from files, and control characters would reach the terminal.
+    # Names from files may contain control characters, which must not reach the terminal.
     message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)
     click.echo(f"lidarpool: {message}", err=True)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""The command `play`: results, scenarios and recordings as live sensors."""
+"""The `lidarpool play` command, which plays back results and simulates scenarios in real time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from . import shared_options as options
 from .first_step import begin
 
 _PACKETS = "packets"
-_NOW_NS = 2_000_000_000  # time between reading the source and the first sweep of --now, to prepare
+_NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, with --now
 
 
 @click.command()
@@ -104,7 +104,7 @@ def play(
       lidarpool play packets/lidar.pcap --as packets --rate 0.5
       lidarpool play drive.yaml --as ros2 --layout ouster --organized
       lidarpool play drive --as foxglove --loop
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     begin("reading the source")
     from lidarsim.packets.capture import ENDINGS
 
@@ -150,7 +150,7 @@ def play(
 def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
-    """Play a recording of packets."""
+    """Play back recorded packets."""
     from ..playback.pcap_recording import PcapRecording, play_recording, recorded_streams
     from ..playback.transmitter import Transmitter
     from .terminal import Terminal
@@ -168,7 +168,7 @@ def _play_recording(
 
 @contextmanager
 def _summarized(summary: Callable[[], str]) -> Iterator[None]:
-    """Print a summary once the body has ended, by Ctrl-C too."""
+    """Print a summary when the body ends, including when it is interrupted with Ctrl-C."""
     try:
         yield
     except KeyboardInterrupt as error:
