@@ -34,7 +34,7 @@ from ..processes.logs import set_logs
 from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
-from .first_step import begin
+from .first_step import print_first_step
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
@@ -91,7 +91,7 @@ _common_options = shared.combine(
 )
 
 
-def _seconds(text: str) -> float:
+def _parse_duration(text: str) -> float:
     """Parse a time such as 90, 90s, 10m or 2h."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
@@ -127,7 +127,9 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if settings.get("pace") and not settings.get("live"):
             raise click.UsageError("`--pace` requires `--live`.")
         settings["extent"] = "pictures" if pictures else "cloud" if cloud_only else None
-        begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
+        print_first_step(
+            f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet
+        )
         from ..processes import timeline as steps
         from ..processes.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
@@ -280,7 +282,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
 @click.option(
     "--startup-timeout",
     "startup_timeout_s",
-    type=_seconds,
+    type=_parse_duration,
     metavar="TIME",
     help="Maximum time to wait for the scheduler and the workers at startup, such as 90s or 10m "
     f"(default: {WAIT_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
@@ -288,7 +290,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
 @click.option(
     "--worker-timeout",
     "worker_timeout_s",
-    type=_seconds,
+    type=_parse_duration,
     metavar="TIME",
     help="Maximum time to wait for new workers if a partition loses all its workers during the run "
     f"(default: {PATIENCE_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
@@ -328,7 +330,7 @@ def run(
     """  # noqa: D301 - Click requires the character \b
     from lidarsim.io.storage import Storage
 
-    from ..report.campaign_output import verify
+    from ..report.campaign_output import verify_dataset
     from ..run.store.run_store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec
     from ..scenario.campaign_sections import is_campaign
@@ -341,7 +343,7 @@ def run(
         raise click.UsageError("`--retry-failed` cannot be combined with `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
-        click.echo(verify(Storage.at(scenarios[0])))
+        click.echo(verify_dataset(Storage.at(scenarios[0])))
         return
     options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
     is_several = len(paths) > 1
@@ -417,7 +419,7 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     from poolpart import Pool
 
     from ..run.cluster.connection import connected
-    from .doctor import advice_in_words, examine, find_cluster_fault, in_words
+    from .doctor import advice_line, check_environment, find_cluster_fault, result_lines
 
     found: Iterable[WorkerInfo] = ()
     fault = ""
@@ -427,9 +429,9 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             found = pool.workers
             fault = find_cluster_fault(pool)
     workers = sorted(found, key=lambda worker: (sorted(worker.resources), worker.name))
-    figures = examine(fault)
+    figures = check_environment(fault)
     figures["workers"] = [asdict(worker) for worker in workers]
-    lines = in_words(figures)
+    lines = result_lines(figures)
     if scheduler is not None:
         hosts = plural(len({worker.host for worker in workers}), "host")
         lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
@@ -443,7 +445,7 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{plural(len(worker.gpus), 'GPU')}"
         )
-    lines.append(advice_in_words(figures))
+    lines.append(advice_line(figures))
     shared.show(figures, lines, as_json)
 
 
@@ -460,15 +462,15 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
     except (KeyboardInterrupt, click.Abort) as error:
-        _die(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
+        _exit_with_message(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
     except Exception as error:
-        if (message := _explanation(error)) is None:  # a defect
+        if (message := _user_error_message(error)) is None:  # a defect
             raise
-        _die(message, error)
+        _exit_with_message(message, error)
     sys.exit(0)
 
 
-def _explanation(error: Exception) -> str | None:
+def _user_error_message(error: Exception) -> str | None:
     """Return the message for an error that the user can correct, or None for a defect."""
     match error:
         case click.MissingParameter():
@@ -500,7 +502,7 @@ def _notes(error: BaseException | None) -> list[str]:
     return []
 
 
-def _die(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
+def _exit_with_message(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
     """Print a message and the notes of an error to stderr, and exit the process."""
     message = " ".join([message, *_notes(error)])
     # Names from files may contain control characters, which must not reach the terminal.

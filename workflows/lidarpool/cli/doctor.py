@@ -29,7 +29,7 @@ from ..report.report import versions
 from ..run.cluster.checks import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR
 from ..scenario.sections import TaskOptions
-from .installed_copies import second_copy
+from .installed_copies import find_second_copy
 
 READY = "ready"
 FREE = "free"
@@ -47,7 +47,7 @@ _MIN_MEMORY_GIB = 2.0  # minimum memory for a small run with its three processes
 _MIN_DISK_GIB = 1.0
 
 
-def examine(cluster_fault: str = "") -> dict[str, Any]:
+def check_environment(cluster_fault: str = "") -> dict[str, Any]:
     """Check the environment and return the results as plain data for JSON.
 
     The entry `fix_first` is an empty string if no problems were found. `cluster_fault` is the
@@ -68,7 +68,7 @@ def examine(cluster_fault: str = "") -> dict[str, Any]:
         "backends": {name: reason or READY for name, reason in available_backends().items()},
         "open3d": _open3d_state(),
         "extras": _extras(),
-        "second_copy": second_copy(),
+        "second_copy": find_second_copy(),
         "cluster_fault": cluster_fault,
         "ports": {str(port): _port_state(port) for port in PORTS},
     }
@@ -170,8 +170,8 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
         yield figures["second_copy"]
 
 
-def in_words(figures: dict[str, Any]) -> list[str]:
-    """Return the results of `examine` as lines of text."""
+def result_lines(figures: dict[str, Any]) -> list[str]:
+    """Return the results of `check_environment` as lines of text."""
     machine = figures["machine"]
     disks = ", ".join(f"{free:.1f} GiB in {name}" for name, free in machine["disk_gib"].items())
     memory = f"{machine['memory_gib']:.1f} GiB, {machine['available_memory_gib']:.1f} GiB available"
@@ -195,7 +195,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
     return lines
 
 
-def advice_in_words(figures: dict[str, Any]) -> str:
+def advice_line(figures: dict[str, Any]) -> str:
     """Return the last line of the text output, which states what to fix first."""
     advice = figures["fix_first"]
     return f"fix first: {advice}." if advice else "No problems were found."

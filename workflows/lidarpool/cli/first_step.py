@@ -26,7 +26,7 @@ class _Lines(logging.Handler):
 _LINES = _Lines()
 
 
-def begin(step: str, *, quiet: bool = False) -> None:
+def print_first_step(step: str, *, quiet: bool = False) -> None:
     """Print the first step of a command, and report when loops are being compiled.
 
     The step is only printed if stderr is not a terminal. A terminal shows a status instead. A

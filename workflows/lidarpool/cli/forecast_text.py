@@ -191,7 +191,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         yield f"splits      {shares}"
     yield f"checked     {figures['checked']:,} of {plural(campaign.count, 'job')}"
     for job in figures["jobs"]:
-        yield f"job         {_in_words(job)}"
+        yield f"job         {_describe_job(job)}"
         points = ""
         if job["estimate"]:
             points = f", about {job['estimate']['points']:,} points"
@@ -222,7 +222,7 @@ def _remarks(figures: dict[str, Any]) -> Iterator[str]:
         yield f"warning: {warning}"
 
 
-def _in_words(job: dict[str, Any]) -> str:
+def _describe_job(job: dict[str, Any]) -> str:
     """Return the name, the split and the varied values of a job as text."""
     shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
     shown = {k: "none" if v is None else v for k, v in shown.items()}
@@ -234,14 +234,14 @@ def _in_words(job: dict[str, Any]) -> str:
 def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     """Yield the estimates for a survey as lines of text."""
     if "job" in figures:
-        yield f"job         {_in_words(figures['job'])}"
+        yield f"job         {_describe_job(figures['job'])}"
     yield from _scene_lines(figures)
     yield from _survey_lines(job, figures)
     if drive := figures["drive"]:
         yield from _drive_lines(drive)
     yield from _return_lines(job, figures)
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
-    yield from _need_lines(figures)
+    yield from _resource_lines(figures)
     yield from _remarks(figures)
 
 
@@ -321,7 +321,7 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _need_lines(figures: dict[str, Any]) -> Iterator[str]:
+def _resource_lines(figures: dict[str, Any]) -> Iterator[str]:
     """Yield lines about the workers, slots, memory and disk space that the run requires."""
     backend = figures["backend"]
     device = {None: "backend not yet known", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")

@@ -72,7 +72,7 @@ def import_with_plugin(
 
     def write(survey: Path, partial: Path, assets: Sequence[Path]) -> list[str]:
         try:
-            left_out = [*map(str, load(survey, partial, assets))]
+            unsupported = [*map(str, load(survey, partial, assets))]
         except LidarError:
             raise
         except Exception as error:  # a plug-in may raise anything
@@ -80,7 +80,7 @@ def import_with_plugin(
             raise LidarError(f"{plugin} failed: {reason}.") from error
         if not (partial / SCENARIO_FILE).is_file():
             raise LidarError(f"{plugin} did not write {SCENARIO_FILE}.")
-        return left_out
+        return unsupported
 
     return import_atomically(write, survey, folder, assets, check)
 
@@ -123,7 +123,7 @@ def import_atomically(
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        left_out = [*write(survey, partial, assets)]
+        unsupported = [*write(survey, partial, assets)]
         check(partial / SCENARIO_FILE)
         partial.chmod(0o755)  # temporary folders are only accessible to their owner
         partial.rename(folder)
@@ -132,4 +132,4 @@ def import_atomically(
         raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return left_out
+    return unsupported

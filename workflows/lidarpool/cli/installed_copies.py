@@ -18,7 +18,7 @@ from ..identity.software import PACKAGES
 _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 
 
-def second_copy() -> str:
+def find_second_copy() -> str:
     """Return advice if there is a second copy of the packages, otherwise an empty string."""
     roots = {name: root for name in PACKAGES if (root := _root_of(name)) is not None}
     root = roots.get("lidarpool")

@@ -16,7 +16,7 @@ from lidarsim.io.storage import Storage
 from ..clouds.format_table import LAYOUTS
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 
 _PACKETS = "packets"
 _NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, with --now
@@ -105,7 +105,7 @@ def play(
       lidarpool play drive.yaml --as ros2 --layout ouster --organized
       lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - Click requires the character \b
-    begin("reading the source")
+    print_first_step("reading the source")
     from lidarsim.packets.capture import ENDINGS
 
     from ..playback.bridge import BridgeOptions, bridge_class
@@ -127,7 +127,7 @@ def play(
             raise click.UsageError(
                 "`--now` cannot be used with recorded packets, which contain their timestamps."
             )
-        options.refuse_mesh_options(of_mesh, source)
+        options.reject_mesh_options(of_mesh, source)
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return
     with ExitStack() as stack:

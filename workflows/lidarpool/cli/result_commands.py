@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..clouds.writing import ExportSpec
 
 
-def _size(text: str) -> tuple[int, int]:
+def _parse_size(text: str) -> tuple[int, int]:
     """Parse a picture size in pixels, such as 1600x1000."""
     if match := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
         return int(match[1]), int(match[2])
@@ -62,7 +62,7 @@ class _FormatName(click.Choice[str]):
 )
 @click.option(
     "--size",
-    type=_size,
+    type=_parse_size,
     metavar="WxH",
     default="1600x1000",
     show_default=True,
@@ -197,12 +197,12 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        specs = _chosen_specs(formats, **settings)
+        specs = _make_export_specs(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
             for chosen in specs:  # reports errors before any file is written
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
-                _check_free(target, chosen.row.file, overwrite=overwrite)
+                _check_not_existing(target, chosen.row.file, overwrite=overwrite)
             try:
                 for chosen in specs:
                     file = folder / chosen.row.file
@@ -213,7 +213,7 @@ def export(
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     if full_scale is not None:
-                        _tell(f"{chosen.title} stores the intensity {full_scale:g} as 65,535")
+                        _print_note(f"{chosen.title} stores the intensity {full_scale:g} as 65,535")
                     click.echo(written[-1])
             except (LidarError, KeyboardInterrupt) as error:
                 if written:
@@ -221,7 +221,7 @@ def export(
                 raise
 
 
-def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
+def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
     """Raise LidarError if a storage contains a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
@@ -230,7 +230,7 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
         )
 
 
-def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
+def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
     """Return the export specifications of formats, each with the options that it supports.
 
     An option that none of the formats supports is passed to all of them, so that it is rejected.
@@ -257,7 +257,7 @@ def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[Exp
     ]
 
 
-def _tell(note: str) -> None:
+def _print_note(note: str) -> None:
     """Print a note without importing Dask, which `Terminal.tell` would require."""
     click.echo(f"note: {note}", err=True)
 
@@ -320,12 +320,12 @@ def view(
                 f"{data_sets[0]} is a data set with several jobs. View it on its own, without "
                 "`--film` and `--export`."
             )
-        options.refuse_mesh_options(of_mesh, data_sets[0])
+        options.reject_mesh_options(of_mesh, data_sets[0])
         from ..pages.job_list import JobList, show_jobs
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
-    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _tell}
+    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _print_note}
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]

@@ -25,10 +25,15 @@ from ..datasets.job_table import Tally, read_table
 from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
-from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
+from ..report.campaign_output import (
+    CAMPAIGN_FILE,
+    check_same_campaign,
+    describe_failures,
+    verify_dataset,
+)
 from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import CLOUD, SurveyOutput, run_survey
-from ..report.report import summary
+from ..report.report import summarize_report
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
@@ -111,7 +116,7 @@ def _run_survey(
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)
         lines = _result_lines(out, result, job, report, terminal)
-        show(summary(out, report), lines, terminal.as_json)
+        show(summarize_report(out, report), lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
@@ -157,7 +162,7 @@ def run_campaign(
         if options.live and options.stay:
             page.stay()
     if run.failed:
-        raise LidarError(failures(run))
+        raise LidarError(describe_failures(run))
 
 
 def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]:
@@ -200,8 +205,8 @@ def run_job(
     dataset = DataSet(target, **asdict(campaign.keep))
     compare: Callable[[RunResult], str] | None = None
     if CAMPAIGN_FILE in target.entries():
-        backend = check_same(target, campaign)["backend"]
-        verify(target, number)
+        backend = check_same_campaign(target, campaign)["backend"]
+        verify_dataset(target, number)
         out = output_destination(f"{out}/job-{name}")
         options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
         compare = partial(_compare_with_dataset, target, number, name)

@@ -19,7 +19,7 @@ from lidarsim.words import plural
 
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
@@ -157,24 +157,26 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 
     folder = out or Path(survey.stem)
     if survey.suffix.lower() in WORLDS:
-        left_out = import_atomically(import_world, survey, folder, assets, check)
+        unsupported = import_atomically(import_world, survey, folder, assets, check)
     elif is_mujoco_model(survey):
-        left_out = import_atomically(import_model, survey, folder, assets, check)
+        unsupported = import_atomically(import_model, survey, folder, assets, check)
     elif is_scanner(survey):
-        left_out = import_atomically(import_scanner, survey, folder, assets, check)
+        unsupported = import_atomically(import_scanner, survey, folder, assets, check)
     elif (plugin := importer_of(survey)) is not None:
-        left_out = import_with_plugin(plugin, survey, folder, assets, check=check)
+        unsupported = import_with_plugin(plugin, survey, folder, assets, check=check)
     elif survey.suffix.lower() in ENDINGS:
-        left_out = import_atomically(import_sensor, survey, folder, assets, check)
+        unsupported = import_atomically(import_sensor, survey, folder, assets, check)
     else:
-        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).unsupported
+        unsupported = import_survey(
+            survey, folder, assets, check=check, surfels=surfels
+        ).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
     own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())
     sensors = plural(own_sensors, "sensor")
     files = plural(len(scenario.scene.files), "mesh file")
     click.echo(f"{click.format_filename(file)}: {sensors}, {files}")
-    for line in left_out:
+    for line in unsupported:
         click.echo(f"not supported: {line}")
     click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
@@ -218,7 +220,7 @@ def check(
       lidarpool check hall.glb --scheduler tcp://127.0.0.1:8786 --json
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - Click requires the character \b
-    begin("reading the scene", quiet=as_json)
+    print_first_step("reading the scene", quiet=as_json)
     from ..run.cluster.connection import connected
     from ..run.cluster_file import ClusterFile
     from ..run.options import RunOptions
@@ -252,11 +254,11 @@ def check(
         start = f"The {subject} cannot be run{':' if reasons[1:] else '.'}"
         raise LidarError(start + ("\n" if reasons[1:] else " ") + "\n".join(reasons))
     if not as_json:
-        words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
+        words = ["lidarpool", "run", str(scenario), *options.command_arguments(of_mesh)]
         settings: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         settings |= {"backend": backend, "job": number}
         if figures["occupied"]:
-            settings["out"] = _free_target(out)
+            settings["out"] = _unused_target(out)
         for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
@@ -279,7 +281,7 @@ def _failed_jobs(figures: dict[str, Any]) -> str:
     )
 
 
-def _free_target(target: Path | Storage) -> str:
+def _unused_target(target: Path | Storage) -> str:
     """Return an unused output folder, derived from the name of one that is in use."""
     from lidarsim.io.storage import Storage
 
@@ -344,7 +346,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
     """  # noqa: D301 - Click requires the character \b
     from lidarscenes.procedural.city import city as make
 
-    _write(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
+    _write_scene(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
 
 
 @scene.command(context_settings={"show_default": True})
@@ -366,7 +368,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     """  # noqa: D301 - Click requires the character \b
     from lidarscenes.procedural.terrain import terrain as make
 
-    _write(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
+    _write_scene(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
 
 
 @scene.command()
@@ -435,10 +437,12 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
             )
         return place
 
-    _write(out, make, overwrite)
+    _write_scene(out, make, overwrite)
 
 
-def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
+def _write_scene(
+    file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False
+) -> None:
     """Create a scene and write it to a file.
 
     `make` returns the scene. It is only called after the output file has been checked. If `paint`
@@ -598,7 +602,7 @@ def _list_models() -> None:
     from lidarsim.schema.model_names import model_names, plugin_model_names
 
     heads = ("model", "channels", "field of view", "range", "rate (Hz)", "points/s")
-    rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
+    rows = [heads, *map(_model_row, (*model_names(), *plugin_model_names()))]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
@@ -633,7 +637,7 @@ def _show_model(name: str) -> None:
         click.echo(f"{figure:<11}  {words}")
 
 
-def _row(name: str) -> tuple[str, ...]:
+def _model_row(name: str) -> tuple[str, ...]:
     """Return the table row of a model, with the columns that `_list_models` prints."""
     from lidarsim.sensor.models import read_model
 

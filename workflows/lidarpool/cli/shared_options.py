@@ -85,7 +85,7 @@ def combine(*options: Callable[[Command], Command]) -> Callable[[Command], Comma
     )
 
 
-def _position(text: str) -> list[float]:
+def _parse_position(text: str) -> list[float]:
     """Parse a position in the form x,y,z.
 
     Whole numbers become integers, so that a scenario file shows them without a decimal point.
@@ -101,7 +101,7 @@ def _position(text: str) -> list[float]:
     return [int(number) if number.is_integer() else number for number in (x, y, z)]
 
 
-def _names(text: str) -> list[str]:
+def _parse_names(text: str) -> list[str]:
     """Parse a comma-separated list of names."""
     return [name.strip() for name in text.split(",")]
 
@@ -111,8 +111,8 @@ def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Comm
     return click.option(f"--{name}", help=f"{description}. Mesh input only.", **settings)
 
 
-_mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
-poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
+_mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_parse_names, multiple=True)
+poses = click.option("--pose", metavar="X,Y,Z", type=_parse_position, multiple=True,
                      help="Position of the sensor in the scene, in meters; can be repeated, with "
                      "one position per sweep (default: from the recording, otherwise "
                      "0,0,0).")  # fmt: skip
@@ -139,7 +139,10 @@ _mesh_options = combine(
     ),
     _mesh_reading_options,
     _mesh_list_option(
-        "pose", "Position of the sensor in meters; can be repeated", metavar="X,Y,Z", type=_position
+        "pose",
+        "Position of the sensor in meters; can be repeated",
+        metavar="X,Y,Z",
+        type=_parse_position,
     ),
     _mesh_list_option(
         "columns",
@@ -186,7 +189,7 @@ def mesh_reading(command: Command) -> Command:
     return _mesh_reading_options(with_options)
 
 
-def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
+def reject_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
     """Raise LidarError if mesh options were passed for a file that is not a mesh."""
     for name in of_mesh:
         raise LidarError(
@@ -195,7 +198,7 @@ def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
         )
 
 
-def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
+def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
     """Yield the command-line arguments that correspond to these mesh options."""
     for name, value in of_mesh.items():
         for item in value if name == "pose" else [value]:

@@ -22,7 +22,7 @@ from lidarsim.words import joined, plural, printable
 
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ _DOMINANT_SHARE = 0.75  # an object with a larger share of the reachable area ca
 _MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a note
 
 
-def _share(text: str) -> float:
+def _parse_percentage(text: str) -> float:
     """Parse a percentage such as 95% or 95."""
     try:
         share = float(text.removesuffix("%")) / 100
@@ -93,7 +93,7 @@ def _share(text: str) -> float:
 )
 @click.option(
     "--coverage",
-    type=_share,
+    type=_parse_percentage,
     metavar="SHARE",
     help=(
         "Add stations until this share of the reachable area is covered, such as 95%; cannot be "
@@ -161,12 +161,12 @@ def stations(
     """  # noqa: D301 - Click requires the character \b
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
-    begin("reading the scene", quiet=settings["as_json"])
+    print_first_step("reading the scene", quiet=settings["as_json"])
     from ..scenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
     if cloud is not None:
-        _refuse_beside_cloud(scene, settings | {"model": model})
+        _reject_planning_options(scene, settings | {"model": model})
         if not within_m > 0:
             raise LidarError(f"`--within` must be greater than 0, but is {within_m:g}.")
         scenario = Scenario.load(scene, of_mesh)
@@ -239,7 +239,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
-def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
+def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
     """Raise UsageError for options that cannot be combined with `--cloud`."""
     chosen = {
         "--sensor": settings["model"],
@@ -297,7 +297,7 @@ def _show_coverage(
         )
     if not coverage.reachable_m2.any():
         raise LidarError(
-            f"No surface{_of_targets(targets)} is reachable from the stations. Check their "
+            f"No surface{_target_phrase(targets)} is reachable from the stations. Check their "
             "poses and the unit of the scene."
         )
     figures = _coverage_figures(coverage, prepared) | {
@@ -306,7 +306,7 @@ def _show_coverage(
         "notes": [*notes, *recording.omission_notes],
     }
     head = (
-        f"{figures['reachable_m2']:,.0f} m²{_of_targets(targets)} are reachable from "
+        f"{figures['reachable_m2']:,.0f} m²{_target_phrase(targets)} are reachable from "
         f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
         f"within {within_m:g} m of a point"
     )
@@ -368,7 +368,7 @@ def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepar
     return prepared, [*notes, *terminal.warnings]
 
 
-def _of_targets(targets: Sequence[str]) -> str:
+def _target_phrase(targets: Sequence[str]) -> str:
     """Return a phrase such as " of Wall* and Roof", or an empty string without targets."""
     return f" of {joined(targets)}" if targets else ""
 
@@ -457,7 +457,7 @@ def _stations_scenario(
     }
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
-        f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_of_targets(targets)}. "
+        f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_target_phrase(targets)}. "
         "Each station scans one revolution in steps of 10 degrees.\n"
     )
     for warning in warnings:
@@ -492,7 +492,7 @@ def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -
     yield (
         f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
         f"{plan.spacing_m:g} m, from which {plan.reachable_m2.sum():,.0f} "
-        f"m²{_of_targets(targets)} are reachable (within range, field of view and slant)"
+        f"m²{_target_phrase(targets)} are reachable (within range, field of view and slant)"
     )
     yield "station        x          y          z   covered     added"
     previous_share = 0.0

@@ -56,7 +56,7 @@ def part_name(mark: str, job: int, first: int, stop: int) -> str:
     return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
 
 
-def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
+def parse_part_name(name: str, mark: str) -> tuple[int, int, int] | None:
     """Return the job, the first scan and the stop scan from the file name of a part.
 
     Return None if the file does not belong to the run with this mark.
@@ -170,7 +170,7 @@ def reading_part(storage: Storage, name: str) -> Iterator[None]:
         ) from error
 
 
-def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
+def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
     """Read only the hit counts of a part, without its columns.
 
     Returns the hit counters that are not zero, and the number of hits of each. Both arrays have

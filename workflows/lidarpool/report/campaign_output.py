@@ -58,7 +58,7 @@ _RECORDED: dict[str, type] = {
     "shards": list,
 }
 
-# Matches the files of jobs and the files that `write_shared` writes.
+# Matches the files of jobs and the files that `write_shared_files` writes.
 _FINISHED = re.compile(
     JOB_FILES.pattern
     + r"|(campaign|dataset|report)\.json|README\.md|report\.(html|csv)|pictures/\w+\.png|"
@@ -84,7 +84,7 @@ def run_campaign(
     with result_folder(target):
         earlier = output.check_existing()
         if earlier.is_complete:
-            return output.finished(earlier)
+            return output.report_complete(earlier)
         with (
             ClusterConnection(campaign, options, screen) as connection,
             open_store(campaign, options, screen) as store,
@@ -144,7 +144,7 @@ class DataSetOutput:
         if not options.may_continue or CAMPAIGN_FILE not in entries or unfinished:
             return FinishedDataSet()
         try:
-            record = check_same(storage, self.campaign)
+            record = check_same_campaign(storage, self.campaign)
         except DamagedRecordError:  # the manifests also identify the campaign
             return FinishedDataSet(note=f"{CAMPAIGN_FILE} was damaged and has been recreated")
         shard = str(self.campaign.shard)
@@ -181,17 +181,17 @@ class DataSetOutput:
         has_all = not wrong and len(rows) == len(self.campaign.numbers)
         return FinishedDataSet(record, rows, wrong, has_all and _has_shared_files(storage, rows))
 
-    def finished(self, complete: FinishedDataSet) -> CampaignRun:
+    def report_complete(self, complete: FinishedDataSet) -> CampaignRun:
         """Report that the data set is complete and return its totals."""
         self.screen.tell(f"{self.dataset.storage} is already complete")
         for row in complete.rows:
             self.page.ended(row)
-        notes = (*self._warnings_of_empty_jobs(complete.rows),)
+        notes = (*self._warn_of_empty_jobs(complete.rows),)
         sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
         return sums
 
-    def _warnings_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
+    def _warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
         """Warn if jobs have no points, and return the warning as a list with at most one item."""
         empty = [row for row in rows if row.done and not row.points]
         if not empty:
@@ -217,10 +217,10 @@ class DataSetOutput:
             store.adopt(rows, sensors=json.dumps(record["sensors"]))
         elif options.may_continue:
             store.notes += [earlier.note] * bool(earlier.note)
-            self._take_over(store)
+            self._adopt_finished_jobs(store)
         # Finished jobs may have been added to the store above.
         begun = store.begun or bool(store.committed_in_words)
-        dataset_files(self.dataset.storage, begun=begun)
+        list_dataset_files(self.dataset.storage, begun=begun)
         wrong = earlier.wrong
         if not record:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
@@ -233,7 +233,7 @@ class DataSetOutput:
         for row in store.rows():
             self.page.ended(row)
 
-    def _take_over(self, store: RunStore) -> None:
+    def _adopt_finished_jobs(self, store: RunStore) -> None:
         """Add finished jobs to a store that has lost its database."""
         names = {row.name for row in store.rows()}
         rows: list[JobRow] = []
@@ -253,7 +253,7 @@ class DataSetOutput:
         store = committed.store
         seconds = time.monotonic() - self.begun_at
         notes = committed.notes
-        warnings = self._warnings_of_empty_jobs(store.rows())
+        warnings = self._warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # otherwise, the merged data set gets this note
             notes += (*warnings,)
         if untimed := [row.name for row in store.rows() if row.done and row.seconds is None]:
@@ -283,7 +283,7 @@ class DataSetOutput:
         # The record is written first, because it associates the other files with a campaign.
         write_record(self.dataset.storage, record)
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
-        sums, _ = write_shared(self.dataset, record, sums, store.rows)
+        sums, _ = write_shared_files(self.dataset, record, sums, store.rows)
         if sums.failed:
             store.save(force=True)
             store.db.close()
@@ -362,7 +362,7 @@ def read_notes(storage: Storage) -> list[str]:
     return [f"{storage.path(LAST_FILE)} is damaged: {reason}. Its notes are lost"]
 
 
-def write_shared(
+def write_shared_files(
     dataset: DataSet,
     record: Mapping[str, Any],
     sums: CampaignRun,
@@ -452,7 +452,7 @@ def _check_jobs(
     return wrong
 
 
-def verify(storage: Storage, number: int | None = None) -> str:
+def verify_dataset(storage: Storage, number: int | None = None) -> str:
     """Verify the checksums of a finished data set, or of a single job in it.
 
     Returns
@@ -481,7 +481,7 @@ def verify(storage: Storage, number: int | None = None) -> str:
     return f"{storage} is intact, with {plural(len(rows), 'job')}"
 
 
-def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
+def check_same_campaign(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     """Check that a data set was created by this campaign and software, and return its record.
 
     Raises
@@ -510,7 +510,7 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     return record
 
 
-def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
+def list_dataset_files(storage: Storage, *, begun: bool) -> list[str]:
     """Return the names of all files in a data set.
 
     The folder must be empty unless the data set has been `begun`.
@@ -537,7 +537,7 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
     Raise LidarError if the folder contains other files.
     """
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
-    files = dataset_files(storage, begun=begun)
+    files = list_dataset_files(storage, begun=begun)
     with explained(f"{storage} cannot be removed"):
         storage.tidy()
         # INDEX_FILE, which marks the data set as finished, is removed first. CAMPAIGN_FILE, which
@@ -546,7 +546,7 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
     remove_run(run_folder)
 
 
-def failures(sums: CampaignRun, max_errors: int = 5) -> str:
+def describe_failures(sums: CampaignRun, max_errors: int = 5) -> str:
     """Summarize the errors of failed jobs, with the varied values of these jobs."""
     head = f"{plural(len(sums.failed), 'job')} failed and {sums.done:,} succeeded:"
     errors = []

@@ -21,8 +21,8 @@ from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_times, draw_varied
-from .page.rendering import rendered
-from .report import stage_figures
+from .page.rendering import render_template
+from .report import stage_statistics
 
 CARD = "README.md"
 PAGE = "report.html"
@@ -101,7 +101,7 @@ def write_card(
         }
         on_page = {name: pages[name] for name in ("varied", "results")}
         on_page["times"] = draw_times(figures)
-        page = rendered(
+        page = render_template(
             "campaign.html",
             captions=_PAGE_CAPTIONS,  # also read by screen readers
             pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
@@ -111,7 +111,7 @@ def write_card(
             stages=run.stages,
         )
         storage.write(PAGE, page.encode())
-        card = rendered("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
+        card = render_template("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
         storage.write(CARD, card.encode("utf-8", "backslashreplace"))
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         storage.write(LAST_FILE, text.encode())
@@ -178,7 +178,7 @@ def campaign_report(
         "varied": list(figures.summaries()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],
-        "stages": stage_figures(run.stages),
+        "stages": stage_statistics(run.stages),
         "sha256": figures.sha256,
     }
 

@@ -242,13 +242,13 @@ def _chart(page: Page, x: float, y: float, chart_width: float, chart_height: flo
     axes.yaxis.set_major_locator(
         MaxNLocator(4 if chart_height > COUNTS_HEIGHT else 2, integer=True)
     )
-    axes.yaxis.set_major_formatter(_tick)
+    axes.yaxis.set_major_formatter(_format_tick)
     axes.xaxis.grid(visible=False)
     axes.tick_params(which="both", color=theme.LINE)
     return axes
 
 
-def _tick(value: float, _: object = None) -> str:
+def _format_tick(value: float, _: object = None) -> str:
     """Format a tick label, for example "1.5 M"."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
@@ -402,7 +402,7 @@ def _set_labels(page: Page, axes: Axes, scale: VariedQuantity, width: float) -> 
         is_integer = bool((scale.edges % 1 == 0.5).all())  # each bin is centered on an integer
         max_ticks = max(2, min(6, int(width / 90)))
         axis.set_major_locator(MaxNLocator(max_ticks, integer=is_integer, min_n_ticks=1))
-    axis.set_major_formatter(_tick)
+    axis.set_major_formatter(_format_tick)
 
 
 def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:

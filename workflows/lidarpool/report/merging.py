@@ -43,17 +43,17 @@ from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .campaign_output import (
     CAMPAIGN_FILE,
-    dataset_files,
+    list_dataset_files,
     read_notes,
     read_record,
     write_record,
-    write_shared,
+    write_shared_files,
 )
 from .output import SurveyOutput
 
 MAX_NAMED = 20  # maximum number of shards or files listed in a message
 _BATCH_ROWS = 1000  # job rows per transaction
-_MISSING = "these shards are missing: "  # start of a note
+_MISSING_NOTE = "these shards are missing: "  # start of a note
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def merge(
     target = output_destination(str(out))
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
-    _check_apart(Storage.at(target), shard_storages)
+    _check_separate(Storage.at(target), shard_storages)
     is_survey_shard = False
     with suppress(LidarError):  # the result would overwrite the points of the shard
         is_survey_shard = "made_of" in _read_folder(Storage.at(target)).record
@@ -172,7 +172,7 @@ def _real_path(storage: Storage) -> str:
     return str(Path(path or storage.url).resolve())
 
 
-def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
+def _check_separate(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
     """Raise LidarError if `target` is a shard, is inside a shard or contains a shard.
 
     `shard_storages` maps the result of `_real_path` to the storage.
@@ -220,7 +220,7 @@ def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
     if shards == [ALL]:
         shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
     notes = read_notes(storage) if LAST_FILE in storage.sizes() else []
-    notes = [note for note in notes if not note.startswith(_MISSING) and NO_POINTS not in note]
+    notes = [note for note in notes if not note.startswith(_MISSING_NOTE) and NO_POINTS not in note]
     return _ShardFolder(storage, record, shards, record["campaign"]["count"], notes)
 
 
@@ -302,15 +302,15 @@ def _check_same_run(
     mistakes.tell()
 
 
-def _notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
+def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
     """Return the notes of all folders, and a note about missing shards if there are any.
 
     Raise LidarError if shards are missing and `partial` is False.
     """
     notes = [*dict.fromkeys(note for folder in shard_folders for note in folder.notes)]
-    if not (missing := _missing(shard_folders)):
+    if not (missing := _missing_shards(shard_folders)):
         return notes
-    message = f"{_MISSING}{listed([*map(str, missing)], MAX_NAMED)}"
+    message = f"{_MISSING_NOTE}{listed([*map(str, missing)], MAX_NAMED)}"
     if partial:
         return [*notes, message]
     advice = "Specify their folders as well"
@@ -328,7 +328,7 @@ def _missing_or_damaged(names: Sequence[str]) -> str:
     )
 
 
-def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
+def _missing_shards(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
     """Return the shards that are missing, or that lack jobs because the campaign has grown."""
     shard_count = shard_folders[-1].shards[0].total
     folders = sorted(shard_folders, key=lambda folder: folder.run_size)
@@ -344,11 +344,11 @@ def _merge_dataset(
     shard_folders: Sequence[_ShardFolder], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
     begun = CAMPAIGN_FILE in target.sizes()
-    dataset_files(target, begun=begun)
+    list_dataset_files(target, begun=begun)
     earlier = _read_dataset(target, shard_count=shard_folders[0].shards[0].total) if begun else None
     all_folders = [earlier, *shard_folders] if earlier else shard_folders
     _check_same_run(all_folders, earlier)
-    notes = _notes(all_folders, partial=partial)
+    notes = _collect_notes(all_folders, partial=partial)
     record = _merged_record(all_folders, shard_folders[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
@@ -370,13 +370,13 @@ def _merge_dataset(
                 earlier_rows = (row for row, _ in dataset.rows() if earlier.has(row.number))
                 _add_rows(db, earlier, earlier_rows, seconds)
             for shard_folder in shard_folders:
-                taken = _take_jobs(shard_folder, dataset, damaged)
-                seconds |= _seconds(shard_folder, notes)
+                taken = _copy_jobs(shard_folder, dataset, damaged)
+                seconds |= _read_casting_times(shard_folder, notes)
                 _add_rows(db, shard_folder, taken, seconds)
-        damaged = damaged or _lacking(all_folders, db)
+        damaged = damaged or _missing_manifests(all_folders, db)
         if damaged:
             raise LidarError(_missing_or_damaged(damaged))
-        lacking = _missing(all_folders)
+        lacking = _missing_shards(all_folders)
         shards = {shard for shard_folder in all_folders for shard in shard_folder.shards}
         record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in rows() if row.done and not row.points]:
@@ -384,7 +384,7 @@ def _merge_dataset(
             screen.warn(notes[-1])
         sensors = record["sensors"]
         run = CampaignRun.from_rows(rows(), 0.0, 0, sensors=sensors, notes=tuple(notes))
-        report = write_shared(dataset, record, run, rows)[1]
+        report = write_shared_files(dataset, record, run, rows)[1]
     if earlier:  # the store of a run with failed jobs is now out of date
         remove_run(target.below(RUN_FOLDER))
     return report
@@ -442,7 +442,7 @@ def _add_rows(
     db.end_jobs(batch)
 
 
-def _take_jobs(
+def _copy_jobs(
     shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
 ) -> Iterator[JobRow]:
     """Copy the jobs of a shard folder, and yield their rows.
@@ -457,7 +457,7 @@ def _take_jobs(
             yield row
 
 
-def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
+def _read_casting_times(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
     """Return the casting times of jobs as {job number: seconds}.
 
     If they cannot be read, append a note to `notes` and return an empty mapping.
@@ -471,7 +471,7 @@ def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float
     return {}
 
 
-def _lacking(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
+def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
     """Describe the manifests that are missing, because their jobs have no row in the database."""
     return [
         f"the manifest of job {number} in {folder.storage}"
@@ -491,7 +491,7 @@ def _merge_survey(
 ) -> dict[str, Any]:
     """Load the scenario of a survey, and write its result from the points in all folders."""
     _check_same_run(shard_folders)
-    notes = _notes(shard_folders, partial=partial)
+    notes = _collect_notes(shard_folders, partial=partial)
     record = shard_folders[0].record
     made_of = record["made_of"]
     path = Path(scenario or made_of["path"])
@@ -518,13 +518,13 @@ def _merge_survey(
         if not options.continues_run:
             output.check_existing(jobs)
         with open_store(jobs, options, screen) as store:
-            _take_points(store, shard_folders, notes)
+            _copy_points(store, shard_folders, notes)
             load_open3d()
             result = Committed(store).result(screen)
             return output.publish(folder, result, store, screen)[1]
 
 
-def _take_points(
+def _copy_points(
     store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
 ) -> None:
     """Copy the points in all folders to a store.

@@ -53,10 +53,10 @@ from .report import make_report
 CLOUD = FORMATS["ply"].file
 PAGE = "report.html"
 REPORT = LAST_FILE
-_DRAWN = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
-_SURVEY = ("scene", "survey")  # entries of the identity that must match for the same survey
-_OF_FORMATS = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
+_PICTURES = tuple(f"{name}.png" for name in PICTURES)
+FILES = (CLOUD, *_PICTURES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+_SURVEY_ENTRIES = ("scene", "survey")  # entries of the identity that must match for the same survey
+_FORMAT_OF_FILE = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
 
 
 def run_survey(
@@ -175,16 +175,16 @@ class SurveyOutput:
                 entries = set(storage.entries())
             except NotADirectoryError:
                 return
-        earlier, listed, earlier_fields = _earlier(storage)
+        earlier, listed, earlier_fields = _read_earlier(storage)
         if REPORT in entries and not overwrite:
             expected = inputs.identity  # slow for large scenes
-            if earlier != {name: expected[name] for name in _SURVEY}:
+            if earlier != {name: expected[name] for name in _SURVEY_ENTRIES}:
                 changed = describe_changes(earlier_fields, inputs.fields) if earlier_fields else ""
                 raise LidarError(
                     f"{target} contains the result of a different "
                     f"survey{f' ({changed})' * bool(changed)}. {advice}"
                 )
-        further = _further_files(self.survey, self.formats)
+        further = _optional_files(self.survey, self.formats)
         foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
             lists = (
@@ -192,7 +192,7 @@ class SurveyOutput:
                 "belong to a result."
             )
             raise LidarError(f"{lists} {advice}")
-        check_foreign_files(storage, _formats({*further, *listed}))
+        check_foreign_files(storage, _formats_of_files({*further, *listed}))
 
     def publish(
         self,
@@ -289,8 +289,8 @@ class SurveyOutput:
             If a file cannot be written.
         """
         target = Storage.at(self.target)
-        earlier = _earlier(target).files
-        further = _further_files(result.survey, self.formats)
+        earlier = _read_earlier(target).files
+        further = _optional_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
         sent: list[ExportSpec] = []  # formats that workers write directly to the storage
         if workers is not None and isinstance(self.target, Storage):
@@ -302,17 +302,17 @@ class SurveyOutput:
             ),
             staging(folder, self.target) as staged,
         ):
-            check_foreign_files(target, _formats({*further, *earlier}))
+            check_foreign_files(target, _formats_of_files({*further, *earlier}))
             sweeps = _write_sweeps(staged, result, sweeps)
-            points = _shown_points(result, CLOUD, show)
+            points = _points_with_progress(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
             timeline.mark(timeline.CLOUD_WRITTEN)
             others = [entry for entry in self.formats if entry not in sent]
             full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
-                _clear(target, further, earlier)
+                _remove_earlier(target, further, earlier)
                 for output_format in sent:
-                    points = _shown_points(result, output_format.row.file, show)
+                    points = _points_with_progress(result, output_format.row.file, show)
                     output_format.write_to_storage(target, points, sweeps, workers)
             if workers:
                 result = workers.recorded(result)
@@ -322,21 +322,21 @@ class SurveyOutput:
             if full_scales:
                 report["intensity_full_scale"] = full_scales
             if self.extent != "cloud":
-                self._report(result, report, counts, staged, show)
+                self._write_page(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
             if isinstance(self.target, Storage):
                 if not sent:
-                    _clear(target, further, earlier)
-                _put(staged, target, further)
+                    _remove_earlier(target, further, earlier)
+                _upload(staged, target, further)
                 with deferred_interrupts():
                     on_written()
             else:
-                _move(staged, folder, report["files"], earlier, on_written)
+                _move_into_place(staged, folder, report["files"], earlier, on_written)
         timeline.mark(timeline.IN_PLACE)
         return report
 
-    def _report(
+    def _write_page(
         self,
         result: RunResult,
         report: dict[str, Any],
@@ -389,7 +389,7 @@ def _write_formats(
     for output_format in sorted(formats, key=lambda entry: entry.has_many_files):
         full_scale = output_format.write(
             staged / output_format.row.file,
-            _shown_points(result, output_format.row.file, show),
+            _points_with_progress(result, output_format.row.file, show),
             sweeps,
             workers=workers,
             content=partial(picture_content, result),
@@ -399,7 +399,7 @@ def _write_formats(
     return full_scales
 
 
-def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
+def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
     """Return the points of a result, which report their progress for a file while they are read."""
     count = len(result.points)
     read_count = 0
@@ -431,33 +431,35 @@ def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) 
     (staged / REPORT).write_text(text, encoding="utf-8")
 
 
-def _put(staged: Path, storage: Storage, further: Collection[str]) -> None:
+def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
     """Upload the files of a result to a storage, with report.json last."""
-    for name in (*_known_further(further), *FILES):
+    for name in (*_known_optional_files(further), *FILES):
         if (staged / name).exists():
             storage.put(staged / name, name)
 
 
-def _further_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
+def _optional_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
     """Return the names of files and folders that only some results have."""
     instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
     return [*(output_format.row.file for output_format in formats), *measured]
 
 
-def _formats(names: Collection[str]) -> list[str]:
+def _formats_of_files(names: Collection[str]) -> list[str]:
     """Return the formats whose file or folder is in a list of names."""
-    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_OF_FORMATS}
-    return [name for file, name in _OF_FORMATS.items() if file in names] + plugin_formats(unknown)
+    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_FORMAT_OF_FILE}
+    return [name for file, name in _FORMAT_OF_FILE.items() if file in names] + plugin_formats(
+        unknown
+    )
 
 
-def _known_further(names: Collection[str]) -> list[str]:
+def _known_optional_files(names: Collection[str]) -> list[str]:
     """Return the names that belong to a format or an instrument, in the order of the formats."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
-    return [format_row(name).file for name in _formats(names)] + measured
+    return [format_row(name).file for name in _formats_of_files(names)] + measured
 
 
-class _Earlier(NamedTuple):
+class _EarlierResult(NamedTuple):
     """Properties of an existing result."""
 
     identity: Mapping[str, str] = MappingProxyType({})  # hashes of the scene and the survey
@@ -465,19 +467,19 @@ class _Earlier(NamedTuple):
     fields: Mapping[str, str] = MappingProxyType({})  # {scenario field: value as text}
 
 
-def _earlier(storage: Storage) -> _Earlier:
+def _read_earlier(storage: Storage) -> _EarlierResult:
     """Return the properties of an existing result, or empty ones if it is missing or damaged."""
     try:
         report = json.loads(storage.read(REPORT))
-        identity = {name: report["identity"][name] for name in _SURVEY}
+        identity = {name: report["identity"][name] for name in _SURVEY_ENTRIES}
         files = frozenset(report["files"])
-        files |= {*_DRAWN} if PICTURE_FILE in files else set()  # may have been drawn later
-        return _Earlier(identity, files, dict(report.get("fields", {})))
+        files |= {*_PICTURES} if PICTURE_FILE in files else set()  # may have been drawn later
+        return _EarlierResult(identity, files, dict(report.get("fields", {})))
     except (OSError, ValueError, TypeError, LookupError):
-        return _Earlier()
+        return _EarlierResult()
 
 
-def _move(
+def _move_into_place(
     staged: Path,
     folder: Path,
     files: Collection[str],
@@ -491,15 +493,15 @@ def _move(
     for name in files:  # `on_written` removes the parts, the only other copy of the points
         flush(staged / name)
     with deferred_interrupts():
-        _clear(Storage.at(folder), files, earlier)
-        for name in (*_known_further(files), *FILES):
+        _remove_earlier(Storage.at(folder), files, earlier)
+        for name in (*_known_optional_files(files), *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
         flush(folder)  # makes the renames durable before the parts are removed
         on_written()
 
 
-def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
+def _remove_earlier(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
     """Remove the files of an earlier result before new `files` are moved into place.
 
     report.json and the page are removed first, and a local folder is flushed afterward, because
@@ -508,7 +510,7 @@ def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) ->
     report.json, the list is lost, and the files of other formats remain. Finally, those of the
     `FILES` that the new result does not have are removed.
     """
-    further = _known_further({*files, *earlier})
+    further = _known_optional_files({*files, *earlier})
     # Remaining pictures of an earlier result would appear to belong to the new result.
     missing = [name for name in FILES if name not in files]
     for name in (REPORT, PAGE, *further, *missing):

@@ -45,7 +45,7 @@ _PACKAGES = (
     "matplotlib", "cupy-cuda12x", "cupy-cuda13x",
 )  # fmt: skip
 # Entries of the report that `--json` prints.
-_FIGURES = (
+_SUMMARY_ENTRIES = (
     "backend", "notes", "scans", "sweeps", "rays", "hits", "points", "points_by_object", "seconds",
     "placement_violations", "replayed", "resumed_scans",
 )  # fmt: skip
@@ -107,7 +107,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
             "planning": round(result.planning_seconds, 3),
             "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
         },
-        "stages": stage_figures(result.stages),
+        "stages": stage_statistics(result.stages),
         "tasks": tasks,
         "placement_violations": sum(stage.violations for stage in result.stages),
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
@@ -117,13 +117,13 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     }
 
 
-def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
+def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
     """Return the main statistics of a report and the paths of its files, as printed by `--json`."""
     planning = report["planning"]
     return {
         "folder": str(folder),
         "files": {name: f"{folder}/{name}" for name in report["files"]},
-        **{name: report[name] for name in _FIGURES},
+        **{name: report[name] for name in _SUMMARY_ENTRIES},
         "planning": planning and {name: planning[name] for name in _PLANNING},
     }
 
@@ -203,7 +203,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
     }
 
 
-def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
+def stage_statistics(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
     """Return the statistics of each stage: tasks, items, task time, elapsed time and workers."""
     return {
         stage.stage: {
@@ -214,11 +214,11 @@ def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
             "span_seconds": round(stage.stop - stage.start, 4),
             "workers": sorted(stage.workers),
         }
-        for stage in in_order(totals)
+        for stage in sort_stages(totals)
     }
 
 
-def in_order(totals: Iterable[StageTotals]) -> list[StageTotals]:
+def sort_stages(totals: Iterable[StageTotals]) -> list[StageTotals]:
     """Sort stages in the order of the pipeline."""
     return sorted(totals, key=lambda stage: [*STAGES].index(stage.stage))
 

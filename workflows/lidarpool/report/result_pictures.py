@@ -223,7 +223,7 @@ def draw_path(
     axes = page.map_chart(FRAME, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # line width of the best path
-    drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
+    drawn_trials = [trial for trial in drawn_trials if max_deviation(trial, best) > width_m]
     circles = zip(planning.centers, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
@@ -240,11 +240,11 @@ def draw_path(
     axes.plot(*best[1:-1].T, "o", color=PATH_COLOR, ms=2.6 * unit, zorder=5)
     _draw_ends(axes, page, planning)
     page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
-    page.title("Planned path", _verdict(path, trials))
+    page.title("Planned path", _path_caption(path, trials))
     return page
 
 
-def farthest(path: Floats, other: Floats) -> float:
+def max_deviation(path: Floats, other: Floats) -> float:
     """Return the maximum distance from one path to another path (directed Hausdorff distance).
 
     `path` and `other` contain the corners of the paths. Shape (w, 2). `path` is sampled at a
@@ -288,7 +288,7 @@ def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Lin
     return handles
 
 
-def _verdict(best: PlannedPath, trials: Sequence[Floats]) -> str:
+def _path_caption(best: PlannedPath, trials: Sequence[Floats]) -> str:
     """Return the caption: the length, the shortest possible length, and the number of trials."""
     shortest = "the discs block every path to the target"
     if math.isfinite(best.shortest_m) and best.shortest_m > 0:
@@ -356,7 +356,7 @@ def draw_stations(plan: StationPlan) -> Page:
     """Draw the scene of a station plan, with each pixel colored by its visibility."""
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
-    axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
+    axes = page.show(shot, _classify_by_coverage(shot, plan).paint(COLORS, 0.6))
     page.number_sensors(axes, shot)
     names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())
@@ -372,7 +372,7 @@ def draw_stations(plan: StationPlan) -> Page:
     return page
 
 
-def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
+def _classify_by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     """Replace the triangle index of each sample by COVERED, UNCOVERED, HIDDEN or OTHER."""
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     visible_from_any = _pixel_visibility(shot, plan)
@@ -381,7 +381,7 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     kinds[surface[covered]] = COVERED
     uncovered = surface[~covered]
     # Testing all pixels would take minutes. One pixel per triangle and block is tested instead.
-    tested, group = _pixels_of_blocks(shot, uncovered)
+    tested, group = _choose_block_pixels(shot, uncovered)
     visible = visible_from_any(candidates, shot.pixel_samples, uncovered[tested])
     kinds[uncovered[visible[group]]] = UNCOVERED
     edge_kinds, edge_surface = _initial_kinds(shot, plan, shot.edge_samples)
@@ -392,8 +392,8 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
         shot,
-        pixel_samples=_painted(shot.pixel_samples, kinds),
-        edge_samples=_painted(shot.edge_samples, edge_kinds),
+        pixel_samples=_replace_triangles(shot.pixel_samples, kinds),
+        edge_samples=_replace_triangles(shot.edge_samples, edge_kinds),
     )
 
 
@@ -408,7 +408,7 @@ def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) ->
     return np.where(on_surface & ~on_target, OTHER, HIDDEN), np.flatnonzero(on_target)
 
 
-def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
+def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
     """Choose one pixel for each triangle in each block of pixels.
 
     Returns
@@ -423,7 +423,7 @@ def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
     return chosen, group
 
 
-def _painted(samples: RaySamples, kinds: Ints) -> RaySamples:
+def _replace_triangles(samples: RaySamples, kinds: Ints) -> RaySamples:
     """Replace the triangle index of each sample that hits a surface by its kind."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 

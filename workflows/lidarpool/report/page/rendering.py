@@ -39,7 +39,7 @@ from ...run.pipeline.task_records import TaskRecord
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
 from ..cloud_counts import CloudCounts
-from ..report import STAGES, in_order
+from ..report import STAGES, sort_stages
 
 SCENARIO_MOST = 50_000  # maximum number of characters; a scenario may contain a million poses
 WIDTH = 1000  # width of the timeline in SVG units, which the page scales
@@ -87,17 +87,17 @@ def write_page(
     """
     has_model = any(mounted.sensor.name for mounted in result.survey.carried)
     marks = _station_marks(result, cloud)
-    text = rendered(
+    text = render_template(
         "page.html",
         report=report,
         cloud=cloud,
         name="" if scenario is None or has_model else scenario.title,
-        pictures={"above": from_above(cloud.above, cloud.pixel_m, marks)},
+        pictures={"above": draw_top_view(cloud.above, cloud.pixel_m, marks)},
         marks=len(marks),
-        densities=_density_ends(cloud),
-        changed=_changed,
+        densities=_density_range(cloud),
+        changed=_changed_fields,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
-        scenario=_written(scenario) if scenario else "",
+        scenario=_scenario_yaml(scenario) if scenario else "",
         stages=result.stages,
     )
     path.write_text(text, encoding="utf-8")
@@ -139,7 +139,7 @@ def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
     ]
 
 
-def from_above(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
+def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
     """Draw a top view of the point counts as an SVG image with a scale bar.
 
     In dark mode, the page inverts the lightness of the points.
@@ -158,13 +158,13 @@ def from_above(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) 
     size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
     return (
         f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
-        f'<image {size} href="{_shaded(counts[::-1])}"/>'
-        f'<g class="stations">{_drawn_marks(marks, letter)}</g>'
+        f'<image {size} href="{_shade_counts(counts[::-1])}"/>'
+        f'<g class="stations">{_draw_marks(marks, letter)}</g>'
         f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}</svg>"
     )
 
 
-def _shaded(counts: Ints) -> str:
+def _shade_counts(counts: Ints) -> str:
     """Return a picture of point counts as a data URL. `counts` has shape (rows, columns)."""
     shade = np.log1p(counts)
     weakest = np.where(counts > 0, _WEAKEST, 0)  # makes single points visible
@@ -175,7 +175,7 @@ def _shaded(counts: Ints) -> str:
     return f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
 
 
-def _drawn_marks(marks: Sequence[_Mark], letter: float) -> str:
+def _draw_marks(marks: Sequence[_Mark], letter: float) -> str:
     """Draw stations as numbered discs, or as dots if there are many stations or only one."""
     if not 1 < len(marks) <= MAX_NUMBERED:
         radius = 0.25 * letter
@@ -199,7 +199,7 @@ def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> 
     )
 
 
-def _density_ends(cloud: CloudCounts) -> tuple[float, float] | None:
+def _density_range(cloud: CloudCounts) -> tuple[float, float] | None:
     """Return the minimum and maximum density in the top view in points per square meter.
 
     Only pixels with points count. Return None if there are no points.
@@ -210,7 +210,7 @@ def _density_ends(cloud: CloudCounts) -> tuple[float, float] | None:
     return float(counts.min()) / cloud.pixel_m**2, float(counts.max()) / cloud.pixel_m**2
 
 
-def rendered(
+def render_template(
     template: str,
     *,
     pictures: Mapping[str, str] | None = None,
@@ -285,7 +285,7 @@ def _with_names(row: str, head: Sequence[str]) -> Markup:
     return Markup(re.sub("<td", lambda _: f'<td data-name="{escape(next(names, ""))}"', row))
 
 
-def _written(scenario: Scenario) -> str:
+def _scenario_yaml(scenario: Scenario) -> str:
     """Return a scenario as YAML, truncated if it is too long."""
     data = scenario.model_dump(mode="json", exclude_defaults=True, by_alias=True)
     data |= {"classes": dict(scenario.classes)} if scenario.classes else {}  # JSON has no numbers
@@ -296,7 +296,7 @@ def _written(scenario: Scenario) -> str:
     return text if data else ""
 
 
-def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
+def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
     """Return the names and values of the fields that differ from the defaults of a dataclass."""
     usual = declared(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
@@ -316,7 +316,7 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
     """
     if not stages:
         return None
-    stages = in_order(stages)
+    stages = sort_stages(stages)
     start = min(stage.start for stage in stages)
     seconds = max(1e-6, max(stage.stop for stage in stages) - start)
     axis = _TimeAxis(start, seconds)
