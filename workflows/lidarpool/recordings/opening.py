@@ -36,7 +36,7 @@ _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if
 
 
 class UnknownFormatError(LidarError):
-    """The format of a file or folder is not supported.
+    """Raised when the format of a file or folder is not supported.
 
     `advice` contains sentences that suggest a remedy. It may be empty.
     """

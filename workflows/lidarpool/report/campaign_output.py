@@ -294,7 +294,7 @@ class DataSetOutput:
 
 
 class DamagedRecordError(LidarError):
-    """CAMPAIGN_FILE is damaged or has been edited."""
+    """Raised when CAMPAIGN_FILE is damaged or has been edited."""
 
 
 def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
@@ -335,9 +335,9 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
 
 def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
-    """Return True if the job table and the index match these rows.
+    """Return True if the job table contains exactly these rows, and the index as many jobs.
 
-    The index is the last file that a run writes. It contains the checksum of the job table.
+    The checksum of the job table is stored in the index and is verified, too.
     """
     with suppress(LidarError):
         index = read_index(storage)
@@ -394,9 +394,10 @@ def write_shared_files(
     campaign = record["campaign"]
     storage = dataset.storage
     with explained(f"{storage} cannot be written"):
-        storage.remove([INDEX_FILE])  # its checksum of the job table is about to become invalid
+        storage.remove([INDEX_FILE])  # contains the checksum of the table that is replaced next
     write_table(storage, campaign["names"], rows)
-    write_record(storage, record)  # after the table, which contains the jobs of all its shards
+    # The record is written after the table, so it never lists shards that the table lacks.
+    write_record(storage, record)
     dataset.finish(rows())
     # Some formats restrict sensor names, so sensors may be renamed in the data set.
     cloud_format = load_format(DATA_SETS[dataset.format])

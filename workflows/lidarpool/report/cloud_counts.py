@@ -119,7 +119,7 @@ class CloudCounts:
 
     @property
     def point_count(self) -> int:
-        """Number of points on objects and points without a surface."""
+        """Total number of points, including points that do not belong to an object."""
         return int(self.by_object.sum()) + self.no_surface
 
     @property
@@ -131,7 +131,10 @@ class CloudCounts:
 
     @property
     def above(self) -> Ints:
-        """Number of points per pixel in the top view. Shape (rows, columns), southernmost first."""
+        """Number of points per pixel in the top view, with the southernmost row first.
+
+        Shape (rows, columns).
+        """
         return self._pixels.counts.T
 
     @property
@@ -189,7 +192,7 @@ class GridCounts:
     def __init__(self, across: int) -> None:
         self._across = across
         self._level = 0
-        # Lowest and highest cells along x, y and possibly more axes. Shape (2, axes).
+        # Lowest and highest cells along x, y and possibly more axes, shape (2, axes).
         self.box: Ints | None = None
         self._array = np.zeros((across, across), np.int64)
 
@@ -235,7 +238,7 @@ class GridCounts:
         self._level += 1
 
     def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:
-        """Return an open mesh of array indices from the numbers of squares along each axis."""
+        """Return array indices of all combinations of square numbers along each axis."""
         return np.ix_(*(along_axis % self._across for along_axis in numbers))
 
     @property

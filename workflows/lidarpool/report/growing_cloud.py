@@ -48,7 +48,10 @@ _POLL_INTERVAL_S = 0.05
 
 
 class _PartWriter:
-    """Writes parts to a file, one at a time, and counts their points. Used by a single thread."""
+    """Writes parts to a file, one at a time, and computes statistics of their points.
+
+    Each thread has a separate instance.
+    """
 
     def __init__(self, file: PlyAppender, points: StoredCloud, scene: Scene) -> None:
         self.counts = CloudCounts(
@@ -192,12 +195,14 @@ class CloudWriter:
             self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
-        """Complete the file and return its statistics. Raises the same errors as `append`.
+        """Complete the file and return its statistics.
 
         Raises
         ------
         LidarError
-            Also if the parts contain points on objects that the scene does not have.
+            If a part is unusable or contains points on objects that the scene does not have.
+        OSError
+            If the file cannot be written.
         """
         self.wait()
         self.file.finish()
@@ -273,7 +278,7 @@ class GrowingCloud:
 
     def __enter__(self) -> GrowingCloud:
         self._thread.start()
-        self.add()
+        self.append_committed()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -283,7 +288,7 @@ class GrowingCloud:
         self._thread.join()
         self._discard()
 
-    def add(self, _: Sequence[Receipt] = ()) -> None:
+    def append_committed(self, _: Sequence[Receipt] = ()) -> None:
         """Queue the committed parts that are next in scan order, without waiting for the thread."""
         parts = self._job.parts
         with suppress(KeyError):  # the next scan is not committed yet

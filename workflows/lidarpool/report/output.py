@@ -101,7 +101,9 @@ def run_survey(
             with GrowingCloud(staged / CLOUD, store.only_job) as cloud:
                 load_open3d()  # required for the cloud; a missing library is reported early
                 committed = cast(
-                    store, connection, Listener(page, on_parts=cloud.add, pace=options.pace)
+                    store,
+                    connection,
+                    Listener(page, on_parts=cloud.append_committed, pace=options.pace),
                 )
                 result = committed.result(screen)
                 page.finish(result.seconds, result)

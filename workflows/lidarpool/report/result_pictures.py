@@ -199,8 +199,8 @@ def draw_path(
     """Draw a planned path, its obstacles and the paths of other trials, as seen from above.
 
     The best path is bold. The paths of other trials are faint, and are only drawn if they differ
-    visibly from the best path. If there are more than 1000 trials, evenly spaced samples of them
-    are drawn.
+    visibly from the best path. If there are more than 1000 trials, an evenly spaced subset is
+    drawn.
 
     Parameters
     ----------
@@ -413,8 +413,8 @@ def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
 
     Returns
     -------
-    Indices of the chosen pixels in `pixels`, and for each pixel, the position of its chosen pixel
-    among these indices.
+    Indices into `pixels` of the chosen pixels, and for each pixel, the index of its chosen pixel
+    in that list.
     """
     width = shot.camera.size[0]
     block = pixels // width // _BLOCK * width + pixels % width // _BLOCK

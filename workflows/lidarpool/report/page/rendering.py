@@ -373,7 +373,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
         count = sum(map(len, tasks.values()))
         total = max(task_counts[partition], count)
         detail = f"{plural(len(workers), 'worker')}, {plural(total, 'task')}"
-        if total > count:  # gaps would look like idle time
+        if total > count:  # otherwise, gaps would look like idle time
             detail += f", of which {count:,} are drawn, so gaps are not always idle time"
         if len(tasks) > MAX_ROWS:
             detail += f"; only the {MAX_ROWS} busiest of {len(tasks):,} rows are shown"
