@@ -92,7 +92,7 @@ _common_options = shared.combine(
 
 
 def _parse_duration(text: str) -> float:
-    """Parse a time such as 90, 90s, 10m or 2h."""
+    """Parse a duration such as 90, 90s, 10m or 2h, and return it in seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -162,7 +162,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             }
             terminal = Terminal(quiet, verbose, as_json)
             command(terminal, RunOptions(**run_settings), **further_settings)
-            terminal.end(strict=strict)
+            terminal.exit_if_warned(strict=strict)
         finally:
             stop_fork_server()
 
@@ -402,7 +402,7 @@ def merge(
     jobs = f"{plural(report['jobs']['done'], 'job')}, " if "jobs" in report else ""
     lines = [*screen.notes(report["notes"]), f"{jobs}{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
-    screen.end(strict=strict)
+    screen.exit_if_warned(strict=strict)
 
 
 @cli.command()

@@ -26,7 +26,7 @@ _MUJOCO = "mujoco"  # root tag of a MuJoCo model
 Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
-def importer_of(survey: Path) -> Plugin | None:
+def find_importer(survey: Path) -> Plugin | None:
     """Return the plug-in that imports a survey.
 
     Returns None for formats that lidarpool imports itself, and for unknown formats.
@@ -36,16 +36,16 @@ def importer_of(survey: Path) -> Plugin | None:
     LidarError
         If two plug-ins support the same format.
     """
-    name = _kind_of(survey)
+    name = _format_key(survey)
     return None if name in (_HELIOS, _MUJOCO) else find_plugin(GROUP, name)
 
 
 def is_mujoco_model(survey: Path) -> bool:
     """Return True if a file is a MuJoCo model."""
-    return _kind_of(survey) == _MUJOCO
+    return _format_key(survey) == _MUJOCO
 
 
-def _kind_of(survey: Path) -> str:
+def _format_key(survey: Path) -> str:
     """Return the root tag of an XML file without its namespace, or the file extension."""
     with suppress(OSError, LidarError, ValueError):
         return parse_lenient_xml(read_input(survey)).tag.rpartition(":")[2]

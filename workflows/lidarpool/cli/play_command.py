@@ -141,7 +141,7 @@ def play(
             sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, bridge_settings)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
-        with _summarized(lambda: bridge.summary), bridge:
+        with _summary_at_end(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
             click.echo(f"ready: {bridge.description}. Press Ctrl-C to stop.")
             play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
@@ -161,13 +161,13 @@ def _play_recording(
         terminal.tell(note)
     streams = recorded_streams(recording, to, settings.get("api", ()))
     transmitter = Transmitter(streams, terminal.tell, settings.get("lateness"))
-    with _summarized(lambda: transmitter.summary), transmitter:
+    with _summary_at_end(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}. Press Ctrl-C to stop.")
         play_recording(recording, transmitter, schedule, loop=loop)
 
 
 @contextmanager
-def _summarized(summary: Callable[[], str]) -> Iterator[None]:
+def _summary_at_end(summary: Callable[[], str]) -> Iterator[None]:
     """Print a summary when the body ends, including when it is interrupted with Ctrl-C."""
     try:
         yield

@@ -146,9 +146,9 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from ..scenario.sections import SensorSection
     from .import_plugins import (
         SCENARIO_FILE,
+        find_importer,
         import_atomically,
         import_with_plugin,
-        importer_of,
         is_mujoco_model,
     )
 
@@ -162,7 +162,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         unsupported = import_atomically(import_model, survey, folder, assets, check)
     elif is_scanner(survey):
         unsupported = import_atomically(import_scanner, survey, folder, assets, check)
-    elif (plugin := importer_of(survey)) is not None:
+    elif (plugin := find_importer(survey)) is not None:
         unsupported = import_with_plugin(plugin, survey, folder, assets, check=check)
     elif survey.suffix.lower() in ENDINGS:
         unsupported = import_atomically(import_sensor, survey, folder, assets, check)
@@ -207,7 +207,7 @@ def check(
     """Validate a scenario and estimate points, memory and disk space.
 
     No workers are started. For a campaign, the varying values and five of the jobs are checked.
-    `lidarpool run` completes the other jobs of a campaign if some jobs cannot be run.
+    If some jobs of a campaign cannot be run, `lidarpool run` completes the others.
 
     The number of points is estimated by casting a sample of the rays in this process. A warning is
     printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario can be
@@ -534,7 +534,7 @@ def sensors(
     """List the sensor models, or describe or export one of them.
 
     Exported files contain the rays in firing order; docs/how-to/other-simulators.md describes the
-    conventions. Properties that the format cannot store are listed on the screen.
+    conventions. Properties that the format cannot store are printed.
 
     \b
     Examples:

@@ -307,7 +307,7 @@ def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
 
 
 def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print the statistics as a JSON document or as lines of text."""
+    """Print results as a JSON document or as lines of text."""
     if as_json:
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:

@@ -147,9 +147,10 @@ def stations(
     the sensor, and within --slant. The output is a scenario with the stations, and a picture of the
     surfaces that they cover.
 
-    With --cloud, no stations are chosen. Instead, the command computes which share of the area that
-    is reachable from the stations in SCENARIO is close to a point of a result, or of any cloud that
-    `lidarpool compare` reads.
+    With --cloud, no stations are chosen. Instead, the command measures the coverage of an existing
+    scan. The coverage is the share of the area reachable from the stations in SCENARIO that is
+    close to a point of the scan. The scan can be a result or any cloud that `lidarpool compare`
+    reads.
 
     \b
     Examples:

@@ -58,7 +58,7 @@ class Terminal(Screen):
             self.warnings.append(words)
             click.echo(f"warning: {words}", err=True)
 
-    def end(self, *, strict: bool) -> None:
+    def exit_if_warned(self, *, strict: bool) -> None:
         """Exit the process with code 1 if `strict` is True and a warning was printed."""
         if strict and self.warnings:
             sys.exit(WARNED)

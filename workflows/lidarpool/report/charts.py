@@ -66,7 +66,7 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
     page = Page((WIDTH, layout.page_height))
     points = figures.per_job("points")
     failures = figures.failures
-    limits = _limits(points[~failures])
+    limits = _axis_limits(points[~failures])
     informative = _most_informative(scales, points, ~failures)
     colors = _dot_colors(informative, len(points))
     for number, scale in enumerate(scales):
@@ -115,8 +115,8 @@ class _Layout(NamedTuple):
         row, column = divmod(number, self.column_count)
         x = LEFT + column * (self.width + COLUMN_GAP)
         y = TOP + row * (self.row_height + ROW_GAP)
-        upper = _chart(page, x, y, self.width, COUNTS_HEIGHT)
-        lower = _chart(page, x, y + COUNTS_HEIGHT + GAP, self.width, DOTS_HEIGHT)
+        upper = _add_axes(page, x, y, self.width, COUNTS_HEIGHT)
+        lower = _add_axes(page, x, y + COUNTS_HEIGHT + GAP, self.width, DOTS_HEIGHT)
         return upper, lower
 
     def label_charts(
@@ -217,7 +217,7 @@ def _draw_distributions(
     page = Page((WIDTH, top + height + 92))
     width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (len(quantities) - 1)) / len(quantities)
     for column, quantity in enumerate(quantities):
-        axes = _chart(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
+        axes = _add_axes(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
         _draw_counts(axes, quantity, np.zeros(len(quantity.values), np.bool_), [BAR])
         _set_labels(page, axes, quantity, width)
         axes.set_xlabel(quantity.name)
@@ -230,7 +230,7 @@ def _draw_distributions(
     return page
 
 
-def _chart(page: Page, x: float, y: float, chart_width: float, chart_height: float) -> Axes:
+def _add_axes(page: Page, x: float, y: float, chart_width: float, chart_height: float) -> Axes:
     """Add axes with an unobtrusive frame.
 
     `x`, `y`, `chart_width` and `chart_height` are in pixels, measured from the top left corner.
@@ -367,7 +367,7 @@ def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
     return np.stack([left, right, np.full(len(groups), np.nan)], axis=1)
 
 
-def _limits(points: Floats) -> tuple[float, float]:
+def _axis_limits(points: Floats) -> tuple[float, float]:
     """Return the axis limits for numbers of points.
 
     The axis starts at 0 unless all jobs have similar numbers of points.

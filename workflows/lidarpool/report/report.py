@@ -83,7 +83,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "machine": {"system": platform.platform(), "processor": platform.machine()},
         "backend": result.backend,
         "notes": list(result.notes),
-        "parameters": _parameters(scene, survey),
+        "parameters": _describe_parameters(scene, survey),
         "scans": survey.scan_count,
         "sweeps": survey.sweep_count,
         "rays": result.rays,
@@ -100,7 +100,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         **({"class_names": dict(survey.classes)} if survey.classes else {}),
         **({"points_by_material": by_material} if has_materials else {}),
         "points_per_m2": density and density._asdict(),
-        "columns": _columns(cloud),
+        "columns": _describe_columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
             "survey": round(result.survey_seconds, 3),
@@ -113,7 +113,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
         "replayed": result.replayed,
         "resumed_scans": result.resumed,
-        "planning": _planning(result),
+        "planning": _describe_planning(result),
     }
 
 
@@ -128,12 +128,12 @@ def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str
     }
 
 
-def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     """Describe the scene, the sensors and the options of a survey."""
     options = declared(survey, CloudOptions) | declared(survey, Weather)
     del options["columns"]  # the report has a separate entry for the columns
     sensors = [
-        _sensor(mounted.sensor)
+        _describe_sensor(mounted.sensor)
         | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}
         | ({"unseen": list(mounted.unseen)} if mounted.unseen else {})
         for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
@@ -164,7 +164,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     }
 
 
-def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
+def _describe_columns(cloud: CloudCounts) -> list[dict[str, Any]]:
     return [
         {
             "name": column.name,
@@ -181,7 +181,7 @@ def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
     ]
 
 
-def _sensor(sensor: Sensor) -> dict[str, Any]:
+def _describe_sensor(sensor: Sensor) -> dict[str, Any]:
     """Describe a sensor: its beams, and the numeric and text properties of its scan head."""
     firings = np.arange(ELEVATION_RAYS // sensor.channels + 1)
     elevations = np.degrees(np.arcsin(sensor.directions(firings)[..., 2].clip(-1, 1)))
@@ -230,7 +230,7 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
-def _planning(result: RunResult) -> dict[str, Any] | None:
+def _describe_planning(result: RunResult) -> dict[str, Any] | None:
     """Describe the planning problem and the planned path, in world coordinates.
 
     Return None if no path was planned.

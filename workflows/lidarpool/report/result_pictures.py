@@ -34,7 +34,7 @@ from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
 from ..plan.stations import StationPlan, StationVisibility
-from .page.rendering import put_picture
+from .page.rendering import insert_picture
 
 MIN_SIDE = 480  # pixels; text would be illegible in smaller pictures
 MAX_SIDE = 4096  # pixels; drawing takes 0.4 kB of memory per pixel
@@ -123,7 +123,7 @@ def draw_pictures(
         picture = makers[name]()
         picture.save(path)
         if page.exists():
-            put_picture(page, name, picture.svg())
+            insert_picture(page, name, picture.svg())
         yield path
     show("pictures", len(names), len(names), "pictures")
 
@@ -219,7 +219,7 @@ def draw_path(
     best = path.corners
     trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
-    limits = _limits(best, drawn_trials, planning, size)
+    limits = _plot_limits(best, drawn_trials, planning, size)
     axes = page.map_chart(FRAME, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # line width of the best path
@@ -302,7 +302,7 @@ def _path_caption(best: PlannedPath, trials: Sequence[Floats]) -> str:
     return f"{length.replace('-', '−')} · {state} · {best_of}"
 
 
-def _limits(
+def _plot_limits(
     best: Floats, trials: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
 ) -> Floats:
     """Return the minimum and maximum x and y of the plot, with the aspect ratio of the page.

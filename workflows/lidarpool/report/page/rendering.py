@@ -67,7 +67,7 @@ def write_page(
     """Write the report of a survey as a self-contained HTML file.
 
     The title contains the sensor models, or the name of the scenario if no sensor has a model.
-    Pictures can be inserted later with `put_picture`.
+    Pictures can be inserted later with `insert_picture`.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def write_page(
     path.write_text(text, encoding="utf-8")
 
 
-def put_picture(page: Path, name: str, svg: str) -> None:
+def insert_picture(page: Path, name: str, svg: str) -> None:
     """Insert a picture into a page that was written by `write_page`.
 
     The page does not change if it has no placeholder for the picture.
