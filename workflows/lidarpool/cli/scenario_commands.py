@@ -206,12 +206,12 @@ def check(
 ) -> None:
     """Validate a scenario and estimate points, memory and disk space.
 
-    No workers are started. For a campaign, the varying values and five of the jobs are checked.
-    If some jobs of a campaign cannot be run, `lidarpool run` completes the others.
+    No workers are started. For a campaign, the varied quantities are listed and five of the jobs
+    are checked. If some jobs of a campaign cannot be run, `lidarpool run` completes the others.
 
     The number of points is estimated by casting a sample of the rays in this process. A warning is
-    printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario can be
-    run, and 2 if it cannot or, for a campaign, if a checked job cannot.
+    printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario or all
+    checked jobs of the campaign can be run, and 2 otherwise.
 
     \b
     Examples:
