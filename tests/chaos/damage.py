@@ -37,7 +37,7 @@ from tests.clusters import thread_cluster
 import lidarpool
 from lidarpool import Campaign, LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.report.campaign_output import verify
+from lidarpool.report.campaign_output import verify_dataset
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.io.storage import Storage
@@ -104,7 +104,7 @@ def read_sweeps(place: Path) -> str:
 
 def read_verified(place: Path) -> str:
     """Compare all files of a data set with what is kept of them."""
-    return verify(Storage.at(place))
+    return verify_dataset(Storage.at(place))
 
 
 def merged(shards: Path) -> str:

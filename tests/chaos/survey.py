@@ -96,7 +96,7 @@ def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
             job = store.only_job
             assert job is not None
             with GrowingCloud(Path(folder, "growing.ply"), job) as cloud:
-                listener = Listener(page, on_frame, cloud.add, run_options.pace)
+                listener = Listener(page, on_frame, cloud.append_committed, run_options.pace)
                 result = cast(store, connection, listener).result(screen)
                 path = Path(folder, "cloud.ply")
                 if cloud.finish(path, job.points()) is not None:

@@ -26,7 +26,7 @@ SOUND = {
 
 def test_nothing_is_wrong_without_a_gpu():
     assert doctor._fix_first(SOUND) == ""
-    assert doctor.advice_in_words({"fix_first": ""}) == "No problems were found."
+    assert doctor.advice_line({"fix_first": ""}) == "No problems were found."
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_nothing_is_wrong_without_a_gpu():
 def test_the_most_urgent_is_named(changes, advice):
     first = doctor._fix_first(SOUND | changes)
     assert re.search(advice, first), first
-    assert doctor.advice_in_words({"fix_first": first}).startswith("fix first: ")
+    assert doctor.advice_line({"fix_first": first}).startswith("fix first: ")
 
 
 def test_without_a_folder_for_compiled_loops(monkeypatch):
@@ -67,8 +67,8 @@ def test_a_port_that_is_in_use(monkeypatch):
         port = server.getsockname()[1]
         monkeypatch.setattr(doctor, "PORTS", {port: "a test"})
         assert doctor._port_state(port) == "in use"
-        figures = doctor.examine()
-        lines = doctor.in_words(figures)
+        figures = doctor.check_environment()
+        lines = doctor.result_lines(figures)
         assert any(f"{port} " in line and "in use (a test)" in line for line in lines)
 
 
@@ -81,7 +81,9 @@ def test_extras_are_added_in_the_checkout(monkeypatch):
         == "pip install -e ./kernels -e ./scheduler -e ./workflows/lidarsim -e . " + at
     )
     assert install_command("torch") == "pip install torch"
-    assert f"extras         installed from {CHECKOUT}" in doctor.in_words(doctor.examine())
+    assert f"extras         installed from {CHECKOUT}" in doctor.result_lines(
+        doctor.check_environment()
+    )
 
 
 def test_an_extra_that_is_missing_names_its_command(monkeypatch):
@@ -127,9 +129,9 @@ def install(tmp_path, monkeypatch):
 
 def test_a_copy_that_hides_an_editable_installation_is_reported(install):
     install(editable=True)
-    assert installed_copies.second_copy() == ""
+    assert installed_copies.find_second_copy() == ""
     checkout, site = install(in_site=PACKAGES, editable=True)
-    assert installed_copies.second_copy() == (
+    assert installed_copies.find_second_copy() == (
         f"There are two copies of lidarpool: it is imported from {site}, so changes in "
         f"{checkout} have no effect. Uninstall lidarpool, lidarsim, poolpart and raybeam, then run "
         + install_command("lidarpool")
@@ -140,17 +142,17 @@ def test_packages_of_several_folders_are_reported(install):
     checkout, site = install(in_site=["raybeam"], editable=True)
     assert (
         f"raybeam is imported from {site}, and lidarpool from {checkout}. Uninstall"
-        in installed_copies.second_copy()
+        in installed_copies.find_second_copy()
     )
 
 
 def test_a_checkout_that_is_not_what_runs_is_reported_unless_it_was_chosen(install, monkeypatch):
     checkout, site = install(in_site=PACKAGES)
-    assert installed_copies.second_copy() == ""
+    assert installed_copies.find_second_copy() == ""
     monkeypatch.chdir(checkout / "workflows")
-    assert f"changes in {checkout} have no effect" in installed_copies.second_copy()
+    assert f"changes in {checkout} have no effect" in installed_copies.find_second_copy()
     monkeypatch.setenv("PYTHONPATH", str(site))
-    assert installed_copies.second_copy() == ""
+    assert installed_copies.find_second_copy() == ""
 
 
 def test_packages_that_are_not_installed_have_no_second_copy(install, monkeypatch):
@@ -160,4 +162,4 @@ def test_packages_that_are_not_installed_have_no_second_copy(install, monkeypatc
     checkout, _ = install()
     monkeypatch.setattr(installed_copies, "distribution", fail)
     monkeypatch.chdir(checkout)
-    assert installed_copies.second_copy() == ""
+    assert installed_copies.find_second_copy() == ""

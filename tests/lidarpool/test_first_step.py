@@ -16,7 +16,7 @@ STEP = re.compile(r"\d\d:\d\d:\d\d  reading the scene\n")
 @pytest.fixture(autouse=True)
 def as_before():
     yield
-    first_step.begin("", quiet=True)
+    first_step.print_first_step("", quiet=True)
 
 
 @pytest.mark.parametrize("command", ["check", "run", "stations"])
@@ -35,20 +35,20 @@ def test_a_quiet_command_tells_no_step(command, quiet, tmp_path):
 def test_compiling_is_told_where_logs_are_dropped(capsys, monkeypatch):
     logger = logging.getLogger("raybeam.compiled")
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)
-    first_step.begin("reading the scene")
-    first_step.begin("reading the scene")  # as a second command of the process
+    first_step.print_first_step("reading the scene")
+    first_step.print_first_step("reading the scene")  # as a second command of the process
     capsys.readouterr()
     logger.info(compiled.COMPILING)
     assert re.fullmatch(
         r"\d\d:\d\d:\d\d  compiling the ray-casting loops, which takes about 20 s the first time\n",
         capsys.readouterr().err,
     )
-    first_step.begin("reading the scene", quiet=True)
+    first_step.print_first_step("reading the scene", quiet=True)
     logger.info(compiled.COMPILING)
     assert capsys.readouterr().err == ""
 
 
 def test_a_terminal_gets_a_status_in_place_of_the_first_step(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    first_step.begin("reading the scene")
+    first_step.print_first_step("reading the scene")
     assert capsys.readouterr().err == ""

@@ -40,7 +40,7 @@ def add(store, growing, first, counts, offset=0):
     assert commit(store, first, counts, [1], [sum(counts)], offset=offset)
     part = store.only_job.parts.part_of(first)
     if growing is not None:
-        growing.add([part])
+        growing.append_committed([part])
 
 
 def grown_at(path):
@@ -216,7 +216,7 @@ def test_a_file_that_fails_is_removed_and_the_end_says_the_error(
             part = store.only_job.parts.part_of(first)
             if fault == "damaged part" and first == 5:
                 store.storage.write(part.name, b"damaged")
-            growing.add([part])
+            growing.append_committed([part])
         points = store.only_job.points()
         assert growing.finish(tmp_path / "grown.ply", points) is None
     assert not path.exists() and not (tmp_path / "grown.ply").exists()

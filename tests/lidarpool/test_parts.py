@@ -15,11 +15,11 @@ from lidarpool.columns.parts import (
     deletable_files,
     mark_name,
     pack,
+    parse_part_name,
     part_name,
     probe_name,
+    read_hit_counts,
     read_part,
-    read_tally,
-    scans_of,
     unpack,
 )
 from lidarsim.columns.part_columns import PartColumns, positions_of
@@ -128,7 +128,7 @@ def storage(request, tmp_path):
     place.remove(list(place.sizes()))
 
 
-@pytest.mark.parametrize("read", [read_part, read_tally])
+@pytest.mark.parametrize("read", [read_part, read_hit_counts])
 def test_a_part_that_cannot_be_read_is_named(storage, read):
     with pytest.raises(LidarError, match=r"The part .*none\.npz cannot be"):
         read(storage, "none.npz")
@@ -156,9 +156,9 @@ def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
         found = deletable_files(storage, which)
         assert {*found} == {*own, mark_name(mark)} and found[-1] == mark_name(mark)
     assert deletable_files(storage, other) == []
-    assert scans_of(part, mark) == (3, 5, 120)
-    assert {scans_of(name, mark) for name in (own | foreign) - {part}} == {None}
-    assert scans_of(part, other) is None
+    assert parse_part_name(part, mark) == (3, 5, 120)
+    assert {parse_part_name(name, mark) for name in (own | foreign) - {part}} == {None}
+    assert parse_part_name(part, other) is None
 
 
 def stored_cloud(storage, counts):

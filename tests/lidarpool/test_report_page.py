@@ -33,7 +33,7 @@ from lidarpool import (
 )
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.rendering import MAX_ROWS, put_picture, sentence, write_page
+from lidarpool.report.page.rendering import MAX_ROWS, insert_picture, sentence, write_page
 from lidarpool.report.report import make_report
 from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.task_book import TaskBook
@@ -140,7 +140,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         report = make_report(result, numbers)
         write_page(page, report, result, numbers, scenario)
         for name in drawn:
-            put_picture(page, name, f'<svg id="{name}"></svg>')
+            insert_picture(page, name, f'<svg id="{name}"></svg>')
         return page.read_text(encoding="utf-8"), report
 
     return write
@@ -164,12 +164,12 @@ def test_pictures_come_into_the_page_when_they_are_drawn(write, tmp_path):
     assert html.fromstring(text).xpath("//figure[@hidden]/@data-picture") == ["path"]
     page = tmp_path / "report.html"
     for size in (9, 1):
-        put_picture(page, "path", f'<svg class="{size * "x"}">\\1</svg>')
+        insert_picture(page, "path", f'<svg class="{size * "x"}">\\1</svg>')
     assert page.read_text("utf-8") == text.replace(
         '"path" hidden>\n    \n    <figc', '"path"><svg class="x">\\1</svg><figc'
     )
     page.write_text("of another program")
-    put_picture(page, "path", "<svg></svg>")
+    insert_picture(page, "path", "<svg></svg>")
     assert page.read_text() == "of another program"
 
 

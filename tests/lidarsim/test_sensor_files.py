@@ -20,7 +20,7 @@ import yaml
 from click.testing import CliRunner
 
 from lidarpool.cli.commands import cli
-from lidarpool.cli.import_plugins import import_whole
+from lidarpool.cli.import_plugins import import_atomically
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.gazebo.import_world import import_world
@@ -451,7 +451,7 @@ def test_an_imported_list_of_rays_counts_as_a_sensor(tmp_path):
 
 def sensor_of_scanner(path, folder):
     """The sensor that a scanner of HELIOS++ is imported as, its mount, and the notes."""
-    notes = import_whole(import_scanner, path, folder, (), lambda scenario: None)
+    notes = import_atomically(import_scanner, path, folder, (), lambda scenario: None)
     content = yaml.safe_load((folder / "scenario.yaml").read_text())
     [entry] = content["sensors"].values() if "sensors" in content else [content["sensor"]]
     mount = entry.pop("mount", {})
@@ -553,7 +553,7 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     assert mount.position == (0, 0, 0.1) and mount.rotation is not None
     content = yaml.safe_load((tmp_path / "new/scenario.yaml").read_text())
     assert content["noise"] == {"range_m": 0.02} and content["returns"]["mode"] == "first"
-    notes = import_whole(
+    notes = import_atomically(
         import_scanner, tmp_path / "scanners.xml#two", tmp_path / "two", (), Scenario.load
     )
     assert notes[-1] == "2 channels in one sensor (they become separate sensors)"
@@ -823,7 +823,9 @@ def test_import_makes_a_scenario_of_a_file(name, file_format, tmp_path):
     if name.endswith(".usda"):
         pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
     file = export_sensor(load_sensor("livox/mid360"), tmp_path / name, format=file_format)
-    left_out = import_whole(import_sensor, tmp_path / name, tmp_path / "new", (), Scenario.load)
+    left_out = import_atomically(
+        import_sensor, tmp_path / name, tmp_path / "new", (), Scenario.load
+    )
     assert len(left_out) == (file_format is None), left_out
     built = prepare(Scenario.load(tmp_path / "new/scenario.yaml"), plans=False)
     [carried] = built.survey.carried
@@ -837,7 +839,7 @@ def test_import_makes_a_scenario_of_a_file(name, file_format, tmp_path):
 def test_import_reads_tables_of_other_programs(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("Time [us],Azimuth [rad],Elevation [deg]\n5,0.5,10\n6,-0.5,-10\n8,0,90\n")
-    left_out = import_whole(import_sensor, path, tmp_path / "new", (), Scenario.load)
+    left_out = import_atomically(import_sensor, path, tmp_path / "new", (), Scenario.load)
     assert left_out == []
     sensor = load_sensor(calibration=tmp_path / "new/rays.npz")
     assert sensor.times_ns(np.arange(3))[:, 0].tolist() == [0, 1000, 3000]
@@ -845,12 +847,12 @@ def test_import_reads_tables_of_other_programs(tmp_path):
     assert np.allclose(np.arctan2(y, x)[:2], [0.5, -0.5])
     assert np.allclose(np.degrees(np.arcsin(z)), [10, -10, 90])
     path.write_text("azimuth_deg,elevation_deg\n0,0\n1,0\n")
-    [line] = import_whole(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
+    [line] = import_atomically(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
     assert line == "files without firing times (2 rays are fired in 0.1 s)"
     path.write_text("azimuth_deg,speed\n0,0\n")
     with pytest.raises(
         LidarError,
         match=r"mine\.csv cannot be converted to a scenario: it cannot be read as a sensor.*speed",
     ):
-        import_whole(import_sensor, path, tmp_path / "no", (), Scenario.load)
+        import_atomically(import_sensor, path, tmp_path / "no", (), Scenario.load)
     assert not (tmp_path / "no").exists()

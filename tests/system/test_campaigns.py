@@ -38,7 +38,7 @@ from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.identity.sealed import seal_json, unseal_json
-from lidarpool.report.campaign_output import verify
+from lidarpool.report.campaign_output import verify_dataset
 from lidarpool.run.progress import Progress
 from lidarsim.errors import explained
 from lidarsim.io.storage import Storage
@@ -139,7 +139,7 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
     run = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client)
     assert run.classes == sweeps(tmp_path / "ds").classes == names
     assert "| 40 road |" in (tmp_path / "ds/README.md").read_text()
-    assert verify(Storage.at(tmp_path / "ds")).endswith("is intact, with 2 jobs")
+    assert verify_dataset(Storage.at(tmp_path / "ds")).endswith("is intact, with 2 jobs")
     again = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client, overwrite=True)
     assert again.done == 2, "all files are known as the data set's own"
 

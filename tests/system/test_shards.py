@@ -21,7 +21,7 @@ from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.job_seconds import read_seconds
 from lidarpool.identity.sealed import seal_json, unseal_json
 from lidarpool.identity.shard import Shard
-from lidarpool.report.campaign_output import verify
+from lidarpool.report.campaign_output import verify_dataset
 from lidarsim.io.storage import Storage
 
 CAMPAIGN = """
@@ -257,11 +257,11 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
     with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume` to rewrite"):
         sweeps(parts[1])
     with pytest.raises(LidarError, match=r"jobs\.csv is damaged"):
-        verify(Storage.at(parts[1]))
+        verify_dataset(Storage.at(parts[1]))
     with Client(slots, set_as_default=False) as client:
         campaign = Campaign.load(parts[0].parent / "c.yaml")
         campaign.run(parts[1], client=client, resume=True, shard=(2, 3))
-    verify(Storage.at(parts[1]))
+    verify_dataset(Storage.at(parts[1]))
     assert table.read_text() == whole
 
 

@@ -1,1 +1,1 @@
-"""The command `lidarpool`."""
+"""The `lidarpool` command-line interface."""

@@ -1,7 +1,7 @@
-"""The command `lidarpool`.
+"""The `lidarpool` command.
 
-The modules of commands import within functions, so that help and completion are
-immediate: the imports of a run take a second.
+Command modules import heavy dependencies inside functions, so that help and shell completion
+respond immediately.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ..processes.logs import set_logs
 from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
-from .first_step import begin
+from .first_step import print_first_step
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from .terminal import Terminal
 
 PROGRAM = "lidarpool"
-PLUGINS = "lidarpool.commands"  # each is a click.Command
+PLUGINS = "lidarpool.commands"  # entry point group for click.Command objects
 
-# Common options of `demo` and `run`; each is a field of RunOptions.
+# Options of both `demo` and `run`. Many of them are fields of RunOptions.
 _common_options = shared.combine(
     shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
     click.option(
@@ -91,8 +91,8 @@ _common_options = shared.combine(
 )
 
 
-def _seconds(text: str) -> float:
-    """Parse a time such as 90, 90s, 10m or 2h."""
+def _parse_duration(text: str) -> float:
+    """Parse a duration such as 90, 90s, 10m or 2h, and return it in seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -104,9 +104,9 @@ def _seconds(text: str) -> float:
 
 
 def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Pass a Terminal and RunOptions to a command, and further options by their names.
+    """Pass a Terminal and RunOptions to a command, and all other options as keyword arguments.
 
-    The modules that workers need are imported meanwhile in the background.
+    A fork server imports the modules that workers require in the background.
     """
 
     @wraps(command)
@@ -127,7 +127,9 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if settings.get("pace") and not settings.get("live"):
             raise click.UsageError("`--pace` requires `--live`.")
         settings["extent"] = "pictures" if pictures else "cloud" if cloud_only else None
-        begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
+        print_first_step(
+            f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet
+        )
         from ..processes import timeline as steps
         from ..processes.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
@@ -148,7 +150,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             if cluster is not None:
                 run_settings = {"cluster": ClusterFile.load(cluster), "startup_timeout_s": QUEUE_S}
                 run_settings["worker_timeout_s"] = QUEUE_S
-            # A scenario may give the backend, too.
+            # The backend is passed separately, because the scenario may also specify it.
             names = {field.name for field in fields(RunOptions)} - {"backend"}
             run_settings |= {
                 name: value
@@ -160,7 +162,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             }
             terminal = Terminal(quiet, verbose, as_json)
             command(terminal, RunOptions(**run_settings), **further_settings)
-            terminal.end(strict=strict)
+            terminal.exit_if_warned(strict=strict)
         finally:
             stop_fork_server()
 
@@ -168,11 +170,12 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class _LiveCommand(click.Command):
-    """A command whose option --live may stand alone, also before an argument."""
+    """A command with an option --live whose value is optional, even before an argument."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the words of the command line, or for completion the words before the last."""
-        if ctx.resilient_parsing and args[-1:] == ["--live"]:  # the last may be its value
+        """Parse the arguments, inserting the default value of --live if it has no value."""
+        # The word that is being completed may be the value of --live.
+        if ctx.resilient_parsing and args[-1:] == ["--live"]:
             args = args[:-1]
         values = {PAGE, *VIEWERS}
         followers = [*args[1:], ""][: len(args)]
@@ -186,12 +189,15 @@ class _LiveCommand(click.Command):
 
 
 class _Commands(click.Group):
-    """The commands of this package, and the commands of plug-ins."""
+    """A command group that includes the commands of plug-ins."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a name.
+        """Return the command with this name, or None if there is none.
 
-        LidarError if the plug-in of the command cannot be used.
+        Raises
+        ------
+        LidarError
+            If the command belongs to a plug-in that cannot be used.
         """
         command = super().get_command(ctx, cmd_name)
         if command is None and (plugin := find_plugin(PLUGINS, cmd_name)) is not None:
@@ -199,18 +205,12 @@ class _Commands(click.Group):
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a command or option.
-
-        Plug-ins are named, and not imported.
-        """
+        """Complete the name of a command or option, without importing plug-ins."""
         items = super().shell_complete(ctx, incomplete)
         return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands for the help.
-
-        Plug-ins are named, and not imported.
-        """
+        """Write the list of commands in the help text, without importing plug-ins."""
         super().format_commands(ctx, formatter)
         rows = [
             (name, " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in plugins))
@@ -248,7 +248,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
     Examples:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..scenario.demo import demo_scenario
     from .run_command import run_scenario
 
@@ -282,7 +282,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
 @click.option(
     "--startup-timeout",
     "startup_timeout_s",
-    type=_seconds,
+    type=_parse_duration,
     metavar="TIME",
     help="Maximum time to wait for the scheduler and the workers at startup, such as 90s or 10m "
     f"(default: {WAIT_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
@@ -290,7 +290,7 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
 @click.option(
     "--worker-timeout",
     "worker_timeout_s",
-    type=_seconds,
+    type=_parse_duration,
     metavar="TIME",
     help="Maximum time to wait for new workers if a partition loses all its workers during the run "
     f"(default: {PATIENCE_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
@@ -327,10 +327,10 @@ def run(
       lidarpool run examples/campaign.yaml --out dataset
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarsim.io.storage import Storage
 
-    from ..report.campaign_output import verify
+    from ..report.campaign_output import verify_dataset
     from ..run.store.run_store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec
     from ..scenario.campaign_sections import is_campaign
@@ -343,7 +343,7 @@ def run(
         raise click.UsageError("`--retry-failed` cannot be combined with `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
-        click.echo(verify(Storage.at(scenarios[0])))
+        click.echo(verify_dataset(Storage.at(scenarios[0])))
         return
     options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
     is_several = len(paths) > 1
@@ -392,7 +392,7 @@ def merge(
     Examples:
       lidarpool merge part-* --out dataset
       lidarpool merge s3://lab/part-1 s3://lab/part-2 --out s3://lab/dataset
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..report.merging import merge as merge_shards
     from .terminal import Terminal
 
@@ -402,7 +402,7 @@ def merge(
     jobs = f"{plural(report['jobs']['done'], 'job')}, " if "jobs" in report else ""
     lines = [*screen.notes(report["notes"]), f"{jobs}{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
-    screen.end(strict=strict)
+    screen.exit_if_warned(strict=strict)
 
 
 @cli.command()
@@ -415,11 +415,11 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     Examples:
       lidarpool doctor
       lidarpool doctor --scheduler tcp://127.0.0.1:8786
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from poolpart import Pool
 
     from ..run.cluster.connection import connected
-    from .doctor import advice_in_words, examine, find_cluster_fault, in_words
+    from .doctor import advice_line, check_environment, find_cluster_fault, result_lines
 
     found: Iterable[WorkerInfo] = ()
     fault = ""
@@ -429,9 +429,9 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             found = pool.workers
             fault = find_cluster_fault(pool)
     workers = sorted(found, key=lambda worker: (sorted(worker.resources), worker.name))
-    figures = examine(fault)
+    figures = check_environment(fault)
     figures["workers"] = [asdict(worker) for worker in workers]
-    lines = in_words(figures)
+    lines = result_lines(figures)
     if scheduler is not None:
         hosts = plural(len({worker.host for worker in workers}), "host")
         lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
@@ -445,12 +445,16 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{plural(len(worker.gpus), 'GPU')}"
         )
-    lines.append(advice_in_words(figures))
+    lines.append(advice_line(figures))
     shared.show(figures, lines, as_json)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command and exit: 0 done, 1 --strict, 2 an error of the user's, 130 interrupted."""
+    """Run the command and exit the process.
+
+    The exit code is 0 for success, 1 for warnings with --strict, 2 for errors that the user can
+    correct, and 130 for an interrupt. Other exceptions are defects and are not caught.
+    """
     interrupt_on_signals()
     set_logs(shown=False)
     try:
@@ -458,25 +462,25 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
     except (KeyboardInterrupt, click.Abort) as error:
-        _die(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
+        _exit_with_message(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
     except Exception as error:
-        if (message := _explanation(error)) is None:  # a defect
+        if (message := _user_error_message(error)) is None:  # a defect
             raise
-        _die(message, error)
+        _exit_with_message(message, error)
     sys.exit(0)
 
 
-def _explanation(error: Exception) -> str | None:
-    """Return the message for an error that users can correct, or None for a defect."""
+def _user_error_message(error: Exception) -> str | None:
+    """Return the message for an error that the user can correct, or None for a defect."""
     match error:
         case click.MissingParameter():
             usage = error.ctx.get_usage() if error.ctx else ""
-            message = " ".join(error.format_message().split())  # click gives each choice a line
+            message = " ".join(error.format_message().split())  # Click lists choices on new lines
             return f"{message}\n{usage}"
         case click.ClickException():
             return error.format_message()
         case OSError(filename=str() | Path() as name):
-            # No file can have this name, or its folder may not be read.
+            # The file name is invalid, or access was denied.
             return f"{name} cannot be accessed: {error.strerror}. Use another file or folder."
         case MemoryError():
             return "Not enough memory. Use a smaller scene, fewer scans or a larger keep_every."
@@ -490,7 +494,7 @@ def _explanation(error: Exception) -> str | None:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """Return the notes of an error or its cause: on kept results, and on how to continue."""
+    """Return the notes of an error or of its cause, such as how to resume the run."""
     while error is not None:
         if notes := getattr(error, "__notes__", []):
             return list(notes)
@@ -498,10 +502,10 @@ def _notes(error: BaseException | None) -> list[str]:
     return []
 
 
-def _die(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
-    """Print a message with the notes of an error, and end the process."""
+def _exit_with_message(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
+    """Print a message and the notes of an error to stderr, and exit the process."""
     message = " ".join([message, *_notes(error)])
-    # Names may come from files, and control characters would reach the terminal.
+    # Names from files may contain control characters, which must not reach the terminal.
     message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)
     click.echo(f"lidarpool: {message}", err=True)
     sys.exit(code)

@@ -1,7 +1,7 @@
-"""Completion of the values of options and arguments by the shell.
+"""Shell completion of option values and arguments.
 
-Values are from tables that are quick to import. Plug-ins are looked up only for words that no table
-completes, because a look-up takes as long as half of a completion.
+Values come from tables that are quick to import. Plug-ins are only looked up for words that no
+table completes, because the lookup takes about half the time of a completion.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Items = list[CompletionItem]
 
 
 def starting_with(incomplete: str, names: Iterable[str]) -> Items:
-    """Return the names that begin with a word."""
+    """Return completion items for the names that start with the incomplete word."""
     return [CompletionItem(name) for name in names if name.startswith(incomplete)]
 
 
@@ -40,8 +40,8 @@ def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
     if not matches:
         with suppress(LidarError):
             matches = starting_with(incomplete, plugin_model_names(incomplete))
-    # The shell completes names of files itself. bash does so only if nothing else matches, and
-    # forgets the items before.
+    # The shell completes file names itself. bash only does so if there are no other matches, and
+    # discards the items before this one.
     return [CompletionItem(incomplete, type="file"), *matches]
 
 
@@ -52,25 +52,25 @@ def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def colors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a column that colors points."""
+    """Complete the name of a column by which points can be colored."""
     del ctx, param
     return starting_with(incomplete, (*ALWAYS_COLUMNS, *OPTIONAL_COLUMNS, *COMPOSED_COLUMNS))
 
 
 def formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the last of several formats of clouds that commas separate."""
+    """Complete the last cloud format in a comma-separated list."""
     del ctx, param
     return _in_list(incomplete, EXPORTS) or _in_list(incomplete, _plugin_formats())
 
 
 def format_name(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a format of clouds."""
+    """Complete the name of a cloud format."""
     del ctx, param
     return starting_with(incomplete, EXPORTS) or starting_with(incomplete, _plugin_formats())
 
 
 def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a format of sensors, with --out a format that has its ending."""
+    """Complete the name of a sensor format that matches the file extension of --out, if any."""
     del param
     file = ctx.params.get("out")
     rows = [row for row in FORMATS if file is None or file.suffix.lower() in row.endings]
@@ -78,7 +78,7 @@ def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def sensor_file(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the ending of a sensor's file, with --as of its format, or the name of a file."""
+    """Complete the extension of an exported sensor file according to --as, or a file name."""
     del param
     stem, dot, _ = incomplete.rpartition(".")
     name = ctx.params.get("file_format")
@@ -91,7 +91,7 @@ def sensor_file(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
 
 
 def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a bridge of `play`."""
+    """Complete the name of a playback bridge."""
     del ctx, param
     return starting_with(incomplete, BRIDGES)
 
@@ -105,7 +105,7 @@ def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
 
 
 def _in_list(incomplete: str, names: Iterable[str]) -> Items:
-    """Complete the last of several names, with the names before it."""
+    """Complete the last name in a comma-separated list, excluding names that were already used."""
     before, comma, last = incomplete.rpartition(",")
     used = before.split(",")
     unused = [name for name in names if name not in used]
@@ -113,7 +113,6 @@ def _in_list(incomplete: str, names: Iterable[str]) -> Items:
 
 
 def _plugin_formats() -> Iterator[str]:
-    """Yield the formats of plug-ins."""
     from lidarsim.environment.plugins import plugins_of
 
     yield from plugins_of(GROUP)

@@ -1,4 +1,4 @@
-"""Examination of an environment, and the fault to fix first."""
+"""Check the installation, the machine and a cluster, and determine which problem to fix first."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from ..report.report import versions
 from ..run.cluster.checks import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR
 from ..scenario.sections import TaskOptions
-from .installed_copies import second_copy
+from .installed_copies import find_second_copy
 
 READY = "ready"
 FREE = "free"
-# {port of this machine: what listens there}
+# {port: program that uses it by default}
 PORTS = {
     80: "HTTP interface of `lidarpool play`",
     8765: "Foxglove",
@@ -43,14 +43,15 @@ PORTS = {
 }
 _FOR_DEVELOPERS = ("bench", "dev", "docs", "lint")
 _GIB = 2**30
-_MIN_MEMORY_GIB = 2.0  # least memory of a small run with its three processes
+_MIN_MEMORY_GIB = 2.0  # minimum memory for a small run with its three processes
 _MIN_DISK_GIB = 1.0
 
 
-def examine(cluster_fault: str = "") -> dict[str, Any]:
-    """Return the findings as plain data for JSON, with `fix_first` "" without a fault.
+def check_environment(cluster_fault: str = "") -> dict[str, Any]:
+    """Check the environment and return the results as plain data for JSON.
 
-    `cluster_fault` is the result of `find_cluster_fault`, or "" without a cluster.
+    The entry `fix_first` is an empty string if no problems were found. `cluster_fault` is the
+    result of `find_cluster_fault`, or an empty string if there is no cluster.
     """
     figures: dict[str, Any] = {
         "versions": versions(),
@@ -67,7 +68,7 @@ def examine(cluster_fault: str = "") -> dict[str, Any]:
         "backends": {name: reason or READY for name, reason in available_backends().items()},
         "open3d": _open3d_state(),
         "extras": _extras(),
-        "second_copy": second_copy(),
+        "second_copy": find_second_copy(),
         "cluster_fault": cluster_fault,
         "ports": {str(port): _port_state(port) for port in PORTS},
     }
@@ -75,7 +76,10 @@ def examine(cluster_fault: str = "") -> dict[str, Any]:
 
 
 def find_cluster_fault(pool: Pool) -> str:
-    """Return why the workers of a cluster cannot run a scenario with default options, or ""."""
+    """Return the reason why the workers of a cluster cannot run a scenario with default options.
+
+    Return an empty string if they can.
+    """
     purpose = dict.fromkeys((GPU, LIDAR), "for a run with default options")
     try:
         pool.require(slots_needed(TaskOptions(), planning=False), purpose)
@@ -85,7 +89,7 @@ def find_cluster_fault(pool: Pool) -> str:
 
 
 def _open3d_state() -> str:
-    """Return `READY`, or why Open3D does not load."""
+    """Return READY, or the reason why Open3D cannot be loaded."""
     try:
         load_open3d()
     except LidarError as error:
@@ -94,7 +98,7 @@ def _open3d_state() -> str:
 
 
 def _extras() -> dict[str, str]:
-    """Return the state of each extra by its name: `READY`, or the command of the checkout."""
+    """Return the state of each optional extra: READY, or the command that installs it."""
     try:
         names = metadata("lidarpool").get_all("Provides-Extra") or []
     except PackageNotFoundError:  # a checkout that is not installed
@@ -115,7 +119,6 @@ def _extras() -> dict[str, str]:
 
 
 def _is_installed(requirement: Requirement) -> bool:
-    """Return whether a version of a distribution is installed that a requirement allows."""
     try:
         return requirement.specifier.contains(version(requirement.name), prereleases=True)
     except PackageNotFoundError:
@@ -123,7 +126,7 @@ def _is_installed(requirement: Requirement) -> bool:
 
 
 def _port_state(port: int) -> str:
-    """Return whether this process may listen at a port of the loopback interface."""
+    """Return whether this process can listen on a port of the loopback interface."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -134,12 +137,12 @@ def _port_state(port: int) -> str:
 
 
 def _fix_first(figures: dict[str, Any]) -> str:
-    """Return the most urgent advice, or "" without a fault."""
+    """Return the most urgent advice, or an empty string if there is none."""
     return next(_advice(figures), "")
 
 
 def _advice(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield advice, the most urgent first."""
+    """Yield advice in order of urgency."""
     machine = figures["machine"]
     backends = figures["backends"]
     if figures["open3d"] != READY:
@@ -167,8 +170,8 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
         yield figures["second_copy"]
 
 
-def in_words(figures: dict[str, Any]) -> list[str]:
-    """Return the lines of a report for a terminal."""
+def result_lines(figures: dict[str, Any]) -> list[str]:
+    """Return the results of `check_environment` as lines of text."""
     machine = figures["machine"]
     disks = ", ".join(f"{free:.1f} GiB in {name}" for name, free in machine["disk_gib"].items())
     memory = f"{machine['memory_gib']:.1f} GiB, {machine['available_memory_gib']:.1f} GiB available"
@@ -192,7 +195,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
     return lines
 
 
-def advice_in_words(figures: dict[str, Any]) -> str:
-    """Return the last line of the report: the fault to fix first."""
+def advice_line(figures: dict[str, Any]) -> str:
+    """Return the last line of the text output, which states what to fix first."""
     advice = figures["fix_first"]
     return f"fix first: {advice}." if advice else "No problems were found."

@@ -1,7 +1,7 @@
-"""What a command prints before the modules that do its work are imported, and while they compile.
+"""Print the first progress message of a command before slow imports start.
 
-Imports take a second or two, in a new installation half a minute, as raybeam and lidarsim compile
-their loops.
+Imports take one or two seconds. In a new installation they take half a minute, because raybeam and
+lidarsim compile their loops.
 """
 
 from __future__ import annotations
@@ -12,36 +12,37 @@ import time
 
 import click
 
-_COMPILER = logging.getLogger("raybeam.compiled")  # logger of a module that is not imported yet
+_COMPILER = logging.getLogger("raybeam.compiled")  # the module itself may not be imported yet
 
 
 class _Lines(logging.Handler):
-    """Writes messages as the lines of a command's progress."""
+    """Logging handler that writes messages as progress lines."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a message."""
+        """Write the message of a log record."""
         _write(record.getMessage())
 
 
 _LINES = _Lines()
 
 
-def begin(step: str, *, quiet: bool = False) -> None:
-    """Print the first step of a command that is not at a terminal, where a status follows.
+def print_first_step(step: str, *, quiet: bool = False) -> None:
+    """Print the first step of a command, and report when loops are being compiled.
 
-    Unless the command is quiet, it also prints that loops are compiled, if they are.
+    The step is only printed if stderr is not a terminal. A terminal shows a status instead. A
+    `quiet` command prints neither.
     """
     _COMPILER.removeHandler(_LINES)
     if quiet or sys.stderr is None:
         return
     if not sys.stderr.isatty():
         _write(step)
-    # A command drops the logs of libraries: this message is the command's own.
+    # Commands suppress the log messages of libraries. This message is an exception.
     _COMPILER.isEnabledFor = lambda level: level >= logging.INFO  # type: ignore[method-assign]
     _COMPILER.propagate = False
     _COMPILER.addHandler(_LINES)
 
 
 def _write(line: str) -> None:
-    """Write a line with the time of day to stderr."""
+    """Write a line with the current time to stderr."""
     click.echo(f"{time.strftime('%H:%M:%S')}  {line}", err=True)

@@ -1,4 +1,4 @@
-"""Output of `lidarpool check`: the forecast of a survey, or of some jobs of a campaign."""
+"""Output of `lidarpool check`: estimates for a survey, or for sample jobs of a campaign."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
 
-FORECAST_JOBS = 5  # number of jobs of a campaign
+FORECAST_JOBS = 5  # number of campaign jobs that are checked
 _JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
 
 
@@ -47,14 +47,34 @@ def forecast_scenario(
     *,
     quiet: bool,
 ) -> tuple[dict[str, Any], Iterator[str]]:
-    """Forecast the run of a scenario, of a campaign or of a job of a campaign.
+    """Estimate the points, memory and disk space of a run.
 
-    `of_mesh` are arguments of `mesh_data`. Some jobs of a campaign are forecast, among them the
-    first and the last; jobs of campaigns plan no paths.
+    Parameters
+    ----------
+    path
+        Scenario, mesh or campaign file. For a campaign, evenly spaced jobs including the first and
+        the last are checked, without path planning.
+    of_mesh
+        Arguments of `mesh_data`.
+    number
+        Number of the campaign job to check. By default, several jobs are checked.
+    client
+        Client of a running cluster, if there is one.
+    out
+        Output folder of the run.
+    options, backend
+        Options of the run, and the ray-casting backend if the user has selected one.
+    quiet
+        Whether to suppress progress messages.
 
     Returns
     -------
     Plain data for JSON, and the same data as lines of text.
+
+    Raises
+    ------
+    LidarError
+        If the scenario is invalid, or if `number` is passed for a file that is not a campaign.
     """
     campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
@@ -63,14 +83,13 @@ def forecast_scenario(
         )
 
     terminal = Terminal(quiet)
-    has_jobs = campaign is not None and number is None  # each with a folder of its own
+    has_jobs = campaign is not None and number is None  # each job has a separate output folder
 
     def forecast_job(job_number: int = 0) -> tuple[Job, dict[str, Any]]:
-        """Return a job and the figures of its forecast."""
         scenario = (
             Scenario.load(path, of_mesh) if campaign is None else campaign.scenario(job_number)
         )
-        assert scenario is not None, "of a file"
+        assert scenario is not None, "a campaign that was read from a file has a scenario"
         with terminal.status("reading the scene", logged=False):
             prepared = prepare(scenario, plans=campaign is None)
             job = prepared.job
@@ -105,15 +124,15 @@ def forecast_scenario(
 def _campaign_figures(
     campaign: CampaignSpec, out: Path | Storage, forecast_job: Callable[[int], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return the figures of some jobs of a campaign.
+    """Return estimates for a campaign, based on evenly spaced jobs.
 
-    `forecast_job` returns the figures of one.
+    `forecast_job` returns the estimates for a single job.
     """
     campaign.check_files()
     jobs: list[dict[str, Any]] = []
     notes: list[str] = []
     warnings: list[str] = []
-    errors: list[tuple[str, str]] = []  # name of a job, and an error
+    errors: list[tuple[str, str]] = []  # (job name, error)
     last = campaign.count - 1
     numbers = dict.fromkeys(last * i // (FORECAST_JOBS - 1) for i in range(FORECAST_JOBS))
     for job_number in numbers:
@@ -145,7 +164,7 @@ def _campaign_figures(
 
 
 def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -> dict[str, Any]:
-    """Return the figures of a job of a campaign, for JSON."""
+    """Return the JSON entry for a campaign job."""
     return {
         "number": number,
         "name": campaign.name(number),
@@ -156,14 +175,13 @@ def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -
 
 
 def _holds_files(folder: Path | Storage) -> bool:
-    """Return whether the output folder contains files."""
     with suppress(NotADirectoryError):
         return bool(Storage.at(folder).entries())
     return False
 
 
 def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the forecast of a campaign as lines of text."""
+    """Yield the estimates for a campaign as lines of text."""
     data_set = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
     yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, stored as {data_set}"
     for name, words in campaign.choices.items():
@@ -173,7 +191,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         yield f"splits      {shares}"
     yield f"checked     {figures['checked']:,} of {plural(campaign.count, 'job')}"
     for job in figures["jobs"]:
-        yield f"job         {_in_words(job)}"
+        yield f"job         {_describe_job(job)}"
         points = ""
         if job["estimate"]:
             points = f", about {job['estimate']['points']:,} points"
@@ -204,8 +222,8 @@ def _remarks(figures: dict[str, Any]) -> Iterator[str]:
         yield f"warning: {warning}"
 
 
-def _in_words(job: dict[str, Any]) -> str:
-    """Return name, split and values of a job."""
+def _describe_job(job: dict[str, Any]) -> str:
+    """Return the name, the split and the varied values of a job as text."""
     shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
     shown = {k: "none" if v is None else v for k, v in shown.items()}
     values = ", ".join(f"{name} {value}" for name, value in shown.items())
@@ -214,21 +232,21 @@ def _in_words(job: dict[str, Any]) -> str:
 
 
 def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the forecast of a survey as lines of text."""
+    """Yield the estimates for a survey as lines of text."""
     if "job" in figures:
-        yield f"job         {_in_words(figures['job'])}"
+        yield f"job         {_describe_job(figures['job'])}"
     yield from _scene_lines(figures)
     yield from _survey_lines(job, figures)
     if drive := figures["drive"]:
         yield from _drive_lines(drive)
     yield from _return_lines(job, figures)
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
-    yield from _need_lines(figures)
+    yield from _resource_lines(figures)
     yield from _remarks(figures)
 
 
 def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield objects, files, size and masks of the scene."""
+    """Yield lines about the objects, files, size and masks of the scene."""
     yield f"scene       {', '.join(plural(figures[f'{n}s'], n) for n in ('object', 'triangle'))}"
     for file, content in figures["sources"].items():
         yield f"file        {file}: {content}"
@@ -244,7 +262,7 @@ def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield scans, poses and rays of the survey."""
+    """Yield lines about the scans, poses and rays of the survey."""
     sensor = job.survey.sensor
     pattern = f"{sensor.channels:,} per firing"
     if len(job.survey.carried) > 1:
@@ -265,7 +283,7 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
-    """Yield the length of the trajectory, and the firings of each sensor."""
+    """Yield lines about the length of the trajectory and the firings of each sensor."""
     lines = drive["lines"]
     of_lines = ""
     if lines:
@@ -285,7 +303,7 @@ def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
 
 
 def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the reported returns, the extinction of air, and the estimated number of points."""
+    """Yield lines about the returns, the atmospheric extinction and the number of points."""
     survey = job.survey
     returns = survey.returns_each[0]
     if figures["drive"] or returns != type(returns)():
@@ -303,15 +321,15 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _need_lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the workers, slots, memory and disk that the run needs."""
+def _resource_lines(figures: dict[str, Any]) -> Iterator[str]:
+    """Yield lines about the workers, slots, memory and disk space that the run requires."""
     backend = figures["backend"]
     device = {None: "backend not yet known", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
     yield f"cast by     {plural(figures['casters'], 'casting worker')} ({device})"
     for name, slots in figures["slots"].items():
         label = name
         partition = ""
-        if name == GPU:  # the partition is called GPU, also where its workers have no GPU
+        if name == GPU:  # the name of the partition, even if its workers have no GPU
             label = "casting"
             partition = " in partition GPU"
         count = plural(slots["there"], "slot")

@@ -1,4 +1,4 @@
-"""Surveys of other programs as scenarios, by plug-ins."""
+"""Convert surveys from other programs to scenarios, using plug-ins for additional formats."""
 
 from __future__ import annotations
 
@@ -14,65 +14,65 @@ from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.words import printable
 
-# Names are tags of the outermost elements of XML files, without namespaces, or endings of other
-# files.
+# Entry point group of importers. The name of an entry point is the root tag of an XML file, without
+# its namespace, or the extension of any other file.
 GROUP = "lidarpool.importers"
 SCENARIO_FILE = "scenario.yaml"
-_HELIOS = "document"  # root of a survey of HELIOS++
-_MUJOCO = "mujoco"  # root of a model of MuJoCo
+_HELIOS = "document"  # root tag of a HELIOS++ survey
+_MUJOCO = "mujoco"  # root tag of a MuJoCo model
 
-# Arguments: a survey, the folder for SCENARIO_FILE and further files, and folders where references
-# start. Returns the features that are not supported, a line each.
+# The arguments of an importer are the survey, the folder for SCENARIO_FILE and all other files, and
+# the folders in which references are resolved. It returns one line for each unsupported feature.
 Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
-def importer_of(survey: Path) -> Plugin | None:
+def find_importer(survey: Path) -> Plugin | None:
     """Return the plug-in that imports a survey.
 
-    Returns None for surveys that lidarpool imports itself, and for unknown files.
+    Returns None for formats that lidarpool imports itself, and for unknown formats.
 
     Raises
     ------
     LidarError
-        If two plug-ins import the survey.
+        If two plug-ins support the same format.
     """
-    name = _kind_of(survey)
+    name = _format_key(survey)
     return None if name in (_HELIOS, _MUJOCO) else find_plugin(GROUP, name)
 
 
 def is_mujoco_model(survey: Path) -> bool:
-    """Return True if a file is a model of MuJoCo."""
-    return _kind_of(survey) == _MUJOCO
+    """Return True if a file is a MuJoCo model."""
+    return _format_key(survey) == _MUJOCO
 
 
-def _kind_of(survey: Path) -> str:
-    """Return the tag of the outermost element of XML without a namespace, else the ending."""
+def _format_key(survey: Path) -> str:
+    """Return the root tag of an XML file without its namespace, or the file extension."""
     with suppress(OSError, LidarError, ValueError):
         return parse_lenient_xml(read_input(survey)).tag.rpartition(":")[2]
     return survey.suffix.lower()
 
 
-def import_by(
+def import_with_plugin(
     plugin: Plugin,
     survey: Path,
     folder: Path,
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
-    """Write a survey as a scenario by a plug-in.
+    """Convert a survey to a scenario with a plug-in.
 
-    Raises the errors of `import_whole`.
+    The other arguments and the result are those of `import_atomically`.
 
     Raises
     ------
     LidarError
-        Also if the plug-in fails.
+        If the plug-in fails, or if the import fails for another reason.
     """
     load: Importer = plugin.load(Callable)  # type: ignore[arg-type]
 
     def write(survey: Path, partial: Path, assets: Sequence[Path]) -> list[str]:
         try:
-            left_out = [*map(str, load(survey, partial, assets))]
+            unsupported = [*map(str, load(survey, partial, assets))]
         except LidarError:
             raise
         except Exception as error:  # a plug-in may raise anything
@@ -80,44 +80,56 @@ def import_by(
             raise LidarError(f"{plugin} failed: {reason}.") from error
         if not (partial / SCENARIO_FILE).is_file():
             raise LidarError(f"{plugin} did not write {SCENARIO_FILE}.")
-        return left_out
+        return unsupported
 
-    return import_whole(write, survey, folder, assets, check)
+    return import_atomically(write, survey, folder, assets, check)
 
 
-def import_whole(
+def import_atomically(
     write: Importer,
     survey: Path,
     folder: Path,
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
-    """Write a survey as a scenario into a new folder, completely or not at all.
+    """Convert a survey to a scenario in a new folder.
 
-    `write` writes the files; `check` reads the scenario and raises LidarError for a scenario that
-    cannot be simulated.
+    If the conversion fails, no files are left behind.
+
+    Parameters
+    ----------
+    write
+        Function that writes the scenario and its files.
+    survey
+        File of the survey.
+    folder
+        Output folder, which must not exist.
+    assets
+        Folders in which references in the survey are resolved.
+    check
+        Function that reads the scenario file, and raises LidarError if it cannot be simulated.
 
     Returns
     -------
-    The features that are not supported.
+    One line for each feature of the survey that is not supported.
 
     Raises
     ------
     LidarError
-        If the folder exists, the survey cannot be written, or the scenario is refused.
+        If the folder exists, the survey cannot be converted, or the scenario is invalid.
     """
     if folder.exists():
         raise LidarError(f"{folder} already exists. Pass another folder with `--out`.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        left_out = [*write(survey, partial, assets)]
+        unsupported = [*write(survey, partial, assets)]
         check(partial / SCENARIO_FILE)
-        partial.chmod(0o755)  # temporary folders are their owner's alone
+        partial.chmod(0o755)  # temporary folders are only accessible to their owner
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
         raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return left_out
+    return unsupported

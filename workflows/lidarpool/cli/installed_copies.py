@@ -1,4 +1,4 @@
-"""Copies of lidarpool's packages beside each other, of which Python imports only one."""
+"""Detect multiple installed copies of lidarpool's packages, of which Python imports only one."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ..identity.software import PACKAGES
 _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 
 
-def second_copy() -> str:
-    """Return advice if there is a second copy of the packages, or ""."""
+def find_second_copy() -> str:
+    """Return advice if there is a second copy of the packages, otherwise an empty string."""
     roots = {name: root for name in PACKAGES if (root := _root_of(name)) is not None}
     root = roots.get("lidarpool")
     if root is None:
@@ -56,13 +56,13 @@ def _root_of(package: str) -> Path | None:
 
 
 def _is_chosen(root: Path, environment: Mapping[str, str]) -> bool:
-    """Return whether the user has put a checkout on PYTHONPATH."""
+    """Return True if the user has added a checkout to PYTHONPATH."""
     entries = environment.get("PYTHONPATH", "").split(os.pathsep)
     return any(Path(entry).resolve().is_relative_to(root) for entry in entries if entry)
 
 
 def _editable_checkout() -> Path | None:
-    """Return the checkout that is installed as editable."""
+    """Return the checkout of an editable installation, if there is one."""
     try:
         text = distribution("lidarpool").read_text("direct_url.json")
     except PackageNotFoundError:
@@ -74,7 +74,7 @@ def _editable_checkout() -> Path | None:
 
 
 def _checkout_of(folder: Path) -> Path | None:
-    """Return the checkout that a folder is in."""
+    """Return the checkout that contains a folder, if there is one."""
     for candidate in (folder.resolve(), *folder.resolve().parents):
         if (candidate / "workflows" / "lidarpool" / "__init__.py").is_file():
             return candidate

@@ -1,4 +1,4 @@
-"""The command `play`: results, scenarios and recordings as live sensors."""
+"""The `lidarpool play` command, which plays back results and simulates scenarios in real time."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lidarsim.io.storage import Storage
 from ..clouds.format_table import LAYOUTS
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 
 _PACKETS = "packets"
-_NOW_NS = 2_000_000_000  # time between reading the source and the first sweep of --now, to prepare
+_NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, with --now
 
 
 @click.command()
@@ -104,8 +104,8 @@ def play(
       lidarpool play packets/lidar.pcap --as packets --rate 0.5
       lidarpool play drive.yaml --as ros2 --layout ouster --organized
       lidarpool play drive --as foxglove --loop
-    """  # noqa: D301 - click wants the character, not its name
-    begin("reading the source")
+    """  # noqa: D301 - Click requires the character \b
+    print_first_step("reading the source")
     from lidarsim.packets.capture import ENDINGS
 
     from ..playback.bridge import BridgeOptions, bridge_class
@@ -127,7 +127,7 @@ def play(
             raise click.UsageError(
                 "`--now` cannot be used with recorded packets, which contain their timestamps."
             )
-        options.refuse_mesh_options(of_mesh, source)
+        options.reject_mesh_options(of_mesh, source)
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return
     with ExitStack() as stack:
@@ -141,7 +141,7 @@ def play(
             sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, bridge_settings)
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
-        with _summarized(lambda: bridge.summary), bridge:
+        with _summary_at_end(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
             click.echo(f"ready: {bridge.description}. Press Ctrl-C to stop.")
             play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
@@ -150,7 +150,7 @@ def play(
 def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
-    """Play a recording of packets."""
+    """Play back recorded packets."""
     from ..playback.pcap_recording import PcapRecording, play_recording, recorded_streams
     from ..playback.transmitter import Transmitter
     from .terminal import Terminal
@@ -161,14 +161,14 @@ def _play_recording(
         terminal.tell(note)
     streams = recorded_streams(recording, to, settings.get("api", ()))
     transmitter = Transmitter(streams, terminal.tell, settings.get("lateness"))
-    with _summarized(lambda: transmitter.summary), transmitter:
+    with _summary_at_end(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}. Press Ctrl-C to stop.")
         play_recording(recording, transmitter, schedule, loop=loop)
 
 
 @contextmanager
-def _summarized(summary: Callable[[], str]) -> Iterator[None]:
-    """Print a summary once the body has ended, by Ctrl-C too."""
+def _summary_at_end(summary: Callable[[], str]) -> Iterator[None]:
+    """Print a summary when the body ends, including when it is interrupted with Ctrl-C."""
     try:
         yield
     except KeyboardInterrupt as error:

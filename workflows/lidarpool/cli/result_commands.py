@@ -1,4 +1,4 @@
-"""The commands for results and recordings: `plot`, `export`, `view`, `compare` and `fit`."""
+"""Commands for results and recordings: `plot`, `export`, `view`, `compare` and `fit`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from ..clouds.writing import ExportSpec
 
 
-def _size(text: str) -> tuple[int, int]:
-    """Parse width and height in pixels from a text such as 1600x1000."""
+def _parse_size(text: str) -> tuple[int, int]:
+    """Parse a picture size in pixels, such as 1600x1000."""
     if match := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
         return int(match[1]), int(match[2])
     raise click.BadParameter(
@@ -33,15 +33,18 @@ def _size(text: str) -> tuple[int, int]:
 
 
 class _FormatName(click.Choice[str]):
-    """A format of the table, or of a plug-in."""
+    """Parameter type for the name of an output format, built in or from a plug-in."""
 
     def __init__(self) -> None:
         super().__init__(EXPORTS)
 
     def convert(self, value: str, param: Any, ctx: Any) -> str:
-        """Return the name of a format.
+        """Check the name of a format and return it.
 
-        LidarError for an unknown format, or a plug-in that cannot be used.
+        Raises
+        ------
+        LidarError
+            If the format is unknown, or if it belongs to a plug-in that cannot be used.
         """
         if value in EXPORTS or value == "ply":
             return super().convert(value, param, ctx)
@@ -59,7 +62,7 @@ class _FormatName(click.Choice[str]):
 )
 @click.option(
     "--size",
-    type=_size,
+    type=_parse_size,
     metavar="WxH",
     default="1600x1000",
     show_default=True,
@@ -81,7 +84,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     Examples:
       lidarpool plot lidarpool-out
       lidarpool plot lidarpool-out --only cloud --color intensity --size 2400x1500 --out figures
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..clouds.folder import local_folder, local_result, upload
@@ -171,7 +174,7 @@ def export(
     Examples:
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarsim.columns.cloud_file import CloudFile
     from lidarsim.sweeps.instruments import INSTRUMENT_FILES
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -179,7 +182,7 @@ def export(
 
     from ..clouds.folder import local_result, result_folder, upload
 
-    # The report of a result is moved into place last.
+    # report.json is written last, so it marks a complete result.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
     target = result if out is None else out
     if isinstance(result, Path) and result.is_file():
@@ -194,12 +197,12 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        specs = _chosen_specs(formats, **settings)
+        specs = _make_export_specs(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
-            for chosen in specs:  # before any is written, which may take long
+            for chosen in specs:  # reports errors before any file is written
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
-                _check_free(target, chosen.row.file, overwrite=overwrite)
+                _check_not_existing(target, chosen.row.file, overwrite=overwrite)
             try:
                 for chosen in specs:
                     file = folder / chosen.row.file
@@ -210,7 +213,7 @@ def export(
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     if full_scale is not None:
-                        _tell(f"{chosen.title} stores the intensity {full_scale:g} as 65,535")
+                        _print_note(f"{chosen.title} stores the intensity {full_scale:g} as 65,535")
                     click.echo(written[-1])
             except (LidarError, KeyboardInterrupt) as error:
                 if written:
@@ -218,8 +221,8 @@ def export(
                 raise
 
 
-def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
-    """Raise LidarError if a storage holds a file that must not be overwritten."""
+def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
+    """Raise LidarError if a storage contains a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
             f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "
@@ -227,10 +230,10 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
         )
 
 
-def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
-    """Return formats with the options that each supports.
+def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
+    """Return the export specifications of formats, each with the options that it supports.
 
-    An option that none of the formats supports goes to all of them, which refuse it.
+    An option that none of the formats supports is passed to all of them, so that it is rejected.
     """
     from ..clouds.writing import ExportSpec
 
@@ -254,11 +257,8 @@ def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[Exp
     ]
 
 
-def _tell(note: str) -> None:
-    """Print a note.
-
-    `Terminal.tell` would import Dask, and a view does not wait for Dask.
-    """
+def _print_note(note: str) -> None:
+    """Print a note without importing Dask, which `Terminal.tell` would require."""
     click.echo(f"note: {note}", err=True)
 
 
@@ -303,7 +303,7 @@ def view(
       lidarpool view recording.mcap --no-browser
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
     from lidarview.picture_file import PICTURE_FILE
     from lidarview.viewer.result_views import show_view
@@ -320,12 +320,12 @@ def view(
                 f"{data_sets[0]} is a data set with several jobs. View it on its own, without "
                 "`--film` and `--export`."
             )
-        options.refuse_mesh_options(of_mesh, data_sets[0])
+        options.reject_mesh_options(of_mesh, data_sets[0])
         from ..pages.job_list import JobList, show_jobs
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
-    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _tell}
+    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _print_note}
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
@@ -420,7 +420,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
       lidarpool compare result recording.mcap --sensor-b /lidar/points --out compared
       lidarpool compare scan.laz earlier.laz --distance 0.05
       lidarpool compare scan.laz model.ply --unit-b ft
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..comparing.two_clouds import compare as compared
     from ..processes.fork_server import keep_freed_memory
 
@@ -471,7 +471,7 @@ def fit(
       lidarpool fit sweeps --white-intensity 255 --out mine.yaml
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
       lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..comparing.fit import fit as fitted
     from ..processes.fork_server import keep_freed_memory
 

@@ -1,4 +1,4 @@
-"""The commands `run` and `demo` without their options: surveys, campaigns and their output."""
+"""Implementation of the commands `run` and `demo`."""
 
 from __future__ import annotations
 
@@ -25,10 +25,15 @@ from ..datasets.job_table import Tally, read_table
 from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
-from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
+from ..report.campaign_output import (
+    CAMPAIGN_FILE,
+    check_same_campaign,
+    describe_failures,
+    verify_dataset,
+)
 from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import CLOUD, SurveyOutput, run_survey
-from ..report.report import summary
+from ..report.report import summarize_report
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
@@ -57,11 +62,16 @@ def run_scenario(
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    With a `shard`, the run stays, and stores `made_of` with it. LidarError if the run fails; notes
-    of the error say what was kept.
+    If a `shard` is selected, only its scans are run. The run store is kept for a later merge, and
+    `made_of` is saved in it.
+
+    Raises
+    ------
+    LidarError
+        If the run fails. Notes of the error describe the results that were kept.
     """
     options = options.with_pool(scenario.pool, {"backend": backend})
-    for output_format in scenario.output.write:  # before reading the scene, which may take long
+    for output_format in scenario.output.write:  # reports errors before the scene is read
         output_format.check_installed()
     if options.starts_workers:
         check_backend_here(options.backend)
@@ -94,9 +104,9 @@ def _run_survey(
     extent: str | None,
     compare: Callable[[RunResult], str] | None = None,
 ) -> None:
-    """Run the job of a scenario, write the result of a survey, and print a summary.
+    """Run a prepared survey, write its result and print a summary.
 
-    `compare` returns a note on the result, or raises an error before the result is written.
+    `compare` checks the result before it is written. It returns a note or raises an error.
     """
     job = prepared.job
     for note in advice(prepared):
@@ -106,7 +116,7 @@ def _run_survey(
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)
         lines = _result_lines(out, result, job, report, terminal)
-        show(summary(out, report), lines, terminal.as_json)
+        show(summarize_report(out, report), lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
@@ -120,9 +130,12 @@ def run_campaign(
     options: RunOptions,
     backend: str | None,
 ) -> None:
-    """Run a campaign, and print a summary.
+    """Run a campaign, write the data set and print a summary.
 
-    LidarError if the run or a job fails.
+    Raises
+    ------
+    LidarError
+        If the run or one of the jobs fails.
     """
     if options.pace is not None:
         raise click.UsageError(
@@ -149,19 +162,19 @@ def run_campaign(
         if options.live and options.stay:
             page.stay()
     if run.failed:
-        raise LidarError(failures(run))
+        raise LidarError(describe_failures(run))
 
 
 def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]:
-    """Return warnings of implausible settings in the first job of a campaign or shard.
+    """Return warnings about implausible settings in the first job of a campaign or shard.
 
-    Jobs that cannot be made are reported by the run.
+    Errors are ignored, because the run will report them.
     """
     if not campaign.numbers:
         return []
     number = campaign.numbers[0]
     with suppress(LidarError), terminal.status("reading the scene", logged=False):
-        if (scenario := campaign.scenario(number)) is not None:  # else a function makes the jobs
+        if (scenario := campaign.scenario(number)) is not None:  # jobs may come from a function
             warnings = implausibilities(prepare(scenario, plans=False))
             return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
     return []
@@ -176,19 +189,24 @@ def run_job(
     backend: str | None,
     extent: str | None,
 ) -> None:
-    """Run a job of a campaign again, and write the result of a survey.
+    """Run a single job of a campaign, and write its result like that of a survey.
 
-    If `out` is the data set of the campaign, the result is a folder in the data set, and its points
-    must be the same. LidarError if they differ, or cannot be compared: the data set was made by
-    other software, or its files of the job are damaged.
+    If `out` contains the data set of the campaign, the result is written to a folder in the data
+    set, and its points are compared with those in the data set.
+
+    Raises
+    ------
+    LidarError
+        If the points differ, or if they cannot be compared because the data set was created with
+        different software or the files of the job are damaged.
     """
     target = Storage.at(out)
     name = campaign.name(number)
     dataset = DataSet(target, **asdict(campaign.keep))
     compare: Callable[[RunResult], str] | None = None
     if CAMPAIGN_FILE in target.entries():
-        backend = check_same(target, campaign)["backend"]
-        verify(target, number)
+        backend = check_same_campaign(target, campaign)["backend"]
+        verify_dataset(target, number)
         out = output_destination(f"{out}/job-{name}")
         options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
         compare = partial(_compare_with_dataset, target, number, name)
@@ -201,9 +219,10 @@ def run_job(
 
 
 def _compare_with_dataset(dataset: Storage, number: int, name: str, result: RunResult) -> str:
-    """Return a note that the points of a job are the data set's, or raise LidarError.
+    """Compare the points of a job with those in the data set, and return a note if they match.
 
-    The note is empty if the data set lacks the job.
+    Return an empty string if the data set does not contain the job. Raise LidarError if the points
+    differ.
     """
     hashes = [row.sha256 for row in read_table(dataset) if row.number == number and row.done]
     if not hashes:
@@ -223,7 +242,7 @@ def _result_lines(
     report: dict[str, Any],
     terminal: Terminal,
 ) -> Iterator[str]:
-    """Yield the outcome of a survey as lines of text."""
+    """Yield a summary of the result as lines of text."""
     yield from terminal.notes(report["notes"])
     hits_elsewhere = result.hit_count - report["hits_on_surfaces"]
     yield (
@@ -245,7 +264,7 @@ def _result_lines(
 
 
 def _objects_with_points(report: dict[str, Any]) -> str:
-    """Return a clause with the number of objects that have points, or an empty string."""
+    """Return a phrase with the number of objects that have points, or an empty string."""
     counts = [n for name, n in report["points_by_object"].items() if name != NO_SURFACE]
     hit = sum(count > 0 for count in counts)
     if not hit:

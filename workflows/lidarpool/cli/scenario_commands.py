@@ -1,4 +1,4 @@
-"""The commands before a run: scenarios, `lidarpool scene …`, `sensors` and `stations`."""
+"""Commands that prepare a run: `init`, `import`, `check`, `schema`, `scene` and `sensors`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lidarsim.words import plural
 
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from ..connection.tls_files import TlsFiles
 
-MAX_COPIED_TRIANGLES = 20_000_000  # limit for files that cannot share triangles
+MAX_COPIED_TRIANGLES = 20_000_000  # limit for file formats without instances
 _SENSOR_FORMATS = "File format: " + ", ".join(row.name for row in FORMATS) + "."
 
 
@@ -53,7 +53,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
       lidarpool init
       lidarpool init surveys/hall --mesh hall.stl --unit mm --sensor ouster/os1-64
       lidarpool init every --all
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..scenario.advice import advice
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario, mesh_data
@@ -73,7 +73,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     note = ""
     notes = []
     if data and not target.exists():
-        # From here: the scenario's folder need not be there yet.
+        # Paths are relative to the working directory, because `folder` may not exist yet.
         content = {"scene": "seed"} | mesh_data(meshes, Path(), of_mesh)
         scenario = Scenario.from_data(content, source=str(target))
         prepared = prepare(scenario, plans=False)
@@ -133,7 +133,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import robot.xml
       lidarpool import mid360.csv
       lidarpool import scanners_tls.xml#vlp16
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarscenes.files.formats import WORLDS
     from lidarscenes.gazebo.import_world import import_world
     from lidarscenes.helios import import_scanner, import_survey, is_scanner
@@ -144,31 +144,39 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
     from ..scenario.sections import SensorSection
-    from .import_plugins import SCENARIO_FILE, import_by, import_whole, importer_of, is_mujoco_model
+    from .import_plugins import (
+        SCENARIO_FILE,
+        find_importer,
+        import_atomically,
+        import_with_plugin,
+        is_mujoco_model,
+    )
 
     def check(path: Path) -> None:
         prepare(Scenario.load(path))
 
     folder = out or Path(survey.stem)
     if survey.suffix.lower() in WORLDS:
-        left_out = import_whole(import_world, survey, folder, assets, check)
+        unsupported = import_atomically(import_world, survey, folder, assets, check)
     elif is_mujoco_model(survey):
-        left_out = import_whole(import_model, survey, folder, assets, check)
+        unsupported = import_atomically(import_model, survey, folder, assets, check)
     elif is_scanner(survey):
-        left_out = import_whole(import_scanner, survey, folder, assets, check)
-    elif (plugin := importer_of(survey)) is not None:
-        left_out = import_by(plugin, survey, folder, assets, check=check)
+        unsupported = import_atomically(import_scanner, survey, folder, assets, check)
+    elif (plugin := find_importer(survey)) is not None:
+        unsupported = import_with_plugin(plugin, survey, folder, assets, check=check)
     elif survey.suffix.lower() in ENDINGS:
-        left_out = import_whole(import_sensor, survey, folder, assets, check)
+        unsupported = import_atomically(import_sensor, survey, folder, assets, check)
     else:
-        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).unsupported
+        unsupported = import_survey(
+            survey, folder, assets, check=check, surfels=surfels
+        ).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
     own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())
     sensors = plural(own_sensors, "sensor")
     files = plural(len(scenario.scene.files), "mesh file")
     click.echo(f"{click.format_filename(file)}: {sensors}, {files}")
-    for line in left_out:
+    for line in unsupported:
         click.echo(f"not supported: {line}")
     click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
@@ -198,12 +206,12 @@ def check(
 ) -> None:
     """Validate a scenario and estimate points, memory and disk space.
 
-    No workers are started. For a campaign, the varying values and five of the jobs are checked.
-    `lidarpool run` completes the other jobs of a campaign if some jobs cannot be run.
+    No workers are started. For a campaign, the varied quantities are listed and five of the jobs
+    are checked. If some jobs of a campaign cannot be run, `lidarpool run` completes the others.
 
     The number of points is estimated by casting a sample of the rays in this process. A warning is
-    printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario can be
-    run, and 2 if it cannot or, for a campaign, if a checked job cannot.
+    printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario or all
+    checked jobs of the campaign can be run, and 2 otherwise.
 
     \b
     Examples:
@@ -211,8 +219,8 @@ def check(
       lidarpool check campaign.yaml --job 17
       lidarpool check hall.glb --scheduler tcp://127.0.0.1:8786 --json
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
-    """  # noqa: D301 - click wants the character, not its name
-    begin("reading the scene", quiet=as_json)
+    """  # noqa: D301 - Click requires the character \b
+    print_first_step("reading the scene", quiet=as_json)
     from ..run.cluster.connection import connected
     from ..run.cluster_file import ClusterFile
     from ..run.options import RunOptions
@@ -246,11 +254,11 @@ def check(
         start = f"The {subject} cannot be run{':' if reasons[1:] else '.'}"
         raise LidarError(start + ("\n" if reasons[1:] else " ") + "\n".join(reasons))
     if not as_json:
-        words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
+        words = ["lidarpool", "run", str(scenario), *options.command_arguments(of_mesh)]
         settings: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         settings |= {"backend": backend, "job": number}
         if figures["occupied"]:
-            settings["out"] = _free_target(out)
+            settings["out"] = _unused_target(out)
         for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
@@ -261,7 +269,7 @@ def check(
 
 
 def _failed_jobs(figures: dict[str, Any]) -> str:
-    """Return the line before the reasons why checked jobs of a campaign cannot be run."""
+    """Return the first line of the message about campaign jobs that cannot be run."""
     failed = len(figures["failed"])
     checked = figures["checked"]
     if failed < checked:
@@ -273,8 +281,8 @@ def _failed_jobs(figures: dict[str, Any]) -> str:
     )
 
 
-def _free_target(target: Path | Storage) -> str:
-    """Return the name of a free target beside a target that holds another result."""
+def _unused_target(target: Path | Storage) -> str:
+    """Return an unused output folder, derived from the name of one that is in use."""
     from lidarsim.io.storage import Storage
 
     names = (f"{str(target).rstrip('/')}-{number}" for number in count(2))
@@ -297,7 +305,7 @@ def schema(campaign: bool) -> None:
     Examples:
       lidarpool schema > scenario.schema.json
       lidarpool schema --campaign > campaign.schema.json
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..scenario.schema import campaign_schema, scenario_schema, schema_text
 
     click.echo(schema_text(campaign_schema() if campaign else scenario_schema()), nl=False)
@@ -312,7 +320,7 @@ _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.
 
 
 def _generated_scene_options(triangles: int) -> Callable[[Command], Command]:
-    """Add the output file, the number of triangles, and a seed."""
+    """Add the output file, the number of triangles and the seed of a generated scene."""
     return combine(
         _out,
         overwrite,
@@ -335,10 +343,10 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
       lidarpool scene city city.glb
       lidarpool scene city city.ply --triangles 10000000 --seed 7
       lidarpool scene city green.glb --trees 500 --cars 200
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarscenes.procedural.city import city as make
 
-    _write(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
+    _write_scene(out, lambda: make(triangles, seed, trees, cars), overwrite, paint=True)
 
 
 @scene.command(context_settings={"show_default": True})
@@ -357,10 +365,10 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
       lidarpool scene terrain hills.ply
       lidarpool scene terrain small.obj --triangles 20000 --side 100
       lidarpool scene terrain woods.glb --trees 10000
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarscenes.procedural.terrain import terrain as make
 
-    _write(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
+    _write_scene(out, lambda: make(triangles, seed, side, trees), overwrite, paint=True)
 
 
 @scene.command()
@@ -409,7 +417,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
       lidarpool scene points scan.xyz place.glb --unit mm
       lidarpool scene points tile.laz place.glb --epsg 32618
       lidarpool scene points stations.e57 place.glb --color intensity
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..scenario.point_scene import points_to_scene
 
     def tell(note: str) -> None:
@@ -429,13 +437,16 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
             )
         return place
 
-    _write(out, make, overwrite)
+    _write_scene(out, make, overwrite)
 
 
-def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
-    """Make a scene and write the scene to a file.
+def _write_scene(
+    file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False
+) -> None:
+    """Create a scene and write it to a file.
 
-    `paint` gives a generated scene its colors.
+    `make` returns the scene. It is only called after the output file has been checked. If `paint`
+    is True, colors are added to the scene if the file format supports them.
     """
     from lidarscenes.procedural.paint import paint_scene
     from lidarscenes.writers.scene_file import check_target, write_scene
@@ -444,7 +455,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     if file.exists() and not overwrite:
         raise LidarError(f"{file} already exists. Use another name, or pass `--overwrite`.")
     scene = make()
-    if file.suffix.lower() == ".glb":  # other formats hold no colors
+    if file.suffix.lower() == ".glb":  # the only format that can store colors
         scene = paint_scene(scene) if paint else scene
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(
@@ -523,7 +534,7 @@ def sensors(
     """List the sensor models, or describe or export one of them.
 
     Exported files contain the rays in firing order; docs/how-to/other-simulators.md describes the
-    conventions. Properties that the format cannot store are listed on the screen.
+    conventions. Properties that the format cannot store are printed.
 
     \b
     Examples:
@@ -532,7 +543,7 @@ def sensors(
       lidarpool sensors velodyne/vlp16 --out vlp16.png
       lidarpool sensors livox/mid360 --seconds 4 --out mid360.csv --as livox
       lidarpool sensors --calibration unit.json --out unit.npz
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from lidarsim.sensor.models import load_sensor
 
     settings = {name: value for name, value in settings.items() if value is not None}
@@ -549,7 +560,7 @@ def sensors(
     if model is not None:
         _show_model(model)
     if out is None:
-        assert model is not None  # a calibration needs a file
+        assert model is not None  # `--calibration` requires `--out`
         command = f"lidarpool sensors {shlex.quote(model)} --out"
         click.echo(f"To draw its pattern: {command} pattern.png")
         click.echo(f"To export its rays: {command} rays.npz")
@@ -574,7 +585,7 @@ def _write_sensor(
     seconds: float | None,
     revolutions: int | None,
 ) -> None:
-    """Write a sensor as a file, and print what the file does not hold."""
+    """Export a sensor to a file, and print the properties that the file cannot store."""
     from lidarsim.sensor.export import export_sensor
 
     if out.exists() and not overwrite:
@@ -587,18 +598,18 @@ def _write_sensor(
 
 
 def _list_models() -> None:
-    """Print the models with their main figures."""
+    """Print a table of the sensor models and their main properties."""
     from lidarsim.schema.model_names import model_names, plugin_model_names
 
     heads = ("model", "channels", "field of view", "range", "rate (Hz)", "points/s")
-    rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
+    rows = [heads, *map(_model_row, (*model_names(), *plugin_model_names()))]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
 
 
 def _show_model(name: str) -> None:
-    """Print the figures of a model and their sources."""
+    """Print the properties of a model and their sources."""
     from lidarsim.schema.model_names import model_names, plugin_model_names
     from lidarsim.sensor.models import read_model, shown_noise
 
@@ -626,8 +637,8 @@ def _show_model(name: str) -> None:
         click.echo(f"{figure:<11}  {words}")
 
 
-def _row(name: str) -> tuple[str, ...]:
-    """Return name, channels, field of view, range, rates and points a second of a model."""
+def _model_row(name: str) -> tuple[str, ...]:
+    """Return the table row of a model, with the columns that `_list_models` prints."""
     from lidarsim.sensor.models import read_model
 
     model = read_model(name)
@@ -646,7 +657,7 @@ def _row(name: str) -> tuple[str, ...]:
 
 
 def _field_of_view(name: str, model: SensorModel) -> str:
-    """Return the field of view of a model in words."""
+    """Describe the field of view of a model."""
     import numpy as np
 
     from lidarsim.sensor.models import load_sensor

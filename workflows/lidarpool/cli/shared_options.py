@@ -1,4 +1,4 @@
-"""Options, output and logs of several commands."""
+"""Command-line options and output functions that several commands share."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Command = Callable[..., None]
 
 
 class StoragePath(click.Path):
-    """A folder or file, or the storage of a URL."""
+    """Parameter type for a local path, or for a URL of a remote storage."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return a Path, or a Storage."""
+        """Convert a local path to a Path, and a URL to a Storage."""
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 
@@ -79,16 +79,16 @@ copies = click.option(
 
 
 def combine(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Return a decorator that adds options to a command, in their order."""
+    """Return a decorator that adds several options to a command, in the order of the arguments."""
     return lambda command: reduce(
         lambda decorated, option: option(decorated), reversed(options), command
     )
 
 
-def _position(text: str) -> list[float]:
-    """Parse x,y,z.
+def _parse_position(text: str) -> list[float]:
+    """Parse a position in the form x,y,z.
 
-    Whole numbers stay integers, to be written without a decimal point.
+    Whole numbers become integers, so that a scenario file shows them without a decimal point.
     """
     try:
         x, y, z = map(float, text.split(","))
@@ -101,22 +101,22 @@ def _position(text: str) -> list[float]:
     return [int(number) if number.is_integer() else number for number in (x, y, z)]
 
 
-def _names(text: str) -> list[str]:
-    """Parse names that commas separate."""
+def _parse_names(text: str) -> list[str]:
+    """Parse a comma-separated list of names."""
     return [name.strip() for name in text.split(",")]
 
 
 def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Command], Command]:
-    """Return an option of a mesh file."""
+    """Return an option that only applies to mesh files."""
     return click.option(f"--{name}", help=f"{description}. Mesh input only.", **settings)
 
 
-_mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
-poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
+_mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_parse_names, multiple=True)
+poses = click.option("--pose", metavar="X,Y,Z", type=_parse_position, multiple=True,
                      help="Position of the sensor in the scene, in meters; can be repeated, with "
                      "one position per sweep (default: from the recording, otherwise "
                      "0,0,0).")  # fmt: skip
-_MESH_READING = ("unit", "up_axis")  # how a mesh is read, wherever a command takes a mesh
+_MESH_READING = ("unit", "up_axis")  # options of all commands that read meshes
 _mesh_reading_options = combine(
     _mesh_option(
         "unit",
@@ -139,7 +139,10 @@ _mesh_options = combine(
     ),
     _mesh_reading_options,
     _mesh_list_option(
-        "pose", "Position of the sensor in meters; can be repeated", metavar="X,Y,Z", type=_position
+        "pose",
+        "Position of the sensor in meters; can be repeated",
+        metavar="X,Y,Z",
+        type=_parse_position,
     ),
     _mesh_list_option(
         "columns",
@@ -153,14 +156,17 @@ _mesh_options = combine(
 
 
 def mesh_options(command: Command) -> Command:
-    """Add the options of a mesh file, which the command gets as a mapping for `mesh_data`."""
+    """Add the options for mesh files, which are passed to the command as the mapping `of_mesh`.
+
+    The mapping contains arguments of `mesh_data`.
+    """
 
     @wraps(command)
     def with_options(
         *arguments: Any,
         pose: Any,
         columns: Any,
-        format: Any,  # noqa: A002 - the name of the option
+        format: Any,  # noqa: A002 - must match the name of the option
         **settings: Any,
     ) -> None:
         values = {name: settings.pop(name) for name in ("sensor", *_MESH_READING)}
@@ -172,7 +178,7 @@ def mesh_options(command: Command) -> Command:
 
 
 def mesh_reading(command: Command) -> Command:
-    """Add --unit and --up-axis, which the command gets as a mapping `of_mesh`."""
+    """Add --unit and --up-axis, which are passed to the command as the mapping `of_mesh`."""
 
     @wraps(command)
     def with_options(*arguments: Any, **settings: Any) -> None:
@@ -183,8 +189,8 @@ def mesh_reading(command: Command) -> Command:
     return _mesh_reading_options(with_options)
 
 
-def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
-    """Raise a LidarError for options of a mesh with a path that is none."""
+def reject_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
+    """Raise LidarError if mesh options were passed for a file that is not a mesh."""
     for name in of_mesh:
         raise LidarError(
             f"`--{name.replace('_', '-')}` only applies to mesh files, and {path} is not a "
@@ -192,8 +198,8 @@ def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
         )
 
 
-def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the words of a command line that give these options."""
+def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the command-line arguments that correspond to these mesh options."""
     for name, value in of_mesh.items():
         for item in value if name == "pose" else [value]:
             yield f"--{name.replace('_', '-')}"
@@ -201,10 +207,10 @@ def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
 
 
 def scheduler(command: Command) -> Command:
-    """Add --scheduler, --scheduler-file and certificates.
+    """Add the options for a running scheduler: its address, its scheduler file and certificates.
 
-    The command gets the address as `scheduler`, and the certificates as `files`. All are checked
-    before the command is called.
+    The address is passed to the command as `scheduler`, and the certificates are passed as `files`.
+    All options are validated before the command is called.
     """
 
     @wraps(command)
@@ -238,9 +244,10 @@ def scheduler(command: Command) -> Command:
 
 
 def _check_combination(settings: Mapping[str, Any], file: Path | None, files: TlsFiles) -> None:
-    """Raise a UsageError for options of a scheduler that exclude each other.
+    """Check the options that select a cluster.
 
-    Raises LidarError if a file of a certificate cannot be read.
+    Raise UsageError for options that cannot be combined, or LidarError if a certificate file cannot
+    be read.
     """
     from lidarsim.io.input_files import input_size
 
@@ -272,7 +279,7 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
 def _scheduler_address(
     given: str | None, file: Path | None, startup_timeout_s: float | None
 ) -> str | None:
-    """Return the address of --scheduler or --scheduler-file, after checking it."""
+    """Validate and return the scheduler address from --scheduler or --scheduler-file."""
     if given is not None and is_scheduler_file(given):
         file = Path(given)
     if file is not None:
@@ -285,7 +292,10 @@ def _scheduler_address(
 
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
-    """Yield a line on the coordinate system of what is written, and on its origin."""
+    """Yield a line about the coordinate system and the origin of the output.
+
+    Yield nothing if the output has neither an EPSG code nor an origin.
+    """
     from lidarsim.scene.files.coordinate_systems import describe_system
 
     if epsg is None and not any(origin):
@@ -297,7 +307,7 @@ def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
 
 
 def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
-    """Print the statistics as a JSON document or as lines of text."""
+    """Print results as a JSON document or as lines of text."""
     if as_json:
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:

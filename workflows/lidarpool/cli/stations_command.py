@@ -1,4 +1,7 @@
-"""`lidarpool stations`: stations of a terrestrial scan, and what a scan covers."""
+"""The `lidarpool stations` command, which plans the stations of a terrestrial scan.
+
+With `--cloud`, the command measures the coverage of an existing scan instead.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from lidarsim.words import joined, plural, printable
 
 from . import completion
 from . import shared_options as options
-from .first_step import begin
+from .first_step import print_first_step
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -32,12 +35,12 @@ if TYPE_CHECKING:
 
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
-_SHOWN_OBJECTS = 12
-_MOST_OF_THE_AREA = 0.75  # share of an object that decides where the stations are
-_LITTLE_OF_THE_AREA = 0.25  # reachable share of a target that a note names
+_SHOWN_OBJECTS = 12  # maximum number of objects listed individually
+_DOMINANT_SHARE = 0.75  # an object with a larger share of the reachable area causes a note
+_MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a note
 
 
-def _share(text: str) -> float:
+def _parse_percentage(text: str) -> float:
     """Parse a percentage such as 95% or 95."""
     try:
         share = float(text.removesuffix("%")) / 100
@@ -90,7 +93,7 @@ def _share(text: str) -> float:
 )
 @click.option(
     "--coverage",
-    type=_share,
+    type=_parse_percentage,
     metavar="SHARE",
     help=(
         "Add stations until this share of the reachable area is covered, such as 95%; cannot be "
@@ -144,9 +147,10 @@ def stations(
     the sensor, and within --slant. The output is a scenario with the stations, and a picture of the
     surfaces that they cover.
 
-    With --cloud, no stations are chosen. Instead, the command computes which share of the area that
-    is reachable from the stations in SCENARIO is close to a point of a result, or of any cloud that
-    `lidarpool compare` reads.
+    With --cloud, no stations are chosen. Instead, the command measures the coverage of an existing
+    scan. The coverage is the share of the area reachable from the stations in SCENARIO that is
+    close to a point of the scan. The scan can be a result or any cloud that `lidarpool compare`
+    reads.
 
     \b
     Examples:
@@ -155,15 +159,15 @@ def stations(
       lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
       lidarpool stations hall-stations/stations.yaml --cloud hall-scan
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
-    begin("reading the scene", quiet=settings["as_json"])
+    print_first_step("reading the scene", quiet=settings["as_json"])
     from ..scenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
     if cloud is not None:
-        _refuse_beside_cloud(scene, settings | {"model": model})
+        _reject_planning_options(scene, settings | {"model": model})
         if not within_m > 0:
             raise LidarError(f"`--within` must be greater than 0, but is {within_m:g}.")
         scenario = Scenario.load(scene, of_mesh)
@@ -189,7 +193,7 @@ def stations(
 
 
 def _scenario_model(scenario: Scenario) -> str | None:
-    """Return the sensor model of a scenario; a sensor file is relative to the scenario's folder."""
+    """Return the sensor model of a scenario, or the path of its sensor file."""
     model = scenario.sensor.model
     if model is not None and scenario.sensor.has_own_model:
         return str(scenario.path(model))
@@ -197,7 +201,7 @@ def _scenario_model(scenario: Scenario) -> str | None:
 
 
 def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
-    """Choose stations, write them as a scenario and a picture, and print them."""
+    """Choose stations, write a scenario and a picture of them, and print a summary."""
     from lidarsim.schema.model_names import full_name
     from lidarsim.sensor.models import load_sensor
 
@@ -236,8 +240,8 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
-def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
-    """Raise UsageError for options that choose stations, beside the cloud of a scan."""
+def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
+    """Raise UsageError for options that cannot be combined with `--cloud`."""
     chosen = {
         "--sensor": settings["model"],
         "--out": settings["out"],
@@ -261,7 +265,7 @@ def _show_coverage(
     slant_deg: float,
     targets: Sequence[str],
 ) -> None:
-    """Print what the stations of a scenario see, and what a cloud covers of it."""
+    """Print the share of the area reachable from the stations of a scenario that a cloud covers."""
     from ..comparing.compared_sweep import compared_in_world
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
@@ -294,7 +298,7 @@ def _show_coverage(
         )
     if not coverage.reachable_m2.any():
         raise LidarError(
-            f"No surface{_of_targets(targets)} is reachable from the stations. Check their "
+            f"No surface{_target_phrase(targets)} is reachable from the stations. Check their "
             "poses and the unit of the scene."
         )
     figures = _coverage_figures(coverage, prepared) | {
@@ -303,7 +307,7 @@ def _show_coverage(
         "notes": [*notes, *recording.omission_notes],
     }
     head = (
-        f"{figures['reachable_m2']:,.0f} m²{_of_targets(targets)} are reachable from "
+        f"{figures['reachable_m2']:,.0f} m²{_target_phrase(targets)} are reachable from "
         f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
         f"within {within_m:g} m of a point"
     )
@@ -313,7 +317,10 @@ def _show_coverage(
 
 
 def _station_positions(prepared: Prepared) -> Floats:
-    """Return the positions (s, 3) of the sensor at all stations, world meters."""
+    """Return the positions of the sensor at all stations in world coordinates, in meters.
+
+    The result has shape (s, 3).
+    """
     path = prepared.survey.path
     mount = prepared.survey.carried[0].mount
     poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]
@@ -321,7 +328,7 @@ def _station_positions(prepared: Prepared) -> Floats:
 
 
 def _coverage_figures(coverage: SurveyCoverage, prepared: Prepared) -> dict[str, Any]:
-    """Return the figures of what a cloud covers for --json."""
+    """Return the coverage of a cloud as printed by --json."""
     names = prepared.scene.names
     reachable_m2 = float(coverage.reachable_m2.sum())
     return {
@@ -334,7 +341,7 @@ def _coverage_figures(coverage: SurveyCoverage, prepared: Prepared) -> dict[str,
 def _object_figures(
     names: Sequence[str], areas: StationPlan | SurveyCoverage
 ) -> dict[str, dict[str, float]]:
-    """Return the areas of targets for --json."""
+    """Return the areas of all targets as printed by --json."""
     kinds = ("area_m2", "reachable_m2", "covered_m2")
     return {
         name: {kind: float(getattr(areas, kind)[index]) for kind in kinds}
@@ -344,9 +351,9 @@ def _object_figures(
 
 
 def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepared, list[str]]:
-    """Prepare a scenario whose poses do not matter.
+    """Prepare a scenario, and print its notes and warnings except those about automatic poses.
 
-    Returns its notes and warnings, which are printed at once.
+    Returns the prepared scenario with the notes and warnings.
     """
     from ..scenario.advice import advice
     from ..scenario.default_poses import Placing
@@ -362,17 +369,17 @@ def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepar
     return prepared, [*notes, *terminal.warnings]
 
 
-def _of_targets(targets: Sequence[str]) -> str:
-    """Return «of Wall* and Roof» with a space before it, or empty if all objects are covered."""
+def _target_phrase(targets: Sequence[str]) -> str:
+    """Return a phrase such as " of Wall* and Roof", or an empty string without targets."""
     return f" of {joined(targets)}" if targets else ""
 
 
 def _target_notes(plan: StationPlan, prepared: Prepared) -> Iterator[str]:
-    """Yield a note if all objects are covered, and one of them has most of the area."""
+    """Yield a note if a single object accounts for most of the reachable area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
     share = float(reachable_m2[largest] / reachable_m2.sum())
-    if share > _MOST_OF_THE_AREA and (reachable_m2 > 0).sum() > 1:
+    if share > _DOMINANT_SHARE and (reachable_m2 > 0).sum() > 1:
         yield (
             f"{printable(prepared.scene.names[largest])} accounts for {share:.0%} of the reachable "
             "area, so it largely determines the stations. To cover other objects, select them with "
@@ -383,8 +390,11 @@ def _target_notes(plan: StationPlan, prepared: Prepared) -> Iterator[str]:
 def _unreachable_notes(
     names: Sequence[str], areas: StationPlan | SurveyCoverage, positions: str
 ) -> Iterator[str]:
-    """Yield a note if most of the area of some targets is unreachable from `positions`."""
-    is_unreachable = areas.targets & (areas.reachable_m2 < _LITTLE_OF_THE_AREA * areas.area_m2)
+    """Yield a note if most of the area of some targets cannot be reached.
+
+    `positions` describes the positions from which they cannot be reached, such as "stations".
+    """
+    is_unreachable = areas.targets & (areas.reachable_m2 < _MIN_REACHABLE_SHARE * areas.area_m2)
     order = (-areas.area_m2).argsort(kind="stable")
     few = [
         f"{areas.reachable_m2[k]:,.1f} of {areas.area_m2[k]:,.1f} m² of {printable(names[k])}"
@@ -401,7 +411,7 @@ def _unreachable_notes(
 
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
-    """Yield notes on a plan with less than `coverage`, or fewer stations than `count`."""
+    """Yield a note if a plan has less coverage or fewer stations than requested."""
     from ..plan.stations import MAX_STATIONS
 
     reached = float(plan.coverage[-1])
@@ -425,7 +435,7 @@ def _stations_scenario(
     targets: Sequence[str],
     warnings: Sequence[str],
 ) -> str:
-    """Return the text of a scenario whose poses are the stations, with warnings as comments."""
+    """Return the text of a scenario file with the stations as poses and warnings as comments."""
     import yaml
 
     def relative(file: Path) -> str:
@@ -448,7 +458,7 @@ def _stations_scenario(
     }
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
-        f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_of_targets(targets)}. "
+        f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_target_phrase(targets)}. "
         "Each station scans one revolution in steps of 10 degrees.\n"
     )
     for warning in warnings:
@@ -460,7 +470,7 @@ def _stations_scenario(
 def _plan_figures(
     plan: StationPlan, prepared: Prepared, sensor: str, notes: list[str]
 ) -> dict[str, Any]:
-    """Return the figures of a plan for --json."""
+    """Return the station plan as printed by --json."""
     names = prepared.scene.names
     return {
         "sensor": sensor,
@@ -478,12 +488,12 @@ def _plan_figures(
 
 
 def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -> Iterator[str]:
-    """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
+    """Yield the stations and the covered areas of a plan as lines of text."""
     names = prepared.scene.names
     yield (
         f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
         f"{plan.spacing_m:g} m, from which {plan.reachable_m2.sum():,.0f} "
-        f"m²{_of_targets(targets)} are reachable (within range, field of view and slant)"
+        f"m²{_target_phrase(targets)} are reachable (within range, field of view and slant)"
     )
     yield "station        x          y          z   covered     added"
     previous_share = 0.0
@@ -500,12 +510,12 @@ def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -
 
 
 def _object_lines(names: Sequence[str], areas: StationPlan | SurveyCoverage) -> Iterator[str]:
-    """Yield a table of the areas of objects, the largest uncovered area first."""
+    """Yield a table of the areas of objects, sorted by uncovered area in descending order."""
     uncovered_m2 = areas.reachable_m2 - areas.covered_m2
     order = (-uncovered_m2).argsort(kind="stable").tolist()
     order = [k for k in order if areas.reachable_m2[k] > 0]
     shown = order[:_SHOWN_OBJECTS]
-    labels = [printable(name) for name in names]  # in full, as --target expects them
+    labels = [printable(name) for name in names]  # not shortened, so they can be used for --target
     groups = [(labels[k], [k]) for k in shown]
     if further := order[_SHOWN_OBJECTS:]:
         groups.append((f"{len(further):,} others", further))

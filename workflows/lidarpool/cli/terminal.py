@@ -1,4 +1,4 @@
-"""Output of a command at the terminal while the command works."""
+"""Messages and progress that a command prints while it is running."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ..processes.streams import TolerantStream
 from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED
 
-# Plain lines follow after a tenth of the elapsed time, within these bounds, so that a survey of
-# hours does not fill a log.
+# Minimum and maximum interval between progress lines in a log. Within these limits, the interval is
+# a tenth of the elapsed time, so that long surveys do not fill the log.
 PLAIN_EVERY_S = (2.0, 60.0)
 
 
 @dataclass(frozen=True)
 class Terminal(Screen):
-    """Messages and progress for the user of a command, on stderr."""
+    """Messages and progress of a command, printed to stderr."""
 
     quiet: bool = False
     verbose: bool = False
@@ -38,12 +38,12 @@ class Terminal(Screen):
 
     @property
     def _stream(self) -> Any:
-        """Stream for messages, or None for a quiet command."""
+        """Stream for messages, or None if the command is quiet."""
         return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
     def console(self) -> Console | None:
-        """Console of a terminal with a movable cursor, or None."""
+        """Console for animated progress, or None if stderr is not a capable terminal."""
         console = Console(file=self._stream) if self._stream else None
         return console if console and console.is_terminal and not console.is_dumb_terminal else None
 
@@ -53,25 +53,25 @@ class Terminal(Screen):
             self._stream.write(f"note: {words}\n")
 
     def warn(self, words: str) -> None:
-        """Print a warning once, even in a quiet command, and append the warning to `warnings`."""
+        """Print a warning unless it was printed before. Quiet commands print warnings, too."""
         if words not in self.warnings:
             self.warnings.append(words)
             click.echo(f"warning: {words}", err=True)
 
-    def end(self, *, strict: bool) -> None:
-        """End the process with exit code 1 if `strict` is set and a warning was printed."""
+    def exit_if_warned(self, *, strict: bool) -> None:
+        """Exit the process with code 1 if `strict` is True and a warning was printed."""
         if strict and self.warnings:
             sys.exit(WARNED)
 
     def notes(self, notes: Iterable[str]) -> Iterator[str]:
-        """Return lines of notes, without notes that were printed as warnings."""
+        """Return notes as lines of text, except those that were printed as warnings."""
         return (f"note: {note}" for note in notes if note not in self.warnings)
 
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
         """Show a status while the body runs.
 
-        If the status is `logged`, a log shows the status too.
+        Outside a terminal, the status is printed as a line of text if `logged` is True.
         """
         console = self.console
         if logged and console is None and self._stream:
@@ -81,9 +81,9 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[WritingProgress]:
-        """Show a bar for each output that the body writes.
+        """Show a progress bar for each file that the body writes.
 
-        A log shows `words` and lines.
+        Outside a terminal, `words` and occasional progress lines are printed.
         """
         console = self.console
         if console is not None:
@@ -95,7 +95,7 @@ class Terminal(Screen):
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
-        """Show bars by stage with rates and time left, or lines of text outside a terminal."""
+        """Show a progress bar for each stage, or lines of text outside a terminal."""
         if (console := self.console) is not None:
             with bars(console) as show:
                 yield show
@@ -106,9 +106,9 @@ class Terminal(Screen):
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
-        """Show a status until the cluster has started.
+        """Show a status until the cluster has started, and yield its client.
 
-        Its workers log as this process does.
+        If `shares_terminal` is True, the workers use the log settings of this process.
         """
         with ExitStack() as stack:
             with self.status(words):
@@ -120,20 +120,23 @@ class Terminal(Screen):
 
 
 def _tell(stream: Any, line: str) -> None:
-    """Write a line with the time of day."""
+    """Write a line with the current time to a stream."""
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
 class WrittenLines:
-    """Progress of written outputs as lines of text in a stream, called as `WritingProgress`."""
+    """Callback that prints the progress of written files as lines of text.
+
+    Calls have the signature of `WritingProgress`.
+    """
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._started = time.monotonic()
-        self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
+        self._next = PLAIN_EVERY_S[0]  # elapsed time in seconds at which the next line is due
 
     def __call__(self, name: str, completed: int, total: int, unit: str) -> None:
-        """Write a line if a line is due."""
+        """Write a progress line if one is due."""
         elapsed_s = time.monotonic() - self._started
         if elapsed_s >= self._next and completed < total:
             min_s, max_s = PLAIN_EVERY_S
@@ -142,23 +145,23 @@ class WrittenLines:
 
 
 class PlainLines:
-    """Progress as lines of text in a stream, called with each `Progress`."""
+    """Callback that prints the progress of a run as lines of text."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
-        self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
+        self._next = PLAIN_EVERY_S[0]  # elapsed time in seconds at which the next line is due
         self._paces = {"survey": Pace(), "planning": Pace(), "campaign": Pace()}
         self._completed: set[str] = set()
-        self._standing_still = ""  # the last line about it
+        self._waiting_reason = ""  # empty while the run makes progress
 
     def __call__(self, progress: Progress) -> None:
-        """Write a line if a line is due or a stage has been completed."""
+        """Write a line if one is due, if a stage is complete or if the run starts waiting."""
         elapsed_s = progress.seconds
-        if (standing := waiting_reason(progress)) != self._standing_still:
-            self._standing_still = standing
+        if (reason := waiting_reason(progress)) != self._waiting_reason:
+            self._waiting_reason = reason
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
-            _tell(self.stream, f"run  {standing or 'continues'}, {ready} are done")
+            _tell(self.stream, f"run  {reason or 'continues'}, {ready} are done")
         due = elapsed_s >= self._next
         if due:
             min_s, max_s = PLAIN_EVERY_S

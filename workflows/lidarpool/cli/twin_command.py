@@ -1,4 +1,4 @@
-"""The command `twin`: a place from a recording."""
+"""The `lidarpool twin` command, which reconstructs a scene from a recording."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def twin(
       lidarpool twin mid360.mcap --model livox/mid360 --out twin
       lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
-    """  # noqa: D301 - click wants the character, not its name
+    """  # noqa: D301 - Click requires the character \b
     from ..processes.fork_server import keep_freed_memory
     from ..reconstruction.building import SCENARIO_FILE
     from ..reconstruction.building import twin as build

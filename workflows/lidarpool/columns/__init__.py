@@ -1,1 +1,1 @@
-"""Storage of points: parts, and clouds that are read from parts."""
+"""Parts, the files that store points during a run, and clouds that are read from them."""

@@ -1,4 +1,4 @@
-"""Read parts in blocks of rows, into memory that is reused.
+"""Read parts in blocks of rows into reusable memory.
 
 Each column of a part is stored contiguously, so the columns of one row are far apart in the file.
 If a whole part were read at once, its data would not fit in the CPU caches: it would be written to
@@ -111,11 +111,11 @@ class _Scans(NamedTuple):
     """Range of scans in a part."""
 
     first: int  # number of the first scan
-    row_ends: Ints  # (scans,): number of rows up to and including each scan
+    row_ends: Ints  # number of rows up to and including each scan, shape (scans,)
 
 
 class _OpenPart:
-    """A part that is being read.
+    """A part file that is open for reading.
 
     The constructor and the methods raise LidarError if the part is damaged. The message is a
     clause, which `reading_part` completes to a sentence.

@@ -56,8 +56,8 @@ def part_name(mark: str, job: int, first: int, stop: int) -> str:
     return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
 
 
-def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
-    """Return the job, the first scan and the stop scan from the file name of a part.
+def parse_part_name(name: str, mark: str) -> tuple[int, int, int] | None:
+    """Return the job number, the first scan and the stop scan from the file name of a part.
 
     Return None if the file does not belong to the run with this mark.
     """
@@ -68,7 +68,7 @@ def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
 
 
 def probe_name(mark: str, driver: str) -> str:
-    """Return the name of the file with which a driver tests its workers' access to the folder."""
+    """Return the name of the file with which a driver tests that workers can access the folder."""
     return f"{mark}-probe-{driver}"
 
 
@@ -170,11 +170,11 @@ def reading_part(storage: Storage, name: str) -> Iterator[None]:
         ) from error
 
 
-def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
+def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
     """Read only the hit counts of a part, without its columns.
 
-    Returns the hit counters that are not zero, and the number of hits of each. Both arrays have
-    shape (k,). Raises the same errors as `read_part`.
+    Returns the indices of the hit counters that are not zero, and the number of hits of each
+    counter. Both arrays have shape (k,). Raises the same errors as `read_part`.
     """
     if not storage.is_local:
         part = read_part(storage, name)
@@ -205,9 +205,9 @@ class StoredCloud(CloudDisplay):
     firsts: Sequence[int]  # first scan of each part
     rows: Sequence[int]  # number of points of each part
     columns: Sequence[Column]  # columns of a part
-    cells: Ints | None  # lowest and highest cell, (2, 3); None without points
+    cells: Ints | None  # lowest and highest cells, shape (2, 3); None if there are no points
     precision_m: float  # size of the cells that positions were rounded to
-    origin: Floats  # world position of the scene's local origin, (3,), meters
+    origin: Floats  # scene origin in world coordinates, shape (3,), meters
     keeper: Any = None  # object that deletes the parts when it is garbage-collected
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
     report: Callable[[int], object] = _ignore_progress  # called with the number of points read
@@ -242,11 +242,11 @@ class StoredCloud(CloudDisplay):
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
-        """Return the points of a part as a cloud, optionally only the selected rows."""
+        """Return the points of a part, or only the selected rows, as a cloud."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the name of each axis with the world coordinates along it, in meters."""
+        """Yield the name of each axis and the world coordinates along that axis, in meters."""
         for i, axis in enumerate(AXES):
             yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 
@@ -255,7 +255,7 @@ class StoredCloud(CloudDisplay):
 
         The last chunk may be smaller. Raises LidarError if a part cannot be read.
         """
-        held: list[Cloud] = []
+        pending: list[Cloud] = []
         count = 0
         for name, rows in zip(self.names, self.rows, strict=True):
             if rows <= first:
@@ -266,15 +266,15 @@ class StoredCloud(CloudDisplay):
             self.report(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
-                yield Cloud.joined([*held, cloud[:cut]])
+                yield Cloud.joined([*pending, cloud[:cut]])
                 cloud = cloud[cut:]
-                held = []
+                pending = []
                 count = 0
             if len(cloud):
-                held.append(cloud)
+                pending.append(cloud)
                 count += len(cloud)
-        if held:
-            yield Cloud.joined(held)
+        if pending:
+            yield Cloud.joined(pending)
 
     def row_of(self, scan: int) -> int:
         """Return the row of the first point of a scan."""

@@ -20,7 +20,7 @@ from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
 from ..clouds.folder import result_folder, staging
-from ..report.page.rendering import millimeters, rendered
+from ..report.page.rendering import millimeters, render_template
 from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
@@ -62,7 +62,7 @@ class Comparison:
     points: Sequence[Floats]
 
     def __repr__(self) -> str:
-        return rendered("comparison.txt", report=self.figures).rstrip("\n")
+        return render_template("comparison.txt", report=self.figures).rstrip("\n")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and the pictures, and return their paths.
@@ -85,7 +85,7 @@ class Comparison:
                 pages = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | pages
             pictures = {name: page.svg() for name, page in pages.items()}
             text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
-            report = rendered("comparison.html", report=self.figures, pictures=pictures)
+            report = render_template("comparison.html", report=self.figures, pictures=pictures)
             files = {"compare.json": text.encode(), "compare.html": report.encode()}
             files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
             for name, content in files.items():

@@ -38,7 +38,7 @@ from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import Fit, fit
 from ..recordings.opening import open_recording
-from ..report.page.rendering import rendered
+from ..report.page.rendering import render_template
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import (
@@ -133,7 +133,7 @@ class Twin:
     pictures: dict[str, Any]
 
     def __repr__(self) -> str:
-        return rendered("twin.txt", report=self.figures).rstrip("\n")
+        return render_template("twin.txt", report=self.figures).rstrip("\n")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
@@ -158,7 +158,7 @@ class Twin:
         ):
             write_scene(staged / SCENE_FILE, self.scene)
             pictures = {name: page.svg() for name, page in self.pictures.items()}
-            page = rendered("twin.html", report=self.figures, pictures=pictures)
+            page = render_template("twin.html", report=self.figures, pictures=pictures)
             stated = self.model.model_dump(mode="json", exclude_defaults=True)
             stated |= self.model.model_dump(mode="json", include=_ROTATION_FIELDS)
             model = {name: stated[name] for name in SensorModel.model_fields if name in stated}

@@ -1,1 +1,1 @@
-"""Reading of clouds and recordings in any supported format, sweep by sweep."""
+"""Readers for clouds and recordings in any supported format."""

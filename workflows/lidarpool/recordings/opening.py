@@ -1,4 +1,4 @@
-"""Open clouds and recordings in any supported format, to be read sweep by sweep."""
+"""Open clouds and recordings in any supported format for reading sweep by sweep."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if
 
 
 class UnknownFormatError(LidarError):
-    """The format of a file or folder is not supported.
+    """Raised when the format of a file or folder is not supported.
 
     `advice` contains sentences that suggest a remedy. It may be empty.
     """
@@ -79,7 +79,7 @@ def open_recording(
     unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a recording or cloud in any format, to be read sweep by sweep.
+    """Open a recording or cloud in any format for reading sweep by sweep.
 
     Parameters
     ----------

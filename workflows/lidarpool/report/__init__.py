@@ -1,1 +1,1 @@
-"""Reports and pictures of a result, and its folder."""
+"""Reports, pictures and output folders of results."""

@@ -1,4 +1,8 @@
-"""The data set of a campaign: checks of existing files, and the files that all jobs share."""
+"""Check and write the data set of a campaign.
+
+This module validates the files of an existing data set and writes the files that all jobs share.
+The files of single jobs are written by `lidarpool.datasets`.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +45,8 @@ from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_jobs import file_hashes
 from ..scenario.empty_cloud import empty_cloud_reason, empty_jobs_warning
 
-CAMPAIGN_FILE = "campaign.json"  # the campaign of the data set, and the software that wrote it
-# Entries of CAMPAIGN_FILE and their types.
+CAMPAIGN_FILE = "campaign.json"  # campaign and software that produced the data set
+# Required entries of CAMPAIGN_FILE and their types.
 _RECORDED: dict[str, type] = {
     "identity": dict,
     "fields": dict,
@@ -54,13 +58,14 @@ _RECORDED: dict[str, type] = {
     "shards": list,
 }
 
-# Files of jobs, and the files of `write_shared`, CAMPAIGN_FILE first.
+# Matches the files of jobs and the files that `write_shared_files` writes.
 _FINISHED = re.compile(
     JOB_FILES.pattern
     + r"|(campaign|dataset|report)\.json|README\.md|report\.(html|csv)|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
 )
-# The run, results of single jobs, and files of writers that have not yet noticed the end.
+# Matches files that may exist beside the data set: the run store, the results of single jobs, and
+# temporary files of writers that have not stopped yet.
 _BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")
 
 
@@ -71,7 +76,7 @@ def run_campaign(
     screen: Screen,
     page: RunPage,
 ) -> CampaignRun:
-    """Cast the jobs of a campaign, write the data set, and return a summary."""
+    """Run the jobs of a campaign, write the data set and return a summary."""
     storage = replace(Storage.at(target), durable=False)
     dataset = DataSet(storage, **asdict(campaign.keep))
     output = DataSetOutput(dataset, campaign, options, screen, page)
@@ -79,7 +84,7 @@ def run_campaign(
     with result_folder(target):
         earlier = output.check_existing()
         if earlier.is_complete:
-            return output.finished(earlier)
+            return output.report_complete(earlier)
         with (
             ClusterConnection(campaign, options, screen) as connection,
             open_store(campaign, options, screen) as store,
@@ -90,10 +95,11 @@ def run_campaign(
 
 
 class FinishedDataSet(NamedTuple):
-    """A finished data set that a run continues.
+    """A finished data set that a run extends or repairs.
 
-    `record` is the content of CAMPAIGN_FILE; it is empty if there is no such data set, or the file
-    is damaged, as `note` reports. `wrong` are faults of jobs, {number: a clause}.
+    `record` is the content of CAMPAIGN_FILE. It is empty if there is no finished data set or if the
+    file is damaged, in which case `note` says so. `wrong` maps the numbers of invalid jobs to a
+    clause that describes the problem.
     """
 
     record: Mapping[str, Any] = MappingProxyType({})
@@ -105,17 +111,21 @@ class FinishedDataSet(NamedTuple):
 
 @dataclass(eq=False)
 class DataSetOutput:
-    """The data set of a campaign as the output of a run."""
+    """The output of a run that creates the data set of a campaign."""
 
     dataset: DataSet
     campaign: CampaignSpec
     options: RunOptions
     screen: Screen
     page: RunPage
-    begun_at: float = field(default_factory=time.monotonic)  # seconds
+    begun_at: float = field(default_factory=time.monotonic)  # monotonic clock, seconds
 
     def check_existing(self) -> FinishedDataSet:
-        """Refuse, remove or check a finished data set, and return it if the run continues it."""
+        """Check the existing data set and return it if the run continues it.
+
+        With `restart` or `overwrite`, the existing data set is removed. Raise LidarError if the
+        data set is finished and may not be replaced, or if it belongs to a different campaign.
+        """
         storage = self.dataset.storage
         options = self.options
         run_folder = storage.below(RUN_FOLDER)
@@ -134,8 +144,8 @@ class DataSetOutput:
         if not options.may_continue or CAMPAIGN_FILE not in entries or unfinished:
             return FinishedDataSet()
         try:
-            record = check_same(storage, self.campaign)
-        except DamagedRecordError:  # the manifests name the campaign of the jobs
+            record = check_same_campaign(storage, self.campaign)
+        except DamagedRecordError:  # the manifests also identify the campaign
             return FinishedDataSet(note=f"{CAMPAIGN_FILE} was damaged and has been recreated")
         shard = str(self.campaign.shard)
         if record["shards"] != [shard]:
@@ -146,15 +156,15 @@ class DataSetOutput:
             )
         finished = self._check_finished(record)
         if finished.is_complete:
-            if RUN_FOLDER in entries:  # a killed run may leave files
+            if RUN_FOLDER in entries:  # a killed run may leave files behind
                 remove_run(run_folder)
             if (files := file_hashes(self.campaign.files)) != [*map(tuple, record["files"])]:
-                # `_check_jobs` has found no job of an older file
+                # `_check_jobs` has verified that no job used a previous version of a file.
                 write_record(storage, {**record, "files": files})
         return finished
 
     def _check_finished(self, record: Mapping[str, Any]) -> FinishedDataSet:
-        """Read the rows of a finished data set, and check its jobs."""
+        """Read the job rows of a finished data set and validate its jobs."""
         storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
             seconds = known_seconds(storage)
@@ -171,23 +181,23 @@ class DataSetOutput:
         has_all = not wrong and len(rows) == len(self.campaign.numbers)
         return FinishedDataSet(record, rows, wrong, has_all and _has_shared_files(storage, rows))
 
-    def finished(self, complete: FinishedDataSet) -> CampaignRun:
-        """Report that the data set is complete, and return its sums."""
+    def report_complete(self, complete: FinishedDataSet) -> CampaignRun:
+        """Report that the data set is complete and return its totals."""
         self.screen.tell(f"{self.dataset.storage} is already complete")
         for row in complete.rows:
             self.page.ended(row)
-        notes = (*self._warnings_of_empty_jobs(complete.rows),)
+        notes = (*self._warn_of_empty_jobs(complete.rows),)
         sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
         return sums
 
-    def _warnings_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
-        """Warn if jobs have no points, and return the warning, if any."""
+    def _warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
+        """Warn if jobs have no points, and return the warning as a list with at most one item."""
         empty = [row for row in rows if row.done and not row.points]
         if not empty:
             return []
         reason = ""
-        with suppress(LidarError):  # a file that the job is made of may be gone
+        with suppress(LidarError):  # an input file of the job may have been deleted
             job = self.campaign.job(empty[0].number)
             reason = empty_cloud_reason(job.scene, job.survey)
         warning = empty_jobs_warning(empty, reason)
@@ -195,7 +205,11 @@ class DataSetOutput:
         return [warning]
 
     def compare_with_store(self, earlier: FinishedDataSet, store: RunStore) -> None:
-        """Compare existing jobs with the run's store, and add jobs that the store lacks."""
+        """Compare existing jobs with the run store, and add the jobs that the store lacks.
+
+        Jobs that are invalid, or that have failed and should be retried, are removed from the
+        store, so that they run again.
+        """
         options = self.options
         if record := earlier.record:
             store.cast_with(record["backend"], record["casting"])
@@ -203,10 +217,10 @@ class DataSetOutput:
             store.adopt(rows, sensors=json.dumps(record["sensors"]))
         elif options.may_continue:
             store.notes += [earlier.note] * bool(earlier.note)
-            self._take_over(store)
-        # Some jobs were perhaps taken over.
+            self._adopt_finished_jobs(store)
+        # Finished jobs may have been added to the store above.
         begun = store.begun or bool(store.committed_in_words)
-        dataset_files(self.dataset.storage, begun=begun)
+        list_dataset_files(self.dataset.storage, begun=begun)
         wrong = earlier.wrong
         if not record:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
@@ -219,11 +233,11 @@ class DataSetOutput:
         for row in store.rows():
             self.page.ended(row)
 
-    def _take_over(self, store: RunStore) -> None:
-        """Add finished jobs to the store whose database was lost."""
+    def _adopt_finished_jobs(self, store: RunStore) -> None:
+        """Add finished jobs to a store that has lost its database."""
         names = {row.name for row in store.rows()}
         rows: list[JobRow] = []
-        seconds = known_seconds(self.dataset.storage)  # of a data set whose record was damaged
+        seconds = known_seconds(self.dataset.storage)  # available if only the record was damaged
         with explained(f"{self.dataset.storage} cannot be read"):
             for row, made_with in self.dataset.rows(names):
                 if made_with.get("identity") != store.made_with["identity"]:
@@ -235,12 +249,12 @@ class DataSetOutput:
         store.adopt(rows)
 
     def publish(self, committed: Committed) -> CampaignRun:
-        """Write the shared files, and remove the run unless jobs have failed."""
+        """Write the shared files, and remove the run store unless a job has failed."""
         store = committed.store
         seconds = time.monotonic() - self.begun_at
         notes = committed.notes
-        warnings = self._warnings_of_empty_jobs(store.rows())
-        if self.campaign.shard == ALL:  # else the merged data set has this note
+        warnings = self._warn_of_empty_jobs(store.rows())
+        if self.campaign.shard == ALL:  # otherwise, the merged data set gets this note
             notes += (*warnings,)
         if untimed := [row.name for row in store.rows() if row.done and row.seconds is None]:
             notes += (
@@ -266,9 +280,10 @@ class DataSetOutput:
             "campaign": self.campaign.described,
             "shards": [str(self.campaign.shard)],
         }
-        write_record(self.dataset.storage, record)  # before the files that it assigns to a campaign
+        # The record is written first, because it associates the other files with a campaign.
+        write_record(self.dataset.storage, record)
         replace(self.dataset, made_with=store.made_with).write_failed(store.rows())
-        sums, _ = write_shared(self.dataset, record, sums, store.rows)
+        sums, _ = write_shared_files(self.dataset, record, sums, store.rows)
         if sums.failed:
             store.save(force=True)
             store.db.close()
@@ -279,17 +294,25 @@ class DataSetOutput:
 
 
 class DamagedRecordError(LidarError):
-    """CAMPAIGN_FILE cannot be read any more."""
+    """Raised when CAMPAIGN_FILE is damaged or has been edited."""
 
 
 def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
-    """Write CAMPAIGN_FILE."""
+    """Write CAMPAIGN_FILE with a checksum."""
     with explained(f"{storage} cannot be written"):
         storage.write(CAMPAIGN_FILE, seal_json(record))
 
 
 def read_record(storage: Storage) -> dict[str, Any]:
-    """Read CAMPAIGN_FILE, or raise DamagedRecordError, or LidarError if there is none."""
+    """Read CAMPAIGN_FILE and verify its checksum.
+
+    Raises
+    ------
+    DamagedRecordError
+        If the file is damaged or has been edited.
+    LidarError
+        If the file is missing or cannot be read.
+    """
     check_exists(storage, "specify the output folder of a campaign")
     try:
         record = unseal_json(storage.read(CAMPAIGN_FILE))
@@ -312,9 +335,9 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
 
 def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
-    """Return True if the job table has these rows, and the last file lists as many jobs.
+    """Return True if the job table contains exactly these rows, and the index as many jobs.
 
-    The last file has the checksum of the table.
+    The checksum of the job table is stored in the index and is verified, too.
     """
     with suppress(LidarError):
         index = read_index(storage)
@@ -325,7 +348,10 @@ def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
 
 
 def read_notes(storage: Storage) -> list[str]:
-    """Return the notes in the report of a data set, or a note that the report is unusable."""
+    """Return the notes in the report of a data set.
+
+    If the report is damaged, return a single note that says so.
+    """
     try:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
@@ -336,31 +362,44 @@ def read_notes(storage: Storage) -> list[str]:
     return [f"{storage.path(LAST_FILE)} is damaged: {reason}. Its notes are lost"]
 
 
-def write_shared(
+def write_shared_files(
     dataset: DataSet,
     record: Mapping[str, Any],
     sums: CampaignRun,
     rows: Callable[[], Iterator[JobRow]],
 ) -> tuple[CampaignRun, dict[str, Any]]:
-    """Write the shared files of a data set.
+    """Write the files of a data set that all jobs share.
 
-    The last file marks the data set as complete.
+    The last file that is written marks the data set as complete.
 
-    `record` is for CAMPAIGN_FILE. Returns the sums, with names of classes, and the content of
-    report.json.
+    Parameters
+    ----------
+    dataset
+        The data set, which already contains the files of its jobs.
+    record
+        Content of CAMPAIGN_FILE.
+    sums
+        Totals of the run.
+    rows
+        Function that returns an iterator over the job rows. It is called several times.
+
+    Returns
+    -------
+    The totals with the class names added, and the content of report.json.
     """
-    # Matplotlib takes as long as all other imports.
+    # Importing Matplotlib takes as long as all other imports together.
     from .campaign_report import write_card
     from .charts import draw_sweep
 
     campaign = record["campaign"]
     storage = dataset.storage
     with explained(f"{storage} cannot be written"):
-        storage.remove([INDEX_FILE])  # which has the checksum of the table
+        storage.remove([INDEX_FILE])  # contains the checksum of the table that is replaced next
     write_table(storage, campaign["names"], rows)
-    write_record(storage, record)  # behind the table, which has the jobs of all shards in it
+    # The record is written after the table, so it never lists shards that the table lacks.
+    write_record(storage, record)
     dataset.finish(rows())
-    # Notes on sensors that have other names in the data set.
+    # Some formats restrict sensor names, so sensors may be renamed in the data set.
     cloud_format = load_format(DATA_SETS[dataset.format])
     sensors_of_jobs = read_index(storage)["jobs"].values()
     renamed = (
@@ -379,12 +418,13 @@ def _check_jobs(
     contents: bool,
     campaign: CampaignSpec | None = None,
 ) -> dict[int, str]:
-    """Describe the faults of jobs, {number: a clause}.
+    """Validate jobs, and return {job number: a clause that describes the problem}.
 
-    LidarError if a file of the campaign differs from the file that intact jobs are made of.
+    Raise LidarError if a job is not part of the campaign, or if an input file of the campaign has
+    changed since intact jobs were created from it.
     """
     wrong = dict[int, str]()
-    # {name and hash of a file: jobs made of it}
+    # {(name, hash) of an input file: names of the jobs created from it}
     jobs_of_file: dict[tuple[str, str], list[str]] = {}
     with explained(f"{dataset.storage} cannot be read"):
         for row, (manifest, difference) in dataset.check_jobs(rows, contents=contents):
@@ -413,10 +453,17 @@ def _check_jobs(
     return wrong
 
 
-def verify(storage: Storage, number: int | None = None) -> str:
-    """Compare the files of a finished data set, or of a job in the data set, with their checksums.
+def verify_dataset(storage: Storage, number: int | None = None) -> str:
+    """Verify the checksums of a finished data set, or of a single job in it.
 
-    Returns a line; LidarError names damaged files, or the missing data set.
+    Returns
+    -------
+    A line of text that confirms that the data set is intact.
+
+    Raises
+    ------
+    LidarError
+        If there is no finished data set, or if files are damaged. The message names these files.
     """
     index = read_index(storage)
     dataset = DataSet(storage, index["format"], index["layout"], index["compensated"])
@@ -435,10 +482,13 @@ def verify(storage: Storage, number: int | None = None) -> str:
     return f"{storage} is intact, with {plural(len(rows), 'job')}"
 
 
-def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
-    """Check that a data set is of this campaign and software, and return its record.
+def check_same_campaign(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
+    """Check that a data set was created by this campaign and software, and return its record.
 
-    LidarError names each difference.
+    Raises
+    ------
+    LidarError
+        If the software or the campaign differs. The message names the difference.
     """
     record = read_record(storage)
     installed = software(record["backend"])
@@ -461,10 +511,15 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     return record
 
 
-def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
-    """Name the files of a data set, which is empty unless `begun`.
+def list_dataset_files(storage: Storage, *, begun: bool) -> list[str]:
+    """Return the names of all files in a data set.
 
-    LidarError if there is a link, or a file that neither jobs nor `write_shared` write.
+    The folder must be empty unless the data set has been `begun`.
+
+    Raises
+    ------
+    LidarError
+        If the folder contains a link or a file that does not belong to a data set.
     """
     files = [name for name in storage.tree() if not _BESIDE.fullmatch(name)]
     allowed = _FINISHED if CAMPAIGN_FILE in files else JOB_FILES
@@ -478,18 +533,22 @@ def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
 
 
 def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
-    """Remove a data set and its run, unless LidarError names further files."""
+    """Remove a data set and its run store.
+
+    Raise LidarError if the folder contains other files.
+    """
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
-    files = dataset_files(storage, begun=begun)
+    files = list_dataset_files(storage, begun=begun)
     with explained(f"{storage} cannot be removed"):
         storage.tidy()
-        # First the file that marks it as finished, and last the file that marks it as a data set.
+        # INDEX_FILE, which marks the data set as finished, is removed first. CAMPAIGN_FILE, which
+        # identifies the folder as a data set, is removed last.
         storage.prune(sorted(files, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)))
     remove_run(run_folder)
 
 
-def failures(sums: CampaignRun, max_errors: int = 5) -> str:
-    """Describe the different errors of jobs that have failed, with the values of the jobs."""
+def describe_failures(sums: CampaignRun, max_errors: int = 5) -> str:
+    """Summarize the errors of failed jobs, with the varied values of these jobs."""
     head = f"{plural(len(sums.failed), 'job')} failed and {sums.done:,} succeeded:"
     errors = []
     for row in sums.failed:

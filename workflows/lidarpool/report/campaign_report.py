@@ -1,4 +1,4 @@
-"""The card of a data set, README.md, its page and its figures as JSON."""
+"""Write the reports of a data set: its dataset card (README.md), HTML page and report.json."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_times, draw_varied
-from .page.rendering import rendered
-from .report import stage_figures
+from .page.rendering import render_template
+from .report import stage_statistics
 
 CARD = "README.md"
 PAGE = "report.html"
 PICTURES = "pictures"
 SPLITS = "splits"
-VALUES_SHOWN = 12  # shown values of a quantity with labels
+VALUES_SHOWN = 12  # maximum number of labels shown per quantity
 _CAPTIONS = {
     "job": "A sweep from one of the jobs.",
     "varied": (
@@ -37,7 +37,8 @@ _CAPTIONS = {
     ),
     "results": "Results: histograms of jobs by number of points and by share of rays that hit.",
 }
-# Of the page alone: the card and the files of pictures are the same in every run.
+# Casting times appear only on the page, because the card and the picture files must be identical in
+# every run.
 _PAGE_CAPTIONS = {
     **_CAPTIONS,
     "times": "Histogram of jobs by casting time, summed over all tasks of a job.",
@@ -52,24 +53,24 @@ def write_card(
     versions: Mapping[str, str],
     picture: Page | None = None,
 ) -> dict[str, Any]:
-    """Write README.md, report.html, report.csv, pictures and splits, and report.json last.
+    """Write the dataset card, the reports, the pictures and the split files of a data set.
 
-    Casting times are in the files of the report alone: report.html, report.csv and report.json.
-
-    The rows of the table are read once; a few numbers of each job are held in memory.
+    report.json is written last. Only report.html, report.csv and report.json contain casting times,
+    so the other files are the same in every run. The job rows are iterated once, and only a few
+    numbers per job are held in memory.
 
     Parameters
     ----------
     storage
         Folder of the data set, which must exist.
     campaign, run
-        The campaign as in `CampaignSpec.described`, and the sums of its run.
+        The campaign in the form of `CampaignSpec.described`, and the totals of its run.
     jobs
-        Rows in order, such as `lidarpool.datasets.job_table.read_table` gives.
+        Job rows in order, for example from `lidarpool.datasets.job_table.read_table`.
     versions
-        Software on which the bytes of points depend, {name: version}.
+        {name: version} of the software that determines the bytes of the points.
     picture
-        Of one job, for README.md.
+        Picture of one job, shown in README.md.
 
     Returns
     -------
@@ -78,7 +79,7 @@ def write_card(
     Raises
     ------
     LidarError
-        If a file cannot be written, or a split cannot be the name of a file.
+        If a file cannot be written, or if the name of a split is not a valid file name.
     """
     with explained(
         f"The card of the data set cannot be written to {storage}", "free some disk space"
@@ -100,9 +101,9 @@ def write_card(
         }
         on_page = {name: pages[name] for name in ("varied", "results")}
         on_page["times"] = draw_times(figures)
-        page = rendered(
+        page = render_template(
             "campaign.html",
-            captions=_PAGE_CAPTIONS,  # readers of screens need captions
+            captions=_PAGE_CAPTIONS,  # also read by screen readers
             pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
             slowest=figures.slowest,
             description=campaign["description"],
@@ -110,7 +111,7 @@ def write_card(
             stages=run.stages,
         )
         storage.write(PAGE, page.encode())
-        card = rendered("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
+        card = render_template("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
         storage.write(CARD, card.encode("utf-8", "backslashreplace"))
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         storage.write(LAST_FILE, text.encode())
@@ -118,7 +119,10 @@ def write_card(
 
 
 def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
-    """Yield rows, and write the names of done jobs into the files of their splits."""
+    """Yield the rows unchanged, and write the names of finished jobs to the files of their splits.
+
+    Raise LidarError if the name of a split is not a valid file name.
+    """
     with ExitStack() as stack:
         files: dict[str, Any] = {}
         for row in jobs:
@@ -141,7 +145,7 @@ def campaign_report(
     versions: Mapping[str, str],
     figures: DataSetStatistics,
 ) -> dict[str, Any]:
-    """Return the figures of a data set, as in report.json."""
+    """Return the statistics of a data set in the form of report.json."""
     return {
         "title": campaign["title"],
         "format": campaign["keep"]["format"],
@@ -174,13 +178,13 @@ def campaign_report(
         "varied": list(figures.summaries()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],
-        "stages": stage_figures(run.stages),
+        "stages": stage_statistics(run.stages),
         "sha256": figures.sha256,
     }
 
 
 def _job_entry(row: JobRow, field: str) -> dict[str, Any]:
-    """Return a job with its values and a field of its row, for JSON."""
+    """Return a JSON object with the number, name and values of a job, and one field of its row."""
     values = {
         name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in row.values.items()

@@ -1,4 +1,4 @@
-"""Charts of the jobs of a data set, and the picture of one of its sweeps."""
+"""Draw charts of the jobs in a data set, and a picture of one of its sweeps."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from ..datasets.figures import DataSetStatistics, VariedQuantity
 from .page.rendering import NARROW
 
 WIDTH = 1600
-MAX_VARIED = 8  # quantities in a picture
-MAX_COLUMNS = 4  # columns of charts, side by side
+MAX_VARIED = 8  # quantities per picture
+MAX_COLUMNS = 4  # charts side by side
 MAX_DOTS = 5_000
 DOT = "#5b8fd0"
 BAR = "#7aa5d8"
-# pixels around the charts
+# Layout of the charts, pixels.
 LEFT = 118
 RIGHT = 40
 TOP = 186
-COLUMN_GAP = 78  # columns of charts
-# heights: histogram, dots, and labels under them
-COUNTS_HEIGHT = 120
-GAP = 20
-DOTS_HEIGHT = 340
-LABEL_HEIGHT = 60
-SLANTED_HEIGHT = 56  # more below slanted labels
-ROW_GAP = 76  # gap between two rows of charts
-PERCENTILES = (10, 50, 90)  # percentiles of the points of jobs with near values
-MAX_COLORS = 6  # labels that have separate colors
-# groups of jobs with similar values, whose medians are drawn; jobs of a group
-_MAX_GROUPS = 12
-_MIN_GROUP = 8
+COLUMN_GAP = 78  # between columns of charts
+COUNTS_HEIGHT = 120  # histogram
+GAP = 20  # between the histogram and the scatter plot
+DOTS_HEIGHT = 340  # scatter plot
+LABEL_HEIGHT = 60  # tick labels below the scatter plot
+SLANTED_HEIGHT = 56  # additional height of slanted labels
+ROW_GAP = 76  # between rows of charts
+PERCENTILES = (10, 50, 90)  # percentiles of points per job, drawn for each group of jobs
+MAX_COLORS = 6  # maximum number of labels with separate colors
+_MAX_GROUPS = 12  # maximum number of groups of jobs with similar values
+_MIN_GROUP = 8  # minimum average number of jobs per group
 SWEEP_SIZE = (1600, 1000)
 SWEEP_DOTS = 150_000
-SWEEP_FRAME = (90, 60, 1210, 750)  # left, bottom, width, height of the drawing, pixels
-SWEEP_SHARE = 0.97  # share of the points that are within the drawing
-MAX_VALUES = 4  # limit for named values
+SWEEP_FRAME = (90, 60, 1210, 750)  # left, bottom, width and height of the plot, pixels
+SWEEP_SHARE = 0.97  # share of the points that lie within the plot
+MAX_VALUES = 4  # maximum number of varied values in the title
 
 
 def draw_varied(figures: DataSetStatistics) -> Page | None:
-    """Draw a histogram of each varied quantity above a plot of the points of jobs by value.
+    """Draw a histogram and a scatter plot for each varied quantity.
 
-    Jobs have the colors of the quantity of few labels whose groups differ most in points. None
-    without varied quantities or jobs.
+    The scatter plot below each histogram shows the number of points of each job as a function of
+    the quantity. Jobs are colored by the most informative quantity: of the quantities with few
+    labels, the one whose groups of jobs differ most in their mean number of points. Return None if
+    there are no varied quantities or no jobs.
     """
     drawable = [varied for varied in figures.varied if len(varied.known_values)]
     if not drawable:
@@ -66,7 +66,7 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
     page = Page((WIDTH, layout.page_height))
     points = figures.per_job("points")
     failures = figures.failures
-    limits = _limits(points[~failures])
+    limits = _axis_limits(points[~failures])
     informative = _most_informative(scales, points, ~failures)
     colors = _dot_colors(informative, len(points))
     for number, scale in enumerate(scales):
@@ -88,11 +88,11 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
 
 
 class _Layout(NamedTuple):
-    """Rows and columns of charts, in pixels."""
+    """Layout of the charts on a page, in pixels."""
 
     row_count: int
     column_count: int
-    width: float  # width of a chart
+    width: float  # of a chart
     row_height: int
 
     @classmethod
@@ -107,22 +107,22 @@ class _Layout(NamedTuple):
 
     @property
     def page_height(self) -> int:
-        """Height of the page, pixels."""
+        """Height of the page in pixels."""
         return TOP + self.row_count * self.row_height + (self.row_count - 1) * ROW_GAP
 
     def add_charts(self, page: Page, number: int) -> tuple[Axes, Axes]:
-        """Add the upper and the lower chart of a quantity."""
+        """Add the histogram and the scatter plot of a quantity, and return their axes."""
         row, column = divmod(number, self.column_count)
         x = LEFT + column * (self.width + COLUMN_GAP)
         y = TOP + row * (self.row_height + ROW_GAP)
-        upper = _chart(page, x, y, self.width, COUNTS_HEIGHT)
-        lower = _chart(page, x, y + COUNTS_HEIGHT + GAP, self.width, DOTS_HEIGHT)
+        upper = _add_axes(page, x, y, self.width, COUNTS_HEIGHT)
+        lower = _add_axes(page, x, y + COUNTS_HEIGHT + GAP, self.width, DOTS_HEIGHT)
         return upper, lower
 
     def label_charts(
         self, page: Page, number: int, scale: VariedQuantity, upper: Axes, lower: Axes
     ) -> None:
-        """Label the axes of the charts of a quantity, and write its name above."""
+        """Label the axes of both charts of a quantity, and add its name as a heading."""
         is_first = number % self.column_count == 0
         for axes, quantity in ((upper, "jobs"), (lower, "points per job")):
             _set_labels(page, axes, scale, self.width)
@@ -136,7 +136,10 @@ class _Layout(NamedTuple):
 
 
 def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
-    """Return the colors (jobs, 3) of dots, by the labels of a quantity, if any."""
+    """Return one RGB color per job, by the labels of the informative quantity if there is one.
+
+    The result has shape (jobs, 3).
+    """
     colors = np.tile(theme.rgb(DOT), (count, 1))
     if informative is not None:
         label_colors = theme.object_colors(len(informative.labels))
@@ -146,7 +149,7 @@ def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
 
 
 def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hidden: int) -> str:
-    """Return a sentence about colors, failures and the number of hidden quantities."""
+    """Return a sentence about the colors, failed jobs, and omitted dots and quantities."""
     remarks = []
     if informative is not None:
         remarks.append(f"colored by {shortened(informative.name, 40)}")
@@ -163,8 +166,11 @@ def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hid
 def _most_informative(
     scales: Sequence[VariedQuantity], points: Floats, is_done: Bools
 ) -> VariedQuantity | None:
-    """Return the quantity of few labels whose groups differ most in points, or None without any."""
-    variances = {}  # {quantity: variance of the means of its groups}
+    """Return the quantity with few labels whose groups differ most in their mean number of points.
+
+    Return None if no quantity has between two and MAX_COLORS labels.
+    """
+    variances = {}  # {quantity: variance of the group means, weighted by the number of jobs}
     for scale in scales:
         is_known = is_done & np.isfinite(scale.values)
         if 2 <= len(scale.labels) <= MAX_COLORS and is_known.any():
@@ -175,7 +181,10 @@ def _most_informative(
 
 
 def draw_results(figures: DataSetStatistics) -> Page | None:
-    """Draw how points and hits are distributed over jobs, or None if no job is done."""
+    """Draw histograms of the points and of the hit rates of jobs.
+
+    Return None if no job has succeeded.
+    """
     is_done = ~figures.failures
     points, rays, hits = (figures.per_job(name)[is_done] for name in ("points", "rays", "hits"))
     with np.errstate(invalid="ignore"):
@@ -187,7 +196,7 @@ def draw_results(figures: DataSetStatistics) -> Page | None:
 
 
 def draw_times(figures: DataSetStatistics) -> Page | None:
-    """Draw how casting times are distributed over jobs, or None if none is known."""
+    """Draw a histogram of the casting times of jobs, or return None if no times are known."""
     seconds = figures.per_job("seconds")[~figures.failures]
     seconds = seconds[np.isfinite(seconds)]
     quantity = VariedQuantity("casting time per job (all tasks), s", seconds)
@@ -197,7 +206,10 @@ def draw_times(figures: DataSetStatistics) -> Page | None:
 def _draw_distributions(
     quantities: Sequence[VariedQuantity], title: str, caption: str
 ) -> Page | None:
-    """Draw the numbers of jobs by quantities, side by side, or None without any job."""
+    """Draw histograms of jobs side by side, one for each quantity.
+
+    Return None if there are no jobs.
+    """
     if not len(quantities[0].values):
         return None
     height = 250
@@ -205,7 +217,7 @@ def _draw_distributions(
     page = Page((WIDTH, top + height + 92))
     width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (len(quantities) - 1)) / len(quantities)
     for column, quantity in enumerate(quantities):
-        axes = _chart(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
+        axes = _add_axes(page, LEFT + column * (width + COLUMN_GAP), top, width, height)
         _draw_counts(axes, quantity, np.zeros(len(quantity.values), np.bool_), [BAR])
         _set_labels(page, axes, quantity, width)
         axes.set_xlabel(quantity.name)
@@ -218,8 +230,11 @@ def _draw_distributions(
     return page
 
 
-def _chart(page: Page, x: float, y: float, chart_width: float, chart_height: float) -> Axes:
-    """Add axes at a position and of a size in pixels, with an unobtrusive frame."""
+def _add_axes(page: Page, x: float, y: float, chart_width: float, chart_height: float) -> Axes:
+    """Add axes with an unobtrusive frame.
+
+    `x`, `y`, `chart_width` and `chart_height` are in pixels, measured from the top left corner.
+    """
     width, height = page.size
     axes = page.chart(
         (x / width, 1 - (y + chart_height) / height, chart_width / width, chart_height / height)
@@ -227,14 +242,14 @@ def _chart(page: Page, x: float, y: float, chart_width: float, chart_height: flo
     axes.yaxis.set_major_locator(
         MaxNLocator(4 if chart_height > COUNTS_HEIGHT else 2, integer=True)
     )
-    axes.yaxis.set_major_formatter(_tick)
+    axes.yaxis.set_major_formatter(_format_tick)
     axes.xaxis.grid(visible=False)
     axes.tick_params(which="both", color=theme.LINE)
     return axes
 
 
-def _tick(value: float, _: object = None) -> str:
-    """Write a number at an axis: «1.5 M»."""
+def _format_tick(value: float, _: object = None) -> str:
+    """Format a tick label, for example "1.5 M"."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
             return f"{value / size:.4g}{NARROW}{letter}"
@@ -242,8 +257,8 @@ def _tick(value: float, _: object = None) -> str:
 
 
 def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Iterable[Any]) -> None:
-    """Draw a histogram with bars in `colors`, behind a histogram of failed jobs."""
-    bar_width = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
+    """Draw a histogram with bars in `colors`, and a histogram of the failed jobs on top of it."""
+    bar_width = 0.7 if scale.labels else 1.0  # gaps show that labels have no order
     edges = scale.edges.tolist()
     failed = scale.values[failures & np.isfinite(scale.values)]
     counts, *_ = axes.hist(scale.known_values, edges, rwidth=bar_width)
@@ -256,13 +271,16 @@ def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Ite
 def _draw_points(
     page: Page, axes: Axes, scale: VariedQuantity, points: Floats, failures: Bools, colors: Floats
 ) -> None:
-    """Draw a dot for each job, in `colors` (jobs, 3), with failed jobs at the bottom."""
+    """Draw a scatter plot with a dot for each job, and crosses at the bottom for failed jobs.
+
+    `points` has shape (jobs,), and `colors` has shape (jobs, 3).
+    """
     unit = page.unit
     is_known = np.isfinite(scale.values)
     done_jobs = np.flatnonzero(is_known & ~failures)
     drawn = done_jobs[even_indices(len(done_jobs), MAX_DOTS)]
     x = scale.values.copy()
-    if scale.labels:  # spread over the bar, the same in each picture of the same jobs
+    if scale.labels:  # deterministic jitter within the bar, so that pictures are reproducible
         x += 0.5 * (np.arange(len(x)) * 0.618034 % 1 - 0.5)
     size = float(np.clip(300 / np.sqrt(max(len(drawn), 1)), 4, 30)) * unit**2
     alpha = float(np.clip(16 / np.sqrt(max(len(drawn), 1)), 0.25, 0.85))
@@ -301,17 +319,17 @@ def _draw_percentiles(
     done_jobs: Indices,
     line_width: float,
 ) -> None:
-    """Draw the percentiles of points (jobs,) of jobs with the same label, or similar x (jobs,).
+    """Plot percentiles of `points`, grouping jobs by label or by similar `x`.
 
-    Each group of jobs has a bar. A line from group to group would show the other quantities of
-    these jobs as ups and downs.
+    Both arrays have shape (jobs,). Each group is drawn as a separate horizontal bar. A line that
+    connects the groups would suggest a trend where the jobs differ in other quantities.
     """
     if scale.labels:
         bins = np.unique(scale.values[done_jobs])
         groups = [done_jobs[scale.values[done_jobs] == number] for number in bins]
         bars = bins[:, None] + [-0.35, 0.35, np.nan]
     else:
-        groups = _groups_of_near(x, done_jobs)
+        groups = _group_similar_jobs(x, done_jobs)
         bars = _adjoining_bars([x[group] for group in groups])
     if groups:
         percentiles = [np.percentile(points[group], PERCENTILES) for group in groups]
@@ -320,10 +338,11 @@ def _draw_percentiles(
         axes.plot(bars.ravel(), median, color=theme.INK, lw=line_width, solid_capstyle="butt")
 
 
-def _groups_of_near(x: Floats, jobs: Indices) -> list[Indices]:
-    """Return groups of jobs with near values x (jobs,), in their order, or none for too few jobs.
+def _group_similar_jobs(x: Floats, jobs: Indices) -> list[Indices]:
+    """Divide jobs into groups with similar values of `x`, ordered by value.
 
-    Jobs with equal values are in one group.
+    `x` has shape (all jobs,), and `jobs` contains indices into it. Jobs with equal values are in
+    the same group. Return an empty list if there are too few jobs.
     """
     count = min(_MAX_GROUPS, len(jobs) // _MIN_GROUP)
     if count < 2:
@@ -335,9 +354,10 @@ def _groups_of_near(x: Floats, jobs: Indices) -> list[Indices]:
 
 
 def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
-    """Return the left and right ends of bars of groups of values, and NaN: (groups, 3).
+    """Return the left end and the right end of the bar of each group, followed by NaN.
 
-    Bars of neighboring groups meet halfway between the groups.
+    Bars of adjacent groups meet halfway between the groups. NaN interrupts the line that is drawn
+    through the ends. The result has shape (groups, 3).
     """
     lowest = np.array([values.min() for values in groups])
     highest = np.array([values.max() for values in groups])
@@ -347,8 +367,11 @@ def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
     return np.stack([left, right, np.full(len(groups), np.nan)], axis=1)
 
 
-def _limits(points: Floats) -> tuple[float, float]:
-    """Return the limits of an axis of points: from 0, unless all jobs have similar numbers."""
+def _axis_limits(points: Floats) -> tuple[float, float]:
+    """Return the axis limits for numbers of points.
+
+    The axis starts at 0 unless all jobs have similar numbers of points.
+    """
     if not len(points):
         return 0.0, 1.0
     lower = float(points.min())
@@ -360,7 +383,7 @@ def _limits(points: Floats) -> tuple[float, float]:
 
 
 def _set_labels(page: Page, axes: Axes, scale: VariedQuantity, width: float) -> None:
-    """Set the limits of the axis of values, and name its bins or numbers."""
+    """Set the limits and the tick labels of the x-axis."""
     axis = axes.xaxis
     lower, upper = scale.edges[[0, -1]].tolist()
     if scale.labels:
@@ -376,14 +399,18 @@ def _set_labels(page: Page, axes: Axes, scale: VariedQuantity, width: float) -> 
         label_logarithms(axis, upper < 1000 * lower)
     else:
         axes.set_xlim(lower - 0.02 * (upper - lower), upper + 0.02 * (upper - lower))
-        is_integer = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
+        is_integer = bool((scale.edges % 1 == 0.5).all())  # each bin is centered on an integer
         max_ticks = max(2, min(6, int(width / 90)))
         axis.set_major_locator(MaxNLocator(max_ticks, integer=is_integer, min_n_ticks=1))
-    axis.set_major_formatter(_tick)
+    axis.set_major_formatter(_format_tick)
 
 
 def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
-    """Draw the points of a sweep in the sensor frame, colored by class, or else by height."""
+    """Draw the points of a sweep in the sensor frame, as seen from above.
+
+    Points are colored by class if there is more than one class, otherwise by height. `names` maps
+    class numbers to names.
+    """
     page = Page(SWEEP_SIZE)
     frame = np.divide(SWEEP_FRAME, SWEEP_SIZE * 2)
     axes = page.chart((frame[0], frame[1], frame[2], frame[3]))

@@ -1,4 +1,4 @@
-"""Statistics of a cloud for its report, counted while the cloud is written."""
+"""Statistics of a point cloud for its report, computed while the cloud is written."""
 
 from __future__ import annotations
 
@@ -14,36 +14,42 @@ from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
 from .count_loops import SHIFT, count_cells, count_labels
 
-_SQUARES = 1024  # most pixels along an axis of the points from above, a power of two
-_MIN_SQUARES = 50  # pixels along an axis that are not joined, however few the points are
-_MIN_POINTS = 30  # points in a square, in the median, that suffice for an estimate of density
-_MIN_DENSITY_SQUARES = 16  # squares along an axis that are not joined for it
+_SQUARES = 1024  # maximum grid size along each axis, a power of two
+_MIN_SQUARES = 50  # top views of at most this size along both axes are not coarsened
+_MIN_POINTS = 30  # median number of points per square that suffices to estimate the density
+_MIN_DENSITY_SQUARES = 16  # grids of at most this size are not coarsened for the density
 
 
 class Density(NamedTuple):
-    """Points per square meter seen from above, over the squares of a grid that contain points."""
+    """Horizontal point density in points per square meter, over the squares that contain points."""
 
-    mean: float  # all points over the area of these squares
-    median: float  # of the squares
-    cell_m: float  # side of a square in meters
+    mean: float  # number of points divided by the total area of the squares
+    median: float  # median over the squares
+    cell_m: float  # side length of a square in meters
 
 
 class CloudCounts:
-    """Statistics of a cloud, whose points are added piece by piece.
-
-    `by_object`, `by_class` and `by_material` are the numbers of points of each object, class and
-    material, `no_surface` the points of no object, and `limits` are {column: minimum and maximum}.
+    """Statistics of a point cloud whose points are added in batches.
 
     Parameters
     ----------
     table
-        Columns beside the positions.
+        All columns except the positions.
     objects, materials
-        Numbers of objects and materials of the scene.
+        Numbers of objects and materials in the scene.
     precision_m
-        Size of the cells of positions, meters.
+        Size in meters of the cells that positions are rounded to.
     origin
-        World position of the cell 0, 0, 0, (3,), meters.
+        World position of cell (0, 0, 0) in meters. Shape (3,).
+
+    Attributes
+    ----------
+    by_object, by_class, by_material
+        Number of points for each object, class and material.
+    no_surface
+        Number of points that do not belong to an object.
+    limits
+        {column name: (minimum, maximum)}.
     """
 
     def __init__(
@@ -65,7 +71,7 @@ class CloudCounts:
         self._squares = GridCounts(_SQUARES)
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
-        """Add points: {name of a column: (n,)}, n > 0."""
+        """Add the values of points, as {column name: array of shape (n,)} with n > 0."""
         self.no_surface += count_labels(columns["object"], self.by_object)
         if "class" in columns:
             count_labels(columns["class"], self.by_class)
@@ -79,22 +85,30 @@ class CloudCounts:
 
     def _add_limits(self, name: str, lower: float, upper: float) -> None:
         limits = self.limits.get(name, (np.inf, -np.inf))
-        # Of 0.0 and -0.0, which are equal, the one that comes first would be the limit.
+        # Adding 0 turns -0.0 into 0.0. Otherwise, the sign would depend on the order of the points.
         self.limits[name] = (min(limits[0], lower) + 0, max(limits[1], upper) + 0)
 
     def widen(self, cell_box: Ints) -> None:
-        """Make room for points between lowest and highest cells, (2, 3), before they are added."""
+        """Extend the grid to the box of points that will be added.
+
+        `cell_box` contains the lowest and the highest cell of the box. Shape (2, 3).
+        """
         self._squares.widen(cell_box)
 
     def add_positions(self, cells: Sequence[Ints32]) -> None:
-        """Add points by their cells along x and y, (n,) each; further axes are ignored.
+        """Add the positions of points.
 
-        Intermediate arrays are as long as these: some 10⁵ points at a time stay in a cache.
+        `cells` contains one array of shape (n,) for each axis. Axes other than x and y are ignored.
+        Intermediate arrays have the same length, so batches of about 10⁵ points stay in the CPU
+        cache.
         """
         self._squares.add(cells[0], cells[1])
 
     def merge(self, other: CloudCounts) -> None:
-        """Add the points of other counts of the same cloud, whose counts are no longer used."""
+        """Add the statistics of other points of the same cloud.
+
+        `other` must not be used afterward.
+        """
         self.by_object += other.by_object
         self.no_surface += other.no_surface
         self.by_class += other.by_class
@@ -105,34 +119,37 @@ class CloudCounts:
 
     @property
     def point_count(self) -> int:
-        """Number of points, by their objects."""
+        """Total number of points, including points that do not belong to an object."""
         return int(self.by_object.sum()) + self.no_surface
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates in the world, (2, 3), meters, or zeros without points."""
+        """Minimum and maximum world coordinates in meters, or zeros if empty. Shape (2, 3)."""
         if self._squares.box is None:
             return np.zeros((2, 3))
         return positions_of(self._squares.box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
-        """Numbers of points seen from above, (rows, columns), the first row in the south."""
+        """Number of points per pixel in the top view, with the southernmost row first.
+
+        Shape (rows, columns).
+        """
         return self._pixels.counts.T
 
     @property
     def pixel_m(self) -> float:
-        """Side of a pixel of `above`, meters."""
+        """Side length of a pixel of `above` in meters."""
         return self._pixels.side * self._precision_m
 
     @property
     def corner(self) -> Floats:
-        """World position of the corner of `above` in the south-west, (2,), meters."""
+        """World position of the southwest corner of `above` in meters. Shape (2,)."""
         return positions_of(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property
     def _pixels(self) -> GridCounts:
-        """Grid of `above`: the more points, the finer, with a point or two in a pixel."""
+        """Grid for `above`, coarsened to about one point per pixel."""
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:
@@ -141,10 +158,10 @@ class CloudCounts:
 
     @property
     def density(self) -> Density | None:
-        """Points per square meter seen from above, or None without points.
+        """Horizontal point density, or None if there are no points.
 
-        Squares are joined until half of those with points have 30 points or more, so that gaps
-        between sparse points lie within squares.
+        The grid is coarsened until the median square with points contains at least 30 points.
+        Smaller squares would exclude the gaps between sparse points from the area.
         """
         squares = deepcopy(self._squares)
         if not squares.total:
@@ -156,30 +173,31 @@ class CloudCounts:
 
 
 class GridCounts:
-    """Numbers of points in a grid of squares, which are larger where points are far apart.
+    """Number of points in each square of a grid that coarsens as the points spread.
 
-    The grid is the finest with at most `across` squares along each axis. A side is a power of two
-    of cells of positions, and larger squares consist of whole smaller squares. So the numbers are
-    the same whatever the order of the points is, and no point is needed again.
+    The grid is always the finest grid with at most `across` squares along each axis. The side of a
+    square is a power of two in cells, so coarser squares consist of whole finer squares. Therefore
+    the counts do not depend on the order of the points, and points do not have to be read again
+    when the grid is coarsened.
 
-    A part of an axis has the number `(cell + SHIFT) >> level`, and the array has the part at this
-    number modulo `across`: the array stays as it is while points spread in any direction.
+    Squares are numbered `(cell + SHIFT) >> level` along each axis, and stored at this number modulo
+    `across`. The array does not have to be moved when the points spread in any direction.
 
     Parameters
     ----------
     across
-        Largest number of squares along an axis, a power of two.
+        Maximum number of squares along each axis, a power of two.
     """
 
     def __init__(self, across: int) -> None:
         self._across = across
         self._level = 0
-        # Lowest and highest cells along x, y and perhaps further axes, (2, n); None without points.
+        # Lowest and highest cells along x, y and possibly more axes, shape (2, axes).
         self.box: Ints | None = None
         self._array = np.zeros((across, across), np.int64)
 
     def widen(self, cell_box: Ints) -> None:
-        """Make room for points between lowest and highest cells, (2, n)."""
+        """Extend the grid to a box, given by its lowest and highest cells. Shape (2, axes)."""
         earlier = self.box
         if earlier is not None:
             lowest = np.minimum(earlier[0], cell_box[0])
@@ -192,13 +210,16 @@ class GridCounts:
         self.box = cell_box
 
     def add(self, x: Ints32, y: Ints32) -> None:
-        """Add points by their cells along each axis, (n,), within the box of `widen`."""
+        """Add points by their cells along each axis.
+
+        Both arrays have shape (n,). The points must lie within the box passed to `widen`.
+        """
         bits = self._across.bit_length() - 1
         x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
         count_cells(x, y, self._level, bits, self._array)
 
     def merge(self, other: GridCounts) -> None:
-        """Add the points of another grid, which may become coarser by it."""
+        """Add the points of another grid, whose squares may be coarsened in the process."""
         if other.box is None:
             return
         self.widen(other.box)
@@ -207,7 +228,7 @@ class GridCounts:
         self._array += other._array
 
     def coarsen(self) -> None:
-        """Double the side."""
+        """Double the side length of the squares."""
         if self.box is not None:
             lowest = _numbers(self.box[0], self._level)
             finer = [low + np.arange(self._across) for low in lowest]
@@ -217,7 +238,7 @@ class GridCounts:
         self._level += 1
 
     def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:
-        """Return indices of the array of all combinations of numbers along each axis."""
+        """Return array indices of all combinations of square numbers along each axis."""
         return np.ix_(*(along_axis % self._across for along_axis in numbers))
 
     @property
@@ -227,40 +248,43 @@ class GridCounts:
 
     @property
     def mean(self) -> float:
-        """Mean of the numbers of points in squares with points."""
+        """Mean number of points in the squares that contain points."""
         return float(np.mean(self._array[self._array > 0]))
 
     @property
     def median(self) -> float:
-        """Median of the numbers of points in squares with points."""
+        """Median number of points in the squares that contain points."""
         return float(np.median(self._array[self._array > 0]))
 
     @property
     def side(self) -> int:
-        """Side of a square in cells."""
+        """Side length of a square in cells."""
         return 1 << self._level
 
     @property
     def lowest(self) -> Ints:
-        """Lowest cell of `counts` along each axis, (2,)."""
+        """Lowest cell of `counts` along each axis. Shape (2,)."""
         box = np.zeros((2, 2), np.int64) if self.box is None else self.box
         return (_numbers(box[0], self._level) << self._level) - SHIFT
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of squares along each axis, between the lowest and highest points."""
+        """Number of squares along each axis between the lowest and the highest point."""
         if self.box is None:
             return 1, 1
         return tuple((np.diff(_numbers(self.box, self._level), axis=0)[0] + 1).tolist())
 
     @property
     def counts(self) -> Ints:
-        """Number of points in each square between the lowest and highest points."""
+        """Number of points in each square between the lowest and the highest point."""
         lowest = (self.lowest + SHIFT) >> self._level
         numbers = [low + np.arange(n) for low, n in zip(lowest, self.shape, strict=True)]
         return self._array[self._indices(numbers)]
 
 
 def _numbers(cells: Ints, level: int) -> Ints:
-    """Return the numbers of the parts of x and y that contain cells, (…, n), as (…, 2)."""
+    """Return the numbers of the squares that contain cells, along x and y.
+
+    `cells` has shape (…, axes), and the result has shape (…, 2).
+    """
     return (cells[..., :2] + SHIFT) >> level

@@ -1,4 +1,4 @@
-"""Loops that count points of a cloud by their positions and labels."""
+"""Compiled loops that count points by position and by label."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -8,30 +8,32 @@ import numpy as np
 
 from raybeam.compiled import compiled, noinline
 
-# Added to coordinates, in binary 101…0101. Multiples of no power of two are near it, so that no
-# grid has a boundary at zero, where walls often are: their points would be in two rows.
+# Added to cells, so that no grid has a boundary at zero. Walls are often at zero, and noise would
+# spread their points over two rows of squares. The binary digits of the number are 1010…0101, so it
+# is not close to a multiple of any large power of two.
 SHIFT = 0x15555555
 _SHIFT = np.int32(SHIFT)
-_TILE = 1024  # points at a time: their indices stay in the first cache
+_TILE = 1024  # points per iteration, so that their indices stay in the L1 cache
 
 
 @noinline
 def _find_parts(cells, level, bits, indices):
-    """Append the number of the part of an axis that contains each cell to the bits of an index."""
+    """Append the number of the square of each cell along one axis to the bits of its index."""
     mask = np.int32((1 << bits) - 1)
     shift = np.int32(level)
     wide = np.uint32(bits)
     for k in range(len(indices)):
-        # A sum beyond 32 bits differs in bits that are not used.
+        # An integer overflow only affects bits that the mask removes.
         number = (np.int32(cells[k] + _SHIFT) >> shift) & mask
         indices[k] = np.uint32(indices[k] << wide) | np.uint32(number)
 
 
 @compiled()
 def count_cells(x, y, level, bits, counts):
-    """Count points by their cells along the axes, (n,) int32 each, in a grid (`GridCounts`).
+    """Count the points in each square of a grid (see `GridCounts`).
 
-    `counts` have two axes, x and y, with 2^`bits` parts along each.
+    `x` and `y` are the cells of the points along each axis, int32 arrays with shape (n,). `counts`
+    is updated in place and has shape (2**bits, 2**bits).
     """
     flat = counts.reshape(-1)
     indices = np.empty(_TILE, np.uint32)
@@ -47,12 +49,13 @@ def count_cells(x, y, level, bits, counts):
 
 @compiled()
 def count_labels(labels, counts):
-    """Count points by labels (n,), whole numbers, and return the number of labels below 0.
+    """Count the points with each label, and return the number of negative labels.
 
-    Labels beyond the counts are not counted.
+    `labels` is an integer array with shape (n,). `counts` is updated in place. Labels that exceed
+    its length are ignored.
     """
     last = np.int64(-1)
-    repeats = 0  # of the last label: neighbors are often of the same object
+    repeats = 0  # consecutive points often have the same label
     negative = 0
     for k in range(len(labels)):
         label = np.int64(labels[k])

@@ -1,4 +1,8 @@
-"""The cloud of a survey as a file that grows by committed parts, while further scans are cast."""
+"""Write the point cloud of a survey to a file while the survey is still running.
+
+Parts are appended as soon as they are committed, so most of the cloud has been written when the
+last scan is finished.
+"""
 
 from __future__ import annotations
 
@@ -32,19 +36,22 @@ from ..run.pipeline.stage_messages import Receipt
 from ..run.store.stored_job import StoredJob
 from .cloud_counts import CloudCounts
 
-_MAX_THREADS = 4  # that write parts; each has a block of rows in memory
-# Bytes written between two flushes. No result relies on these flushes, since the complete file is
-# flushed before it is moved into place: they keep that flush short, and no flush delays the flushes
-# of parts.
+_MAX_THREADS = 4  # maximum number of writer threads; each holds a block of rows in memory
+# Number of bytes written between two flushes. These flushes are an optimization, since the complete
+# file is flushed before it is moved into place. They keep the final flush short, so that no single
+# flush delays the flushes of parts.
 _FLUSH_BYTES = 1 << 25
-# Rows of a block. Blocks of a quarter of this size stay in the second cache of a core, and took as
-# long: there are four times as many system calls.
+# Rows per block. Blocks of a quarter of this size fit in the L2 cache, but were not faster, because
+# they require four times as many system calls.
 _BLOCK_ROWS = 1 << 16
-_LOOK_EVERY_S = 0.05
+_POLL_INTERVAL_S = 0.05
 
 
 class _PartWriter:
-    """Writes parts to a file, one at a time, and counts their points. Each thread has its own."""
+    """Writes parts to a file, one at a time, and computes statistics of their points.
+
+    Each thread has a separate instance.
+    """
 
     def __init__(self, file: PlyAppender, points: StoredCloud, scene: Scene) -> None:
         self.counts = CloudCounts(
@@ -56,14 +63,15 @@ class _PartWriter:
         )
         self._file = file
         self._points = points
-        self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)  # used again for each part
-        self._row_encoder: PlyRowEncoder | None = None  # once the file has its layout
+        self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)  # reused for each part
+        self._row_encoder: PlyRowEncoder | None = None  # created when the file has its layout
 
     def write(self, name: str, row_count: int, cell_box: Ints, offset: int = 0) -> None:
         """Write the points of a part block by block.
 
-        `offset` of the first row in the file is 0 for the first part, which gives the file its
-        layout. LidarError if the part cannot be used, OSError if the disk is full.
+        `offset` is the byte offset of the first row. It is 0 for the first part, which determines
+        the layout of the file. Raise LidarError if the part is unusable, or OSError if the disk is
+        full.
         """
         is_first = not offset
         self.counts.widen(cell_box)
@@ -85,30 +93,30 @@ class _PartWriter:
                     self._points.origin,
                 )
             rows = self._row_encoder.encode(columns)
-            if is_first:  # the number of first points is known by now
+            if is_first:  # the offset of the first part is only known once the layout is known
                 offset = self._file.extend(rows_in_block)
             self._file.write_rows(rows, offset)
             offset += len(rows)
 
 
 class CloudWriter:
-    """Writes the points of parts to a PLY file, and counts the points in the same pass.
+    """Writes the points of parts to a PLY file, and computes statistics in the same pass.
 
-    Parts are appended in scan order, so that the offset of a part is known. Several threads write
-    them, a part each. An error of a thread is raised by a later call.
+    Parts are appended in scan order, so the file offset of each part is known in advance and
+    several threads can write parts concurrently. An error in a thread is raised by a later call.
 
     Parameters
     ----------
     path
         The file, which must not exist.
     points
-        Points of the survey; further parts may be appended.
+        Points of the survey. Parts that are not included yet can be appended.
     sweeps, scene
         Sweeps and scene of the survey.
     position_type
-        Type of positions in the file (`position_dtype`).
+        Data type of the positions in the file (see `position_dtype`).
     expected_count
-        Expected number of points (`PlyAppender`).
+        Expected number of points (see `PlyAppender`).
     """
 
     def __init__(
@@ -128,7 +136,7 @@ class CloudWriter:
         for part_writer in self._part_writers:
             self._idle.put(part_writer)
         self._executor = ThreadPoolExecutor(self.threads, "write cloud")
-        self._being_written = deque[Future[None]]()  # one for each part, at most one per thread
+        self._being_written = deque[Future[None]]()  # one per part, limited to one per thread
 
     def __enter__(self) -> CloudWriter:
         return self
@@ -137,28 +145,30 @@ class CloudWriter:
         self.close()
 
     def append(self, name: str, row_count: int, cell_box: Ints) -> None:
-        """Append the points of a part; wait while as many parts as there are threads are written.
+        """Append the points of a part.
+
+        If all threads are busy, wait until one of them has finished.
 
         Parameters
         ----------
         name
-            The part.
+            Name of the part.
         row_count
-            Number of its points, at least 1.
+            Number of points in the part, at least 1.
         cell_box
-            Lowest and highest cells of its points or of more points, (2, 3).
+            Lowest and highest cells of a box that contains the points. Shape (2, 3).
 
         Raises
         ------
         LidarError
-            If a part cannot be used.
+            If a part is unusable.
         OSError
             If the disk is full, or the file cannot be written for another reason.
         """
         if not self.file.has_layout:
             self._write(name, row_count, cell_box)
             return
-        if len(self._being_written) == self.threads:  # bounds the parts in memory
+        if len(self._being_written) == self.threads:  # limits the memory use
             self._being_written.popleft().result()
         offset = self.file.extend(row_count)
         is_flushed = self.file.size - self._flushed_bytes > _FLUSH_BYTES
@@ -180,12 +190,20 @@ class CloudWriter:
             self._idle.put(part_writer)
 
     def wait(self) -> None:
-        """Wait until no thread writes, or raise the errors of `append`."""
+        """Wait until all appended parts have been written. Raises the same errors as `append`."""
         while self._being_written:
             self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
-        """Complete the file and return the counts of its points, or raise errors of `append`."""
+        """Complete the file and return its statistics.
+
+        Raises
+        ------
+        LidarError
+            If a part is unusable or contains points on objects that the scene does not have.
+        OSError
+            If the file cannot be written.
+        """
         self.wait()
         self.file.finish()
         counts, *others = (part_writer.counts for part_writer in self._part_writers)
@@ -199,18 +217,18 @@ class CloudWriter:
         return counts
 
     def close(self) -> None:
-        """Wait until no thread writes, and close the file."""
+        """Wait for the threads, and close the file."""
         self._executor.shutdown(cancel_futures=True)
         self.file.close()
 
 
 def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -> CloudCounts:
-    """Write all points to a PLY file, which must not exist, and return their counts.
+    """Write all points to a new PLY file, and return their statistics.
 
     Raises
     ------
     LidarError
-        If the disk lacks room, or a part cannot be used.
+        If there is not enough disk space, or if a part is unusable.
     OSError
         If the file cannot be written.
     """
@@ -227,49 +245,51 @@ def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -
 
 
 class GrowingCloud:
-    """Appends the committed parts of a job, in scan order, to a PLY file in a thread.
+    """A PLY file to which a background thread appends the committed parts of a job.
 
-    The file is temporary until `finish`. If the file cannot be written, such as on a full disk, it
-    is removed and the run goes on; in the end, `write_cloud` writes the cloud, or says the error.
+    Parts are appended in scan order. The file is temporary until `finish` is called. If the file
+    cannot be written, for example because the disk is full, it is removed and the run continues. In
+    this case, `write_cloud` must be called at the end of the run. It writes the cloud or raises the
+    error.
 
     Parameters
     ----------
     path
-        The file, which must not exist.
+        The temporary file, which must not exist.
     job
-        The job. Parts of an earlier run are appended first.
+        The job. Parts that a previous run has committed are appended first.
     """
 
     def __init__(self, path: Path, job: StoredJob) -> None:
         self._path = path
         self._job = job
         self._sweeps = Sweeps.from_survey(job.job.survey, job.job.scene)
-        # With the cells of appended parts; only their bounds are used.
+        # Only the bounds of these points are used. Their cells are those of the appended parts.
         self._points = replace(job.points(), cells=None)
-        self._next_scan = job.scans.start  # first scan of the next part to be appended
+        self._next_scan = job.scans.start  # first scan of the next part
         self._appended: list[Receipt] = []
         self._appended_rows = 0
-        self._appended_bytes = 0  # of their files
+        self._appended_bytes = 0  # total size of the appended parts
         self._writer: CloudWriter | None = None
-        self._is_complete = False  # True once all parts that were added are appended
+        self._is_complete = False  # set when all queued parts have been appended
         self._is_stopped = False
         self._queue = SimpleQueue[Receipt | None]()  # parts in scan order; None ends the thread
         self._thread = Thread(target=self._run, name="grow cloud", daemon=True)
 
     def __enter__(self) -> GrowingCloud:
         self._thread.start()
-        self.add()
+        self.append_committed()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the thread, and remove the file unless it is finished."""
+        """Stop the thread, and remove the file unless `finish` has moved it into place."""
         self._is_stopped = True
         self._queue.put(None)
         self._thread.join()
         self._discard()
 
-    def add(self, _: Sequence[Receipt] = ()) -> None:
-        """Append the committed parts that are next in scan order, and return at once."""
+    def append_committed(self, _: Sequence[Receipt] = ()) -> None:
+        """Queue the committed parts that are next in scan order, without waiting for the thread."""
         parts = self._job.parts
         with suppress(KeyError):  # the next scan is not committed yet
             while True:
@@ -279,9 +299,10 @@ class GrowingCloud:
                     self._queue.put(part)
 
     def finish(self, path: Path, points: StoredCloud) -> CloudCounts | None:
-        """Move the file to a path once it has all `points`, and return their counts.
+        """Wait for the thread, move the file to `path` and return its statistics.
 
-        None if the file failed, or was never begun.
+        Return None if the file is missing or does not contain all `points`, for example because it
+        could not be written.
 
         Raises
         ------
@@ -289,13 +310,13 @@ class GrowingCloud:
             If the file cannot be completed.
         """
         self._queue.put(None)
-        told_count = 0
+        reported_count = 0
         while self._thread.is_alive():
-            self._thread.join(_LOOK_EVERY_S)
-            points.report(self._appended_rows - told_count)
-            told_count = self._appended_rows
+            self._thread.join(_POLL_INTERVAL_S)
+            points.report(self._appended_rows - reported_count)
+            reported_count = self._appended_rows
         writer = self._writer
-        # On a network disk without locks, another run may have removed the file.
+        # On a network file system without locks, another run may have removed the file.
         is_usable = self._is_complete and self._path.exists()
         if writer is None or not is_usable or writer.file.count != len(points):
             self._discard()
@@ -307,23 +328,23 @@ class GrowingCloud:
         return counts
 
     def _run(self) -> None:
-        """Append parts until the end of the queue, or until the file fails."""
+        """Append parts until the queue ends or the file cannot be written."""
         try:
-            # Errors are met again, and shown, when `write_cloud` writes all points.
+            # Errors can be ignored, because `write_cloud` will encounter and report them.
             with suppress(LidarError, OSError):
                 while (part := self._queue.get()) is not None and not self._is_stopped:
                     self._append(part)
                 if self._writer is not None:
-                    self._writer.wait()  # errors of its threads are errors of the file, too
+                    self._writer.wait()  # also raises the errors of the writer's threads
                 self._is_complete = True
         finally:
             if not self._is_complete:
                 self._discard()
 
     def _append(self, part: Receipt) -> None:
-        """Append a part with points, or begin anew if the positions need another type."""
+        """Append a part, or restart the file if the positions require a different data type."""
         self._appended.append(part)
-        self._check_room(part)
+        self._check_disk_space(part)
         cells = np.array(part.cell_box, np.int64).reshape(2, 3)
         if self._points.cells is not None:
             earlier = self._points.cells
@@ -349,13 +370,13 @@ class GrowingCloud:
             self._writer.append(appended.name, appended.point_count, cells)
             self._appended_rows += appended.point_count
 
-    def _check_room(self, part: Receipt) -> None:
-        """Raise OSError unless the disk has room for a part here and for the parts to come.
+    def _check_disk_space(self, part: Receipt) -> None:
+        """Raise OSError unless the disk has enough space for this part and all remaining parts.
 
-        Else the disk would be full before all scans are stored.
+        Without this check, the growing file could fill the disk before all scans are stored.
         """
         rows_bytes = 0
-        if self._writer is not None:  # as many parts as there are threads may not be written yet
+        if self._writer is not None:  # each thread may still have a part to write
             rows_bytes = part.point_count * self._writer.file.row.itemsize * self._writer.threads
         self._appended_bytes += part.size
         appended_scans = part.stop - self._job.scans.start

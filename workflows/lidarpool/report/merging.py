@@ -1,4 +1,4 @@
-"""Merges shards, done by several clusters, into the data set or result of one run."""
+"""Merge shards that were run separately into a single data set or result."""
 
 from __future__ import annotations
 
@@ -43,25 +43,26 @@ from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .campaign_output import (
     CAMPAIGN_FILE,
-    dataset_files,
+    list_dataset_files,
     read_notes,
     read_record,
     write_record,
-    write_shared,
+    write_shared_files,
 )
 from .output import SurveyOutput
 
-MAX_NAMED = 20  # shards or files in a message
-_BATCH_ROWS = 1000  # rows of jobs in a transaction
-_MISSING = "these shards are missing: "  # begins a note
+MAX_NAMED = 20  # maximum number of shards or files listed in a message
+_BATCH_ROWS = 1000  # job rows per transaction
+_MISSING_NOTE = "these shards are missing: "  # start of a note
 
 
 @dataclass(frozen=True)
 class _ShardFolder:
-    """Shards of a run in a folder.
+    """A folder with one or more shards of a run.
 
-    `record` is the content of CAMPAIGN_FILE of a data set, and `run_size` the number of all jobs or
-    scans of the run. `notes` are the notes of its report. Only surveys have parts and trials.
+    For a data set, `record` is the content of CAMPAIGN_FILE. For a survey, it contains the
+    corresponding metadata of the run. `run_size` is the number of jobs or scans in the whole run,
+    and `notes` are the notes of the shard's report. Only surveys have `parts` and `trials`.
     """
 
     storage: Storage
@@ -77,20 +78,20 @@ class _ShardFolder:
 
     @cached_property
     def ranges(self) -> Sequence[range]:
-        """Numbers of the jobs or scans of each shard."""
+        """Numbers of the jobs or scans in each shard."""
         return [self.numbers(shard) for shard in self.shards]
 
     def has(self, number: int) -> bool:
-        """Return True if a job or scan is in one of the shards."""
+        """Return True if one of the shards includes this job or scan."""
         return any(number in numbers for numbers in self.ranges)
 
     @property
     def common(self) -> dict[str, Any]:
-        """Properties that all shard folders must have in common, {name: value}."""
+        """Properties that must be the same in all shard folders, as {name: value}."""
         record = self.record
         properties = {"kind": [*record["identity"]]} | record["identity"]
         properties |= {f"the file {name}": digest for name, digest in record["files"]}
-        # No software is recorded if the shard has cast no rays.
+        # The versions on the workers are not recorded for a shard without rays.
         properties |= {
             f"the {name} of the workers": value for name, value in record["casting"].items()
         }
@@ -107,21 +108,21 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that a single run would have written.
 
-    Every byte is verified with the checksums of its shard. The rows of the jobs are read from the
-    manifests of the jobs, which also have checksums. If the merge is interrupted, the same call
-    resumes it.
+    The checksums of all files are verified. If the merge is interrupted, call this function again
+    with the same arguments to resume it.
 
     Parameters
     ----------
-    shards, out
-        Folders or URLs of the shards of one campaign or survey, and of the merged data set or
-        result. Shards can be added to a data set later. `out` must not be inside a shard or contain
-        a shard.
+    shards
+        Folders or URLs of the shards of a campaign or survey.
+    out
+        Folder or URL of the merged data set or result. It must not be inside a shard or contain a
+        shard. More shards can be added to a merged data set later.
     partial
         Whether to merge the available shards if others are missing. A note lists the missing
         shards.
     scenario
-        Scenario or mesh file of a survey, if it has been moved since the shards were run.
+        Scenario or mesh file of the survey, if it has been moved since the shards were run.
     screen
         Object that shows the progress. By default, the progress is logged.
 
@@ -140,9 +141,9 @@ def merge(
     target = output_destination(str(out))
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
-    _check_apart(Storage.at(target), shard_storages)
+    _check_separate(Storage.at(target), shard_storages)
     is_survey_shard = False
-    with suppress(LidarError):  # the result would have the place of the shard's points
+    with suppress(LidarError):  # the result would overwrite the points of the shard
         is_survey_shard = "made_of" in _read_folder(Storage.at(target)).record
     if is_survey_shard:
         raise LidarError(
@@ -164,15 +165,18 @@ def merge(
 
 
 def _real_path(storage: Storage) -> str:
-    """Return the same path for a folder by any path or URL, which may lead through links."""
+    """Return the URL of a remote storage, or the absolute path of a local folder without links."""
     scheme, separator, path = storage.url.partition("://")
     if separator and scheme not in ("file", "local"):
         return storage.url
     return str(Path(path or storage.url).resolve())
 
 
-def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
-    """Check that `target` is apart from all places of shards, {`_real_path`: place}."""
+def _check_separate(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
+    """Raise LidarError if `target` is a shard, is inside a shard or contains a shard.
+
+    `shard_storages` maps the result of `_real_path` to the storage.
+    """
     path = _real_path(target)
     for real, storage in shard_storages.items():
         relation = ""
@@ -190,7 +194,10 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
 
 
 def _read_folder(storage: Storage) -> _ShardFolder:
-    """Read a finished shard or a data set of several shards, or raise LidarError."""
+    """Read a finished shard, or a data set of several shards.
+
+    Raise LidarError if the folder contains no finished shard.
+    """
     check_exists(storage, "specify the output folder of `lidarpool run --shard`")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
@@ -207,22 +214,25 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
-    """Read a data set of shards, which are `shard_count` shards if it is complete."""
+    """Read a data set. A complete data set is treated as `shard_count` shards."""
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
         shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
     notes = read_notes(storage) if LAST_FILE in storage.sizes() else []
-    notes = [note for note in notes if not note.startswith(_MISSING) and NO_POINTS not in note]
+    notes = [note for note in notes if not note.startswith(_MISSING_NOTE) and NO_POINTS not in note]
     return _ShardFolder(storage, record, shards, record["campaign"]["count"], notes)
 
 
 def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
     """Read a shard of a survey.
 
-    Raises LookupError for an unfinished shard or another run.
-
-    LidarError if the database is damaged.
+    Raises
+    ------
+    LookupError
+        If the shard is unfinished, or if the folder contains a different kind of run.
+    LidarError
+        If the database is damaged.
     """
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
         path = Path(folder, FILE)
@@ -251,9 +261,10 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
 def _check_same_run(
     shard_folders: Sequence[_ShardFolder], earlier: _ShardFolder | None = None
 ) -> None:
-    """Raise LidarError, which names wrong folders, unless folders have shards of the same run.
+    """Raise LidarError unless all folders contain different shards of the same run.
 
-    Shards of the `earlier` data set may be in further folders, too.
+    The message lists the folders that do not match. Shards that the `earlier` data set already
+    contains may be passed again.
     """
     mistakes = Mistakes()
     expected = software()
@@ -291,12 +302,15 @@ def _check_same_run(
     mistakes.tell()
 
 
-def _notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
-    """Return the notes of all folders and on missing shards, which need `partial`."""
+def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
+    """Return the notes of all folders, and a note about missing shards if there are any.
+
+    Raise LidarError if shards are missing and `partial` is False.
+    """
     notes = [*dict.fromkeys(note for folder in shard_folders for note in folder.notes)]
-    if not (missing := _missing(shard_folders)):
+    if not (missing := _missing_shards(shard_folders)):
         return notes
-    message = f"{_MISSING}{listed([*map(str, missing)], MAX_NAMED)}"
+    message = f"{_MISSING_NOTE}{listed([*map(str, missing)], MAX_NAMED)}"
     if partial:
         return [*notes, message]
     advice = "Specify their folders as well"
@@ -314,14 +328,14 @@ def _missing_or_damaged(names: Sequence[str]) -> str:
     )
 
 
-def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
-    """List the shards that are missing, or lack jobs that the campaign has gained."""
+def _missing_shards(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
+    """Return the shards that are missing, or that lack jobs because the campaign has grown."""
     shard_count = shard_folders[-1].shards[0].total
     folders = sorted(shard_folders, key=lambda folder: folder.run_size)
     have = {
         shard.number: len(folder.numbers(shard)) for folder in folders for shard in folder.shards
     }
-    have.setdefault(1, -1)  # which plans the path, even if it has no scans
+    have.setdefault(1, -1)  # shard 1 is always required, because it plans the path
     every = (Shard(number, shard_count) for number in range(1, shard_count + 1))
     return [shard for shard in every if have.get(shard.number, 0) < len(folders[-1].numbers(shard))]
 
@@ -330,15 +344,15 @@ def _merge_dataset(
     shard_folders: Sequence[_ShardFolder], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
     begun = CAMPAIGN_FILE in target.sizes()
-    dataset_files(target, begun=begun)
+    list_dataset_files(target, begun=begun)
     earlier = _read_dataset(target, shard_count=shard_folders[0].shards[0].total) if begun else None
     all_folders = [earlier, *shard_folders] if earlier else shard_folders
     _check_same_run(all_folders, earlier)
-    notes = _notes(all_folders, partial=partial)
+    notes = _collect_notes(all_folders, partial=partial)
     record = _merged_record(all_folders, shard_folders[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
-    if earlier is None:  # the files belong to the campaign now
+    if earlier is None:  # marks the folder as a data set of this campaign
         write_record(target, record | {"shards": []})
     with (
         tempfile.TemporaryDirectory(prefix="lidarpool-") as folder,
@@ -351,18 +365,18 @@ def _merge_dataset(
         damaged = list[str]()
         with explained(f"{target} cannot be merged"):
             seconds = dict[int, float]()
-            if earlier:  # after a killed merge without casting times: no note
+            if earlier:  # casting times may be missing after an interrupted merge
                 seconds |= known_seconds(target)
                 earlier_rows = (row for row, _ in dataset.rows() if earlier.has(row.number))
                 _add_rows(db, earlier, earlier_rows, seconds)
             for shard_folder in shard_folders:
-                taken = _take_jobs(shard_folder, dataset, damaged)
-                seconds |= _seconds(shard_folder, notes)
+                taken = _copy_jobs(shard_folder, dataset, damaged)
+                seconds |= _read_casting_times(shard_folder, notes)
                 _add_rows(db, shard_folder, taken, seconds)
-        damaged = damaged or _lacking(all_folders, db)
+        damaged = damaged or _missing_manifests(all_folders, db)
         if damaged:
             raise LidarError(_missing_or_damaged(damaged))
-        lacking = _missing(all_folders)
+        lacking = _missing_shards(all_folders)
         shards = {shard for shard_folder in all_folders for shard in shard_folder.shards}
         record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in rows() if row.done and not row.points]:
@@ -370,16 +384,17 @@ def _merge_dataset(
             screen.warn(notes[-1])
         sensors = record["sensors"]
         run = CampaignRun.from_rows(rows(), 0.0, 0, sensors=sensors, notes=tuple(notes))
-        report = write_shared(dataset, record, run, rows)[1]
-    if earlier:  # a run with failed jobs would continue with its knowledge of these jobs
+        report = write_shared_files(dataset, record, run, rows)[1]
+    if earlier:  # the store of a run with failed jobs is now out of date
         remove_run(target.below(RUN_FOLDER))
     return report
 
 
 def _merged_record(shard_folders: Sequence[_ShardFolder], fallback: _ShardFolder) -> dict[str, Any]:
-    """Return the content of CAMPAIGN_FILE for a data set of shard folders.
+    """Return the content of CAMPAIGN_FILE for the merged data set.
 
-    The software is the software of a shard folder with cast rays, else of the fallback.
+    The software versions are taken from the first shard folder that records them, or from
+    `fallback`.
     """
     sensors = dict[str, str]()
     for folder in shard_folders:
@@ -395,10 +410,11 @@ def _add_rows(
     rows: Iterable[JobRow],
     seconds: Mapping[int, float],
 ) -> None:
-    """Add the rows of a shard folder, with casting times {number: seconds}, to those of all jobs.
+    """Add the job rows of a shard folder, with their casting times, to the database.
 
-    A job that has failed there stays as it is. LidarError if the shard folder cannot have such a
-    job, or two manifests are of one job.
+    `seconds` maps job numbers to casting times. A failed job does not replace a row that already
+    exists. Raise LidarError if a job does not belong to the shards in the folder, or if two
+    manifests belong to the same job.
     """
     added = set[int]()
     batch = list[tuple[int, bool, dict[str, Any]]]()  # a transaction for each row would be slow
@@ -426,10 +442,13 @@ def _add_rows(
     db.end_jobs(batch)
 
 
-def _take_jobs(
+def _copy_jobs(
     shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
 ) -> Iterator[JobRow]:
-    """Copy the jobs of a shard folder, yield their rows, and add files to `damaged`."""
+    """Copy the jobs of a shard folder, and yield their rows.
+
+    The names of missing or damaged files are appended to `damaged`.
+    """
     for _, row, wrong in dataset.copy_jobs(
         shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
     ):
@@ -438,8 +457,11 @@ def _take_jobs(
             yield row
 
 
-def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
-    """Return the casting times of jobs, {number: seconds}, or add a note that they are lost."""
+def _read_casting_times(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
+    """Return the casting times of jobs as {job number: seconds}.
+
+    If they cannot be read, append a note to `notes` and return an empty mapping.
+    """
     if not shard_folder.shards:
         return {}
     try:
@@ -449,8 +471,8 @@ def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float
     return {}
 
 
-def _lacking(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
-    """List the jobs of shard folders that have no row, as a folder and a number."""
+def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
+    """Describe the manifests that are missing, because their jobs have no row in the database."""
     return [
         f"the manifest of job {number} in {folder.storage}"
         for folder in shard_folders
@@ -467,9 +489,9 @@ def _merge_survey(
     scenario: str | Path | None,
     screen: Screen,
 ) -> dict[str, Any]:
-    """Build the survey again, and write its result from the points of all folders."""
+    """Load the scenario of a survey, and write its result from the points in all folders."""
     _check_same_run(shard_folders)
-    notes = _notes(shard_folders, partial=partial)
+    notes = _collect_notes(shard_folders, partial=partial)
     record = shard_folders[0].record
     made_of = record["made_of"]
     path = Path(scenario or made_of["path"])
@@ -496,23 +518,26 @@ def _merge_survey(
         if not options.continues_run:
             output.check_existing(jobs)
         with open_store(jobs, options, screen) as store:
-            _take_points(store, shard_folders, notes)
+            _copy_points(store, shard_folders, notes)
             load_open3d()
             result = Committed(store).result(screen)
             return output.publish(folder, result, store, screen)[1]
 
 
-def _take_points(
+def _copy_points(
     store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
 ) -> None:
-    """Take the points of all folders into a store, or raise LidarError for damaged files."""
+    """Copy the points in all folders to a store.
+
+    Raise LidarError if files are missing or damaged.
+    """
     damaged = list[str]()
     only = store.only_job
     mark = store.db.meta["mark"]
-    assert only is not None, "of a survey"
+    assert only is not None, "the store of a survey has a single job"
 
-    def take(source: Storage, part_file: Receipt) -> Receipt | None:
-        """Take a file and return its receipt, or None if the file is missing or damaged."""
+    def copy_part(source: Storage, part_file: Receipt) -> Receipt | None:
+        """Copy a part and return its receipt, or None if the part is missing or damaged."""
         name = part_name(mark, 0, part_file.first, part_file.stop)
         with (
             explained(f"{source.path(part_file.name)} cannot be copied"),
@@ -536,11 +561,11 @@ def _take_points(
             for receipt in shard_folder.parts
             if only.parts.missing(receipt.first, receipt.stop)
         )
-        for expected, receipt in read_ahead(partial(take, source), missing):
+        for expected, receipt in read_ahead(partial(copy_part, source), missing):
             if receipt is None or not store.db.commit([(only.committed, receipt)]):
                 damaged.append(source.path(expected.name))
     if damaged:
         raise LidarError(_missing_or_damaged(damaged))
-    # Without trials, the first shard, which plans, is missing.
+    # If there are no trials, the first shard, which plans the path, is missing.
     store.take_over(only.job if only.trials else replace(only.job, planning=None))
     store.notes = [*notes]

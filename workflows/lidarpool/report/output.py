@@ -1,4 +1,8 @@
-"""The output folder: all files of a result, or none of them."""
+"""Write the result of a survey to its output folder.
+
+Files are written to a temporary folder first, so that the output folder always contains either a
+complete result or none.
+"""
 
 from __future__ import annotations
 
@@ -49,10 +53,10 @@ from .report import make_report
 CLOUD = FORMATS["ply"].file
 PAGE = "report.html"
 REPORT = LAST_FILE
-_DRAWN = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
-_SURVEY = ("scene", "survey")  # entries of the identity that distinguish surveys
-_OF_FORMATS = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
+_PICTURES = tuple(f"{name}.png" for name in PICTURES)
+FILES = (CLOUD, *_PICTURES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+_SURVEY_ENTRIES = ("scene", "survey")  # entries of the identity that must match for the same survey
+_FORMAT_OF_FILE = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
 
 
 def run_survey(
@@ -63,10 +67,27 @@ def run_survey(
     page: RunPage,
     compare: Callable[[RunResult], str] | None = None,
 ) -> tuple[RunResult, dict[str, Any]]:
-    """Cast a survey, write its result, remove the run, and return the result and its report.
+    """Run a survey, write its result and remove the run store.
 
-    `cloud.ply` grows while the survey is cast. `compare` returns a note on the result, or raises an
-    error before the result is written.
+    The point cloud is written while the survey is running.
+
+    Parameters
+    ----------
+    jobs
+        The survey as the only job of the run.
+    options
+        Options of the run.
+    output
+        Output folder and formats.
+    screen, page
+        Objects that show the progress in the terminal and in the browser.
+    compare
+        Function that checks the result before it is written. It returns a note about the result,
+        which may be empty, or raises an error.
+
+    Returns
+    -------
+    The result and the content of report.json.
     """
     with output.lock() as folder:
         if not options.continues_run:
@@ -76,11 +97,13 @@ def run_survey(
             open_store(jobs, options, screen, output.target) as store,
             staging(folder, output.target) as staged,
         ):
-            assert store.only_job is not None, "of a survey"
+            assert store.only_job is not None, "the store of a survey has a single job"
             with GrowingCloud(staged / CLOUD, store.only_job) as cloud:
-                load_open3d()  # writes the cloud; a missing library is reported before casting
+                load_open3d()  # required for the cloud; a missing library is reported early
                 committed = cast(
-                    store, connection, Listener(page, on_parts=cloud.add, pace=options.pace)
+                    store,
+                    connection,
+                    Listener(page, on_parts=cloud.append_committed, pace=options.pace),
                 )
                 result = committed.result(screen)
                 page.finish(result.seconds, result)
@@ -94,10 +117,13 @@ def run_survey(
 
 @dataclass(eq=False)
 class SurveyOutput:
-    """The result of a survey in a folder or storage.
+    """The output folder or storage of a survey.
 
-    `formats` are written beside the cloud. `extent` is "cloud"; "page" for the page and the content
-    of pictures, too; or "pictures" for the pictures, too.
+    `formats` are written in addition to the cloud. `extent` selects the other files:
+
+    - "cloud": only the cloud and report.json
+    - "page": also the HTML report and the file from which pictures can be drawn
+    - "pictures": also the pictures
     """
 
     target: Path | Storage
@@ -113,29 +139,32 @@ class SurveyOutput:
 
     @property
     def in_pieces(self) -> bool:
-        """True if a format has many files, which workers can write."""
+        """Whether a format consists of many files, which workers can write in parallel."""
         return any(output_format.has_many_files for output_format in self.formats)
 
     @property
     def _requested(self) -> Sequence[str]:
-        """Columns that the user asked for, without those that only formats need."""
+        """Optional columns that the user requested, without those that only formats require."""
         columns = self.survey.columns if self.scenario is None else self.scenario.cloud.columns
         return [column.name for column in optional_columns(columns)]
 
     @contextmanager
     def lock(self) -> Iterator[Path]:
-        """Lock the folder while the body runs, and yield the folder that files are written to."""
+        """Lock the output folder while the body runs, and yield the local folder to write to."""
         for output_format in self.formats:
             output_format.check_installed()
         with result_folder(self.target) as folder:
             yield folder
 
     def check_existing(self, inputs: OneJob | RunResult, *, overwrite: bool = False) -> None:
-        """Refuse a target that holds the result of another survey, or files of no result.
+        """Check that the target contains nothing that must not be replaced.
 
-        LidarError if there is a result of another scene or survey, a damaged result, or a file that
-        this result would replace and that no report there lists, each unless `overwrite`; or a
-        folder that would be replaced and holds foreign files.
+        Raises
+        ------
+        LidarError
+            If a folder that would be replaced contains foreign files. Unless `overwrite` is True,
+            also if the target contains a damaged result, the result of a different survey, or a
+            file that would be replaced but does not belong to a result.
         """
         target = self.target
         storage = Storage.at(target)
@@ -148,16 +177,16 @@ class SurveyOutput:
                 entries = set(storage.entries())
             except NotADirectoryError:
                 return
-        earlier, listed, earlier_fields = _earlier(storage)
+        earlier, listed, earlier_fields = _read_earlier(storage)
         if REPORT in entries and not overwrite:
-            expected = inputs.identity  # takes a moment for large scenes
-            if earlier != {name: expected[name] for name in _SURVEY}:
+            expected = inputs.identity  # slow for large scenes
+            if earlier != {name: expected[name] for name in _SURVEY_ENTRIES}:
                 changed = describe_changes(earlier_fields, inputs.fields) if earlier_fields else ""
                 raise LidarError(
                     f"{target} contains the result of a different "
                     f"survey{f' ({changed})' * bool(changed)}. {advice}"
                 )
-        further = _further_files(self.survey, self.formats)
+        further = _optional_files(self.survey, self.formats)
         foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
             lists = (
@@ -165,7 +194,7 @@ class SurveyOutput:
                 "belong to a result."
             )
             raise LidarError(f"{lists} {advice}")
-        check_foreign_files(storage, _formats({*further, *listed}))
+        check_foreign_files(storage, _formats_of_files({*further, *listed}))
 
     def publish(
         self,
@@ -176,9 +205,25 @@ class SurveyOutput:
         cluster: Cluster | None = None,
         growing: GrowingCloud | None = None,
     ) -> tuple[RunResult, dict[str, Any]]:
-        """Write the result of a run, remove the run, and return the result and its report.
+        """Write the result of a run and remove the run store.
 
-        LIDAR workers of the cluster write formats in pieces. `growing` may have the points already.
+        Parameters
+        ----------
+        folder
+            Folder that `lock` yields.
+        result, store
+            Result and store of the run.
+        screen
+            Object that shows the progress.
+        cluster
+            Cluster whose LIDAR workers write the formats that consist of many files. By default,
+            this process writes them.
+        growing
+            Cloud that was written during the run, if there is one.
+
+        Returns
+        -------
+        The result and the content of report.json.
         """
         workers = LidarWorkers(cluster) if cluster is not None and self.in_pieces else None
         is_in_place = False
@@ -210,24 +255,46 @@ class SurveyOutput:
         growing: GrowingCloud | None = None,
         show: WritingProgress = lambda *_: None,
     ) -> dict[str, Any]:
-        """Write cloud, pictures and report into the target, and return the report.
+        """Write the cloud, the pictures and the report to the target.
 
-        Files are written to a temporary folder within `folder`, which `lock` yields, and moved into
-        place once all are on the disk, so that an earlier result stays intact if a file cannot be
-        written. Pictures of an earlier result that this result lacks are removed. `on_written` is
-        called when all files are in place, before a pending interrupt is raised. `workers` write
-        formats of many files, and `show` shows the progress of each file.
+        In a local folder, files are first written to a temporary folder within `folder`. They are
+        moved into place after all of them have been flushed to the disk, so an earlier result stays
+        intact if a file cannot be written. Pictures of an earlier result are removed if the new
+        result does not have them.
 
-        If `target` is a storage, all files are put into it, report.json last. Files of workers go
-        there directly, and an earlier result is removed before.
+        In a remote storage, all files are uploaded, with report.json last. Files that workers write
+        are written to the storage directly, after an earlier result has been removed.
 
-        LidarError if a file cannot be written.
+        Parameters
+        ----------
+        folder
+            Folder that `lock` yields.
+        result
+            Result of the run.
+        on_written
+            Function that is called when all files are in place, before a pending interrupt is
+            raised.
+        workers
+            Workers that write the formats that consist of many files.
+        growing
+            Cloud that was written during the run, if there is one.
+        show
+            Function that shows the progress of each file.
+
+        Returns
+        -------
+        The content of report.json.
+
+        Raises
+        ------
+        LidarError
+            If a file cannot be written.
         """
         target = Storage.at(self.target)
-        earlier = _earlier(target).files
-        further = _further_files(result.survey, self.formats)
+        earlier = _read_earlier(target).files
+        further = _optional_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
-        sent: list[ExportSpec] = []  # formats that workers write to the storage
+        sent: list[ExportSpec] = []  # formats that workers write directly to the storage
         if workers is not None and isinstance(self.target, Storage):
             sent = [entry for entry in self.formats if entry.has_many_files]
         with (
@@ -237,17 +304,17 @@ class SurveyOutput:
             ),
             staging(folder, self.target) as staged,
         ):
-            check_foreign_files(target, _formats({*further, *earlier}))
+            check_foreign_files(target, _formats_of_files({*further, *earlier}))
             sweeps = _write_sweeps(staged, result, sweeps)
-            points = _shown_points(result, CLOUD, show)
+            points = _points_with_progress(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
             timeline.mark(timeline.CLOUD_WRITTEN)
             others = [entry for entry in self.formats if entry not in sent]
             full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
-                _clear(target, further, earlier)
+                _remove_earlier(target, further, earlier)
                 for output_format in sent:
-                    points = _shown_points(result, output_format.row.file, show)
+                    points = _points_with_progress(result, output_format.row.file, show)
                     output_format.write_to_storage(target, points, sweeps, workers)
             if workers:
                 result = workers.recorded(result)
@@ -257,21 +324,21 @@ class SurveyOutput:
             if full_scales:
                 report["intensity_full_scale"] = full_scales
             if self.extent != "cloud":
-                self._report(result, report, counts, staged, show)
+                self._write_page(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
             if isinstance(self.target, Storage):
                 if not sent:
-                    _clear(target, further, earlier)
-                _put(staged, target, further)
+                    _remove_earlier(target, further, earlier)
+                _upload(staged, target, further)
                 with deferred_interrupts():
                     on_written()
             else:
-                _move(staged, folder, report["files"], earlier, on_written)
+                _move_into_place(staged, folder, report["files"], earlier, on_written)
         timeline.mark(timeline.IN_PLACE)
         return report
 
-    def _report(
+    def _write_page(
         self,
         result: RunResult,
         report: dict[str, Any],
@@ -279,14 +346,14 @@ class SurveyOutput:
         staged: Path,
         show: WritingProgress,
     ) -> None:
-        """Write the page, the content of pictures, and the pictures if in the extent."""
-        from .page.rendering import write_page  # jinja2
+        """Write the HTML report, the picture content and, if requested, the pictures."""
+        from .page.rendering import write_page  # imports jinja2
 
         shown = picture_content(result)
         shown.save(staged / PICTURE_FILE)
         write_page(staged / PAGE, report, result, counts, self.scenario)
         if self.extent == "pictures":
-            from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
+            from .result_pictures import draw_pictures  # imports Matplotlib
 
             list(draw_pictures(shown, staged, staged, show=show))
 
@@ -298,7 +365,10 @@ def _write_cloud(
     result: RunResult,
     growing: GrowingCloud | None,
 ) -> CloudCounts:
-    """Write the cloud, or move the file there that has grown, and return the counts of points."""
+    """Write the cloud, or move the cloud that was written during the run to `path`.
+
+    Returns the statistics of the cloud.
+    """
     with explained(f"{path} cannot be written"):
         counts = None if growing is None else growing.finish(path, points)
         return counts or write_cloud(path, points, sweeps, result.scene)
@@ -312,15 +382,16 @@ def _write_formats(
     workers: LidarWorkers | None,
     show: WritingProgress,
 ) -> dict[str, float]:
-    """Write formats to a temporary folder, those of many files last.
+    """Write formats to a temporary folder. Formats that consist of many files are written last.
 
-    Returns the intensity that each format with integer intensities stores as its highest integer.
+    Returns {format: intensity} for formats with integer intensities. The value is the intensity
+    that is stored as the largest integer.
     """
     full_scales: dict[str, float] = {}
     for output_format in sorted(formats, key=lambda entry: entry.has_many_files):
         full_scale = output_format.write(
             staged / output_format.row.file,
-            _shown_points(result, output_format.row.file, show),
+            _points_with_progress(result, output_format.row.file, show),
             sweeps,
             workers=workers,
             content=partial(picture_content, result),
@@ -330,8 +401,8 @@ def _write_formats(
     return full_scales
 
 
-def _shown_points(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
-    """Return the points of a result, whose reading is shown as the progress of a file."""
+def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
+    """Return the points of a result, which report their progress for a file while they are read."""
     count = len(result.points)
     read_count = 0
 
@@ -345,7 +416,7 @@ def _shown_points(result: RunResult, file: str, show: WritingProgress) -> Stored
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
-    """Write the sweeps, and instruments if any, and return sweeps that refer to these files."""
+    """Write the sweeps and the instrument files, if any, and return sweeps that refer to them."""
     sweeps.save(staged / SWEEPS_FILE)
     instruments = sweeps.instruments
     if instruments is None:
@@ -355,90 +426,96 @@ def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
 
 
 def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) -> None:
-    """Add the names of all files to a report, and write the report."""
+    """Add the names of all files to the report, and write report.json."""
     present = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
     report["files"] = [CLOUD, *further, *present]
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
     (staged / REPORT).write_text(text, encoding="utf-8")
 
 
-def _put(staged: Path, storage: Storage, further: Collection[str]) -> None:
-    """Put the files of a result into a storage, the report last."""
-    for name in (*_known_further(further), *FILES):
+def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
+    """Upload the files of a result to a storage, with report.json last."""
+    for name in (*_known_optional_files(further), *FILES):
         if (staged / name).exists():
             storage.put(staged / name, name)
 
 
-def _further_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
-    """Name the files of a result beyond the files that all results have."""
+def _optional_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
+    """Return the names of files and folders that only some results have."""
     instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
     return [*(output_format.row.file for output_format in formats), *measured]
 
 
-def _formats(names: Collection[str]) -> list[str]:
-    """Return the formats whose file or folder is among the names of a result."""
-    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_OF_FORMATS}
-    return [name for file, name in _OF_FORMATS.items() if file in names] + plugin_formats(unknown)
+def _formats_of_files(names: Collection[str]) -> list[str]:
+    """Return the formats whose file or folder is in a list of names."""
+    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_FORMAT_OF_FILE}
+    return [name for file, name in _FORMAT_OF_FILE.items() if file in names] + plugin_formats(
+        unknown
+    )
 
 
-def _known_further(names: Collection[str]) -> list[str]:
-    """Return the names that are files or folders of formats or instruments, in order."""
+def _known_optional_files(names: Collection[str]) -> list[str]:
+    """Return the names that belong to a format or an instrument, in the order of the formats."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
-    return [format_row(name).file for name in _formats(names)] + measured
+    return [format_row(name).file for name in _formats_of_files(names)] + measured
 
 
-class _Earlier(NamedTuple):
-    """The result in a folder."""
+class _EarlierResult(NamedTuple):
+    """Properties of an existing result."""
 
-    identity: Mapping[str, str] = MappingProxyType({})  # identity of scene and survey
+    identity: Mapping[str, str] = MappingProxyType({})  # hashes of the scene and the survey
     files: frozenset[str] = frozenset()  # files that may be removed
-    fields: Mapping[str, str] = MappingProxyType({})  # fields in words
+    fields: Mapping[str, str] = MappingProxyType({})  # {scenario field: value as text}
 
 
-def _earlier(storage: Storage) -> _Earlier:
-    """Return the result in a folder, or an empty one if the result is missing or damaged."""
+def _read_earlier(storage: Storage) -> _EarlierResult:
+    """Return the properties of an existing result, or empty ones if it is missing or damaged."""
     try:
         report = json.loads(storage.read(REPORT))
-        identity = {name: report["identity"][name] for name in _SURVEY}
+        identity = {name: report["identity"][name] for name in _SURVEY_ENTRIES}
         files = frozenset(report["files"])
-        files |= {*_DRAWN} if PICTURE_FILE in files else set()  # drawn since then
-        return _Earlier(identity, files, dict(report.get("fields", {})))
+        files |= {*_PICTURES} if PICTURE_FILE in files else set()  # may have been drawn later
+        return _EarlierResult(identity, files, dict(report.get("fields", {})))
     except (OSError, ValueError, TypeError, LookupError):
-        return _Earlier()
+        return _EarlierResult()
 
 
-def _move(
+def _move_into_place(
     staged: Path,
     folder: Path,
     files: Collection[str],
     earlier: Collection[str],
     on_written: Callable[[], object],
 ) -> None:
-    """Move all files of a result into place, the report last; a killed run can be resumed."""
-    for name in files:  # before its name: parts, the other copy of the points, are removed then
+    """Move all files of a result into place, with report.json last.
+
+    If the process is killed, the run can be resumed, because its parts are only removed afterward.
+    """
+    for name in files:  # `on_written` removes the parts, the only other copy of the points
         flush(staged / name)
     with deferred_interrupts():
-        _clear(Storage.at(folder), files, earlier)
-        for name in (*_known_further(files), *FILES):
+        _remove_earlier(Storage.at(folder), files, earlier)
+        for name in (*_known_optional_files(files), *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
-        flush(folder)  # the names last before the parts are removed
+        flush(folder)  # makes the renames durable before the parts are removed
         on_written()
 
 
-def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
-    """Remove the files of an earlier result, before a result of `files` is moved into place.
+def _remove_earlier(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
+    """Remove the files of an earlier result before new `files` are moved into place.
 
-    The report and the page go first, and a local folder is flushed: a report marks a whole result.
-    Then go files and folders of formats that `files` replace, or that the `earlier` result lists.
-    If a killed run has removed the earlier report, nothing is listed, and other formats stay. Of
-    the remaining `FILES`, those go that are not among `files`.
+    report.json and the page are removed first, and a local folder is flushed afterward, because
+    report.json marks a complete result. Next, files and folders of formats are removed if `files`
+    replaces them or if the `earlier` result lists them. If a run was killed after the removal of
+    report.json, the list is lost, and the files of other formats remain. Finally, those of the
+    `FILES` that the new result does not have are removed.
     """
-    further = _known_further({*files, *earlier})
-    # The picture of the path of an earlier result would look like a picture of this result.
+    further = _known_optional_files({*files, *earlier})
+    # Remaining pictures of an earlier result would appear to belong to the new result.
     missing = [name for name in FILES if name not in files]
     for name in (REPORT, PAGE, *further, *missing):
         target.discard(name)
-        if name == PAGE and target.is_local:  # no report lasts beside files of another result
+        if name == PAGE and target.is_local:  # a crash must not leave the old report behind
             flush(target.local())

@@ -1,4 +1,4 @@
-"""Converts the planning and the result of a run to the content of pictures."""
+"""Convert the result of a run to the content from which its pictures are drawn."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def picture_content(result: RunResult) -> PictureContent:
 def planning_picture(
     planning: Planning | None, plan: Plan | None = None, trials: Sequence[Trial] = ()
 ) -> PlanningPicture | None:
-    """Return a planning for pictures, with its plan and trials once all trials have ended."""
+    """Return the planning problem for pictures, including the best path and all trials if known.
+
+    Return None if the run plans no path.
+    """
     if planning is None:
         return None
     best = None

@@ -1,4 +1,4 @@
-"""The report of a run, as plain data for JSON."""
+"""Create the report of a run, as plain data that can be serialized to JSON."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from ..run.planning_trials import TRIAL
 from ..run.run_result import RunResult
 from .cloud_counts import CloudCounts
 
-ELEVATION_RAYS = 20_000  # whose elevations are examined
-# {stage: its name on pages}, in the order of the pipeline
+ELEVATION_RAYS = 20_000  # number of rays from which the elevation range is computed
+# {stage: displayed name}, in the order of the pipeline
 STAGES = {
     GENERATE: "generate",
     INTERSECT: "intersect",
@@ -44,8 +44,8 @@ _PACKAGES = (
     "numpy", "dask", "distributed", "trimesh", "numba", "open3d-cpu", "open3d",
     "matplotlib", "cupy-cuda12x", "cupy-cuda13x",
 )  # fmt: skip
-# What `--json` prints of a report.
-_FIGURES = (
+# Entries of the report that `--json` prints.
+_SUMMARY_ENTRIES = (
     "backend", "notes", "scans", "sweeps", "rays", "hits", "points", "points_by_object", "seconds",
     "placement_violations", "replayed", "resumed_scans",
 )  # fmt: skip
@@ -53,7 +53,7 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of the main dependencies."""
+    """Return the versions of lidarpool, Python and the main dependencies as {name: version}."""
     result = {"lidarpool": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
@@ -62,20 +62,20 @@ def versions() -> dict[str, str]:
 
 
 def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
-    """Return the report of a run, ready for JSON.
+    """Return the report of a run as plain data for JSON.
 
-    Lengths are in meters, times in seconds; infinite and unknown values are None.
+    Lengths are in meters and times are in seconds. Infinite and unknown values are None.
     """
     scene = result.scene
     survey = result.survey
-    tasks: dict[str, dict[str, int]] = {}  # {partition where they ran: {stage: number}}
+    tasks: dict[str, dict[str, int]] = {}  # {partition: {stage: number of tasks}}
     for stage in result.stages:
         for name, count in stage.resources.items():
             tasks.setdefault(name, {})[stage.stage] = count
     has_materials = any(column.name == "material" for column in cloud.table)
     counts = cloud.by_material.tolist()
     by_material = dict(zip(scene.material_names, counts, strict=True))
-    density = cloud.density if survey.coordinates == "world" else None  # None without points, too
+    density = cloud.density if survey.coordinates == "world" else None  # also None without points
     return {
         "versions": versions(),
         "identity": dict(result.identity),
@@ -83,12 +83,12 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "machine": {"system": platform.platform(), "processor": platform.machine()},
         "backend": result.backend,
         "notes": list(result.notes),
-        "parameters": _parameters(scene, survey),
+        "parameters": _describe_parameters(scene, survey),
         "scans": survey.scan_count,
         "sweeps": survey.sweep_count,
         "rays": result.rays,
         "hits": result.hit_count,
-        # The counts of large scenes are large: without need they are not read.
+        # The hit counts of a large scene are only read if they are required.
         "hits_on_surfaces": int(result.hit_counts.sum()) if cloud.no_surface else result.hit_count,
         "points": len(result.points),
         "points_by_object": {
@@ -100,40 +100,40 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         **({"class_names": dict(survey.classes)} if survey.classes else {}),
         **({"points_by_material": by_material} if has_materials else {}),
         "points_per_m2": density and density._asdict(),
-        "columns": _columns(cloud),
+        "columns": _describe_columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
             "survey": round(result.survey_seconds, 3),
             "planning": round(result.planning_seconds, 3),
             "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
         },
-        "stages": stage_figures(result.stages),
+        "stages": stage_statistics(result.stages),
         "tasks": tasks,
         "placement_violations": sum(stage.violations for stage in result.stages),
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
         "replayed": result.replayed,
         "resumed_scans": result.resumed,
-        "planning": _planning(result),
+        "planning": _describe_planning(result),
     }
 
 
-def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
-    """Return the main figures of a report and the paths of its files, for `--json`."""
+def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
+    """Return the main statistics of a report and the paths of its files, as printed by `--json`."""
     planning = report["planning"]
     return {
         "folder": str(folder),
         "files": {name: f"{folder}/{name}" for name in report["files"]},
-        **{name: report[name] for name in _FIGURES},
+        **{name: report[name] for name in _SUMMARY_ENTRIES},
         "planning": planning and {name: planning[name] for name in _PLANNING},
     }
 
 
-def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     """Describe the scene, the sensors and the options of a survey."""
     options = declared(survey, CloudOptions) | declared(survey, Weather)
-    del options["columns"]  # columns have a separate table
+    del options["columns"]  # the report has a separate entry for the columns
     sensors = [
-        _sensor(mounted.sensor)
+        _describe_sensor(mounted.sensor)
         | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}
         | ({"unseen": list(mounted.unseen)} if mounted.unseen else {})
         for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
@@ -164,7 +164,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     }
 
 
-def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
+def _describe_columns(cloud: CloudCounts) -> list[dict[str, Any]]:
     return [
         {
             "name": column.name,
@@ -181,15 +181,16 @@ def _columns(cloud: CloudCounts) -> list[dict[str, Any]]:
     ]
 
 
-def _sensor(sensor: Sensor) -> dict[str, Any]:
-    """Describe a sensor: its beams, and the numbers and words of its head."""
+def _describe_sensor(sensor: Sensor) -> dict[str, Any]:
+    """Describe a sensor: its beams, and the numeric and text properties of its scan head."""
     firings = np.arange(ELEVATION_RAYS // sensor.channels + 1)
     elevations = np.degrees(np.arcsin(sensor.directions(firings)[..., 2].clip(-1, 1)))
     head = {
         name: value
         for name, value in vars(sensor.head).items()
         if not name.startswith("_") and isinstance(value, (int, float, str))
-        if sensor.cycle != "frame" or name == "rate_hz"  # their head is only the clock
+        # The head of a frame-based sensor is only a clock.
+        if sensor.cycle != "frame" or name == "rate_hz"
     }
     return {
         "kind": sensor.model,
@@ -202,8 +203,8 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
     }
 
 
-def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
-    """Return tasks, items, seconds of work, and the span from first start to last stop by stage."""
+def stage_statistics(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
+    """Return the statistics of each stage: tasks, items, task time, elapsed time and workers."""
     return {
         stage.stage: {
             "partition": stage.partition,
@@ -213,24 +214,27 @@ def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
             "span_seconds": round(stage.stop - stage.start, 4),
             "workers": sorted(stage.workers),
         }
-        for stage in in_order(totals)
+        for stage in sort_stages(totals)
     }
 
 
-def in_order(totals: Iterable[StageTotals]) -> list[StageTotals]:
+def sort_stages(totals: Iterable[StageTotals]) -> list[StageTotals]:
     """Sort stages in the order of the pipeline."""
     return sorted(totals, key=lambda stage: [*STAGES].index(stage.stage))
 
 
 def overlap_seconds(totals: Iterable[StageTotals]) -> float:
-    """Return the seconds during which casting and planning trials were both under way."""
+    """Return the time in seconds during which casting and planning trials ran concurrently."""
     busy = {stage.stage: union(stage.busy) for stage in totals}
     casting, planning = (busy.get(stage, []) for stage in (INTERSECT, TRIAL))
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
-def _planning(result: RunResult) -> dict[str, Any] | None:
-    """Describe the planning and its result, in world coordinates, as in the scenario."""
+def _describe_planning(result: RunResult) -> dict[str, Any] | None:
+    """Describe the planning problem and the planned path, in world coordinates.
+
+    Return None if no path was planned.
+    """
     plan = result.plan
     planning = result.planning
     if plan is None or planning is None:

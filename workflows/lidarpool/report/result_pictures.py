@@ -1,4 +1,4 @@
-"""The pictures of a result, each by name."""
+"""Draw the pictures of a result: scene, hits, point cloud, intensity and planned path."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
 from ..plan.stations import StationPlan, StationVisibility
-from .page.rendering import put_picture
+from .page.rendering import insert_picture
 
-# small letters are illegible; a pixel takes 0.4 kB of memory
-MIN_SIDE = 480
-MAX_SIDE = 4096
-_LIGHT = ("reflectance", "intensity")  # columns for the picture of intensity, by preference
-MAX_RATIO = 2  # longer side to shorter, at most, or legends do not fit
-FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
+MIN_SIDE = 480  # pixels; text would be illegible in smaller pictures
+MAX_SIDE = 4096  # pixels; drawing takes 0.4 kB of memory per pixel
+_LIGHT = ("reflectance", "intensity")  # columns for the intensity picture, in order of preference
+MAX_RATIO = 2  # maximum aspect ratio for which legends fit
+FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width and height of the plot on the page
 MAX_TRIALS = 1000
-_BEST_WIDTH = 2.0  # line of the best path, points
+_BEST_WIDTH = 2.0  # line width of the best path, points
 PATH_COLOR = "#d6336c"
 TRIAL_COLOR = "#5b8fd0"
-COVERED, UNCOVERED, HIDDEN, OTHER = range(4)  # hidden from all candidates; no target
+# HIDDEN surfaces are not visible from any candidate, and OTHER surfaces are not targets.
+COVERED, UNCOVERED, HIDDEN, OTHER = range(4)
 COLORS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY, "#c8bda6")])
-_BLOCK = 4  # pixels a side
+_BLOCK = 4  # side length of a block in pixels
 
 
 def draw_pictures(
@@ -60,11 +60,37 @@ def draw_pictures(
     color: str = Z.name,
     show: WritingProgress = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw all pictures of a result, or `only` named pictures, into a folder and into its page.
+    """Draw the pictures of a result, save them in a folder and insert them into its report.html.
 
-    The folder is created. All pictures have the same viewpoint, and the cloud has the colors of
-    the column `color`. Without planning, the picture of the path is missing. Points in the frames
-    of their sensors, which differ from the scene's, have no picture.
+    All pictures of the scene have the same viewpoint. The path is only drawn if one was planned.
+    Points in sensor coordinates are not drawn, because they cannot be combined with the scene.
+
+    Parameters
+    ----------
+    shown
+        Content of the pictures.
+    result
+        Folder of the result, which contains the cloud.
+    folder
+        Folder for the pictures, created if necessary.
+    only
+        Names of the pictures to draw. By default, all available pictures are drawn.
+    size
+        Width and height in pixels.
+    color
+        Column by which the cloud is colored.
+    show
+        Function that shows the progress.
+
+    Yields
+    ------
+    The path of each picture after it has been saved.
+
+    Raises
+    ------
+    LidarError
+        If a picture is unknown or not available, if its size is not supported, or if the folder
+        cannot be created.
     """
     cloud = result / "cloud.ply"
     page = Path(folder) / "report.html"
@@ -97,7 +123,7 @@ def draw_pictures(
         picture = makers[name]()
         picture.save(path)
         if page.exists():
-            put_picture(page, name, picture.svg())
+            insert_picture(page, name, picture.svg())
         yield path
     show("pictures", len(names), len(names), "pictures")
 
@@ -105,14 +131,14 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures, and read the file `cloud` on demand."""
+    """Return {picture name: function that draws it}. The file `cloud` is read on demand."""
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
 
     @cache
     def shot() -> SurfaceView:
-        # A moving sensor has a marker at half time, and a line for its trajectory.
+        # A moving sensor is drawn as a line for its trajectory, with a marker at half the duration.
         positions = [w.position_at(middle)[None] if w.moves else w.positions for w in shown.sensors]
         scene = shown.scene
         return take_shot(
@@ -170,22 +196,34 @@ def _picture_makers(
 def draw_path(
     planning: PlanningPicture, path: PlannedPath, origin: Floats, size: tuple[int, int]
 ) -> Page:
-    """Draw a planned path from above, with obstacles, both ends and the paths of other trials.
+    """Draw a planned path, its obstacles and the paths of other trials, as seen from above.
 
-    The best path is bold. Trials whose paths differ visibly are faint, and named in the legend;
-    others are below the best path. Of more than 1000 trials, an evenly spaced sample is drawn.
-    `origin` (2,) is x and y of the local origin: the axes have world coordinates.
+    The best path is bold. The paths of other trials are faint, and are only drawn if they differ
+    visibly from the best path. If there are more than 1000 trials, an evenly spaced subset is
+    drawn.
+
+    Parameters
+    ----------
+    planning
+        Planning problem with its start, target and obstacles.
+    path
+        Best path and the waypoints of all trials.
+    origin
+        x and y of the scene origin in world coordinates, in meters. The axes show world
+        coordinates. Shape (2,).
+    size
+        Width and height of the picture in pixels.
     """
     page = Page(size)
     unit = page.unit
     best = path.corners
     trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
-    limits = _limits(best, drawn_trials, planning, size)
+    limits = _plot_limits(best, drawn_trials, planning, size)
     axes = page.map_chart(FRAME, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
-    width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # width of the line of the best path
-    drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
+    width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # line width of the best path
+    drawn_trials = [trial for trial in drawn_trials if max_deviation(trial, best) > width_m]
     circles = zip(planning.centers, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
@@ -202,14 +240,15 @@ def draw_path(
     axes.plot(*best[1:-1].T, "o", color=PATH_COLOR, ms=2.6 * unit, zorder=5)
     _draw_ends(axes, page, planning)
     page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
-    page.title("Planned path", _verdict(path, trials))
+    page.title("Planned path", _path_caption(path, trials))
     return page
 
 
-def farthest(path: Floats, other: Floats) -> float:
-    """Return the largest distance of a path's points from another path, both (w, 2) corners.
+def max_deviation(path: Floats, other: Floats) -> float:
+    """Return the maximum distance from one path to another path (directed Hausdorff distance).
 
-    Points are taken at most a hundredth of the other path apart.
+    `path` and `other` contain the corners of the paths. Shape (w, 2). `path` is sampled at a
+    spacing of about a hundredth of the length of `other`, with at most 100 points per segment.
     """
     spacing = max(float(np.linalg.norm(np.diff(other, axis=0), axis=1).sum()) / 100, 1e-12)
     points = [path[-1:]]
@@ -227,7 +266,7 @@ def farthest(path: Floats, other: Floats) -> float:
 
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
-    """Return the handles of the legend of a planned path."""
+    """Return the legend handles for a planned path."""
     handles = [Line2D([], [], color=PATH_COLOR, lw=_BEST_WIDTH * unit, label="Best path")]
     if trial_count:
         label = plural(trial_count, "other trial")
@@ -249,24 +288,27 @@ def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Lin
     return handles
 
 
-def _verdict(best: PlannedPath, trials: Sequence[Floats]) -> str:
-    """Return the caption: length, shortest possible length, collisions, and the longest trial."""
+def _path_caption(best: PlannedPath, trials: Sequence[Floats]) -> str:
+    """Return the caption: the length, the shortest possible length, and the number of trials."""
     shortest = "the discs block every path to the target"
     if math.isfinite(best.shortest_m) and best.shortest_m > 0:
         shortest = f"shortest possible length {best.shortest_m:.2f} m ({best.excess:+.2%})"
     length = f"length {best.length_m:.2f} m · {shortest}"
     state = "collision-free" if best.clearance_m >= 0 else "enters a disc"
     best_of = f"best of {plural(len(trials), 'trial')}"
-    if len(trials) > 1:  # equal paths are hidden by the best path
+    if len(trials) > 1:  # paths that coincide with the best path cannot be distinguished
         longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
         best_of += f", of which the longest is {longest:.2f} m"
     return f"{length.replace('-', '−')} · {state} · {best_of}"
 
 
-def _limits(
+def _plot_limits(
     best: Floats, trials: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
 ) -> Floats:
-    """Return the lowest and highest corner (2, 2) of the plot, in the page's proportions."""
+    """Return the minimum and maximum x and y of the plot, with the aspect ratio of the page.
+
+    The result has shape (2, 2).
+    """
     reach = planning.radii[:, None]
     shown = np.concatenate([best, *trials, planning.centers - reach, planning.centers + reach])
     lower = shown.min(axis=0)
@@ -294,7 +336,7 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
             mew=0.8 * page.unit,
             zorder=6,
         )
-        is_right = position[0] > middle  # names are towards the middle, inside the plot
+        is_right = position[0] > middle  # labels face the center, so that they fit into the plot
         axes.annotate(
             name,
             position,
@@ -311,10 +353,10 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
 
 
 def draw_stations(plan: StationPlan) -> Page:
-    """Draw the scene of a plan and color each pixel by its visibility from the stations."""
+    """Draw the scene of a station plan, with each pixel colored by its visibility."""
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
-    axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
+    axes = page.show(shot, _classify_by_coverage(shot, plan).paint(COLORS, 0.6))
     page.number_sensors(axes, shot)
     names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())
@@ -330,16 +372,16 @@ def draw_stations(plan: StationPlan) -> Page:
     return page
 
 
-def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
-    """Return the shot with COVERED, UNCOVERED, HIDDEN or OTHER in place of triangles."""
+def _classify_by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
+    """Replace the triangle index of each sample by COVERED, UNCOVERED, HIDDEN or OTHER."""
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     visible_from_any = _pixel_visibility(shot, plan)
     kinds, surface = _initial_kinds(shot, plan, shot.pixel_samples)
     covered = visible_from_any(stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
     uncovered = surface[~covered]
-    # To test all pixels would take minutes: only one pixel of each triangle in a block is tested.
-    tested, group = _pixels_of_blocks(shot, uncovered)
+    # Testing all pixels would take minutes. One pixel per triangle and block is tested instead.
+    tested, group = _choose_block_pixels(shot, uncovered)
     visible = visible_from_any(candidates, shot.pixel_samples, uncovered[tested])
     kinds[uncovered[visible[group]]] = UNCOVERED
     edge_kinds, edge_surface = _initial_kinds(shot, plan, shot.edge_samples)
@@ -350,23 +392,29 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
         shot,
-        pixel_samples=_painted(shot.pixel_samples, kinds),
-        edge_samples=_painted(shot.edge_samples, edge_kinds),
+        pixel_samples=_replace_triangles(shot.pixel_samples, kinds),
+        edge_samples=_replace_triangles(shot.edge_samples, edge_kinds),
     )
 
 
 def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) -> tuple[Ints, Ints]:
-    """Return HIDDEN or OTHER for each sample (n,), and the indices of samples of targets."""
-    is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # of triangles
+    """Return HIDDEN or OTHER for each sample, and the indices of the samples on targets.
+
+    The first array has shape (n,).
+    """
+    is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # one value per triangle
     on_surface = samples.triangle >= 0
     on_target = on_surface & is_target[samples.triangle]
     return np.where(on_surface & ~on_target, OTHER, HIDDEN), np.flatnonzero(on_target)
 
 
-def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
-    """Choose a pixel of each triangle in each block of pixels.
+def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
+    """Choose one pixel for each triangle in each block of pixels.
 
-    Returns indices into `pixels` (k,), and for each pixel (k,) the number of the chosen pixel.
+    Returns
+    -------
+    Indices into `pixels` of the chosen pixels, and for each pixel, the index of its chosen pixel
+    in that list.
     """
     width = shot.camera.size[0]
     block = pixels // width // _BLOCK * width + pixels % width // _BLOCK
@@ -375,22 +423,24 @@ def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
     return chosen, group
 
 
-def _painted(samples: RaySamples, kinds: Ints) -> RaySamples:
-    """Return samples with kinds (n,) in place of triangles."""
+def _replace_triangles(samples: RaySamples, kinds: Ints) -> RaySamples:
+    """Replace the triangle index of each sample that hits a surface by its kind."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
 def _pixel_visibility(
     shot: SurfaceView, plan: StationPlan
 ) -> Callable[[Floats, RaySamples, Ints], Bools]:
-    """Return a function for the visibility of samples, by the same rules as in the plan's table.
+    """Return a function that tests the visibility of samples by the same rules as the plan.
 
-    The function returns a mask (k,) of samples, given by their indices (k,), whose drawn side is
-    visible from any position (p, 3).
+    The function takes sensor positions with shape (p, 3), samples, and indices of samples with
+    shape (k,). It returns a mask with shape (k,), which is True for samples whose drawn side is
+    visible from at least one of the positions.
     """
-    # The shot has moved the objects a little, so its rays must meet the moved triangles. The
-    # normals of small triangles would turn: the plan's scene has them as they are. The normals
-    # of samples do not serve, because they are smoothed for shading.
+    # Rays must intersect the triangles of the shot, whose objects are slightly displaced. Face
+    # normals are computed from the original scene, because the displacement would rotate the
+    # normals of small triangles. The normals of the samples are smoothed for shading, so they
+    # cannot be used.
     sight = StationVisibility(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
     a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
     face_normals = normalize(np.cross(b - a, c - a))

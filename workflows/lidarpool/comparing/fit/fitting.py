@@ -27,7 +27,7 @@ from lidarsim.words import plural
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
 from ...recordings.opening import open_recording
-from ...report.page.rendering import rendered
+from ...report.page.rendering import render_template
 from .charts import draw_charts
 from .estimates import Estimate
 from .known_poses import KnownPoses
@@ -48,7 +48,7 @@ class Fit:
     model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:
-        return rendered("fit.txt", report=self.figures).rstrip("\n")
+        return render_template("fit.txt", report=self.figures).rstrip("\n")
 
     def save(self, file: str | Path) -> list[Path]:
         """Write the sensor file, and an .html report next to it, and return both paths.
@@ -68,7 +68,7 @@ class Fit:
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
         pictures = {"fit": draw_charts(self.figures).svg()}
-        page = rendered("fit.html", report=self.figures, pictures=pictures)
+        page = render_template("fit.html", report=self.figures, pictures=pictures)
         contents = {model_path: text, model_path.with_suffix(".html"): page}
         advice = "choose an existing folder with enough free space"
         with explained(f"{model_path} cannot be written", advice):

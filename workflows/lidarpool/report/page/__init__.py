@@ -1,1 +1,1 @@
-"""The report as a page: one HTML file that needs no network."""
+"""The report of a run as a self-contained HTML file."""

@@ -1,4 +1,7 @@
-"""Fills the templates of pages, with a timeline of tasks and with numbers and names as text."""
+"""Render reports from Jinja templates, with filters that format numbers and escape names.
+
+The HTML report of a survey includes a top view of the point cloud and a timeline of the tasks.
+"""
 
 from __future__ import annotations
 
@@ -36,22 +39,22 @@ from ...run.pipeline.task_records import TaskRecord
 from ...run.run_result import RunResult
 from ...scenario.scenario import Scenario
 from ..cloud_counts import CloudCounts
-from ..report import STAGES, in_order
+from ..report import STAGES, sort_stages
 
-SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
-WIDTH = 1000  # units of the drawing, which the page scales
-ROW = 18  # height of a row
-MAX_MARKS = 200  # stations in the picture from above
-MAX_NUMBERED = 30  # stations that have their numbers there
-_WEAKEST = 40  # opacity of a pixel with a single point, of 255
-MAX_ROWS = 24  # rows of a partition; the busiest are drawn
-_THIN = 1.2  # smallest width of a bar, in units
-_GAP = 0.6  # bars closer than this are drawn as one
+SCENARIO_MOST = 50_000  # maximum number of characters; a scenario may contain a million poses
+WIDTH = 1000  # width of the timeline in SVG units, which the page scales
+ROW = 18  # height of a row in SVG units
+MAX_MARKS = 200  # maximum number of stations in the top view
+MAX_NUMBERED = 30  # maximum number of stations for which numbers are drawn
+_WEAKEST = 40  # opacity of a pixel with a single point, from 0 to 255
+MAX_ROWS = 24  # maximum number of rows per partition; the busiest rows are drawn
+_THIN = 1.2  # minimum width of a bar in SVG units
+_GAP = 0.6  # bars are merged if the gap between them is smaller, in SVG units
 TimeSpan = tuple[float, float]
-WorkerTasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): their tasks}
+WorkerTasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): tasks}
 MINUS = "\N{MINUS SIGN}"
 NARROW = "\N{NARROW NO-BREAK SPACE}"
-_SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
+_SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # harmless, although `str.isprintable` rejects them
 
 
 def write_page(
@@ -61,10 +64,21 @@ def write_page(
     cloud: CloudCounts,
     scenario: Scenario | None = None,
 ) -> None:
-    """Write a report as a single HTML file, which needs no further files and no network.
+    """Write the report of a survey as a self-contained HTML file.
 
-    Most numbers come from `report`, made by `make_report`. `put_picture` adds pictures. The title
-    has the models of the sensors, or the scenario's name if no sensor has a model.
+    The title contains the sensor models, or the name of the scenario if no sensor has a model.
+    Pictures can be inserted later with `insert_picture`.
+
+    Parameters
+    ----------
+    path
+        Output file.
+    report
+        Content of the report, as returned by `make_report`.
+    result, cloud
+        Result of the run, and statistics of its cloud.
+    scenario
+        Scenario of the survey, which is included as YAML.
 
     Raises
     ------
@@ -73,28 +87,31 @@ def write_page(
     """
     has_model = any(mounted.sensor.name for mounted in result.survey.carried)
     marks = _station_marks(result, cloud)
-    text = rendered(
+    text = render_template(
         "page.html",
         report=report,
         cloud=cloud,
         name="" if scenario is None or has_model else scenario.title,
-        pictures={"above": from_above(cloud.above, cloud.pixel_m, marks)},
+        pictures={"above": draw_top_view(cloud.above, cloud.pixel_m, marks)},
         marks=len(marks),
-        densities=_density_ends(cloud),
-        changed=_changed,
+        densities=_density_range(cloud),
+        changed=_changed_fields,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
-        scenario=_written(scenario) if scenario else "",
+        scenario=_scenario_yaml(scenario) if scenario else "",
         stages=result.stages,
     )
     path.write_text(text, encoding="utf-8")
 
 
-def put_picture(page: Path, name: str, svg: str) -> None:
-    """Insert a picture into a page of `write_page`.
+def insert_picture(page: Path, name: str, svg: str) -> None:
+    """Insert a picture into a page that was written by `write_page`.
 
-    A page without room for the picture stays.
+    The page does not change if it has no placeholder for the picture.
 
-    LidarError if the page cannot be written.
+    Raises
+    ------
+    LidarError
+        If the page cannot be written.
     """
     pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explained(f"{page} cannot be written"):
@@ -102,12 +119,12 @@ def put_picture(page: Path, name: str, svg: str) -> None:
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
-# A station seen from above: pixels from the west and from the north, and its number.
+# A station in the top view: x and y in pixels from the northwest corner, and its number.
 _Mark = tuple[float, float, int]
 
 
 def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
-    """Return the stations of sensors that stand within the bounds of the points."""
+    """Return the stations of a stationary sensor that lie within the bounds of the points."""
     survey = result.survey
     if survey.coordinates != "world" or survey.path.moves or not len(result.points):
         return []
@@ -122,27 +139,35 @@ def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
     ]
 
 
-def from_above(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
-    """Draw numbers of points (rows, columns), the first row in the south, as SVG with a scale.
+def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
+    """Draw a top view of the point counts as an SVG image with a scale bar.
 
-    The page inverts the lightness of the points where the page is dark. Few `marks` have their
-    numbers; many are red dots.
+    In dark mode, the page inverts the lightness of the points.
+
+    Parameters
+    ----------
+    counts
+        Number of points per pixel, southernmost row first. Shape (rows, columns).
+    pixel_m
+        Side length of a pixel in meters.
+    marks
+        Stations to mark. They are numbered unless there are too many.
     """
     rows, columns = counts.shape
-    letter = max(rows / 30, columns / 55)  # height of letters
+    letter = max(rows / 30, columns / 55)  # font size in pixels of the image
     size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
     return (
         f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
-        f'<image {size} href="{_shaded(counts[::-1])}"/>'
-        f'<g class="stations">{_drawn_marks(marks, letter)}</g>'
+        f'<image {size} href="{_shade_counts(counts[::-1])}"/>'
+        f'<g class="stations">{_draw_marks(marks, letter)}</g>'
         f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}</svg>"
     )
 
 
-def _shaded(counts: Ints) -> str:
-    """Return the address of a picture of numbers of points (rows, columns)."""
+def _shade_counts(counts: Ints) -> str:
+    """Return a picture of point counts as a data URL. `counts` has shape (rows, columns)."""
     shade = np.log1p(counts)
-    weakest = np.where(counts > 0, _WEAKEST, 0)  # single points are visible, too
+    weakest = np.where(counts > 0, _WEAKEST, 0)  # makes single points visible
     pixels = np.full((*counts.shape, 4), (53, 105, 176, 0), np.uint8)
     pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
@@ -150,8 +175,8 @@ def _shaded(counts: Ints) -> str:
     return f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
 
 
-def _drawn_marks(marks: Sequence[_Mark], letter: float) -> str:
-    """Draw stations as discs with their numbers, or as dots if there are many or only one."""
+def _draw_marks(marks: Sequence[_Mark], letter: float) -> str:
+    """Draw stations as numbered discs, or as dots if there are many stations or only one."""
     if not 1 < len(marks) <= MAX_NUMBERED:
         radius = 0.25 * letter
         return "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y, _ in marks)
@@ -163,7 +188,7 @@ def _drawn_marks(marks: Sequence[_Mark], letter: float) -> str:
 
 
 def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> str:
-    """Draw a scale bar of about an eighth of a width, with its length."""
+    """Draw a scale bar with its length, which is about an eighth of the width of the view."""
     length_m = nice_step(width_m / 8)
     length = length_m / pixel_m
     words = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
@@ -174,25 +199,37 @@ def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> 
     )
 
 
-def _density_ends(cloud: CloudCounts) -> tuple[float, float] | None:
-    """Return the lowest and highest points per square meter in `above`, or None without points."""
+def _density_range(cloud: CloudCounts) -> tuple[float, float] | None:
+    """Return the minimum and maximum density in the top view in points per square meter.
+
+    Only pixels with points count. Return None if there are no points.
+    """
     counts = cloud.above[cloud.above > 0]
     if not len(counts):
         return None
     return float(counts.min()) / cloud.pixel_m**2, float(counts.max()) / cloud.pixel_m**2
 
 
-def rendered(
+def render_template(
     template: str,
     *,
     pictures: Mapping[str, str] | None = None,
     stages: Sequence[StageTotals] = (),
     **values: Any,
 ) -> str:
-    """Fill a template for HTML, Markdown or a terminal.
+    """Render an HTML, Markdown or text template.
 
-    `pictures` are elements of HTML, and `stages` are for a timeline. All other values are escaped
-    as the format needs; a missing one is an error.
+    Parameters
+    ----------
+    template
+        File name of the template, whose extension selects the kind of escaping.
+    pictures
+        {name: HTML element}. Pictures are not escaped.
+    stages
+        Statistics of stages, from which the timeline is drawn.
+    **values
+        Other values of the template, which are escaped. It is an error if the template uses a value
+        that is not passed.
     """
     return _template(template).render(
         pictures={name: Markup(image) for name, image in (pictures or {}).items()},
@@ -201,7 +238,7 @@ def rendered(
     )
 
 
-@cache  # compiling a template takes longer than filling
+@cache  # compiling a template takes longer than rendering it
 def _template(name: str) -> Template:
     escaped = markdown if name.endswith(".md") else printable
     environment = Environment(
@@ -211,7 +248,7 @@ def _template(name: str) -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        finalize=lambda value: escaped(value) if type(value) is str else value,  # not of Markup
+        finalize=lambda value: escaped(value) if type(value) is str else value,  # skips Markup
     )
     for filter_ in (
         duration,
@@ -240,16 +277,16 @@ def _template(name: str) -> Template:
 
 
 def _with_names(row: str, head: Sequence[str]) -> Markup:
-    """Give the cells (td) of a row of a table the names of their columns, as the style shows.
+    """Add the column names to the cells (td) of a table row, so that the style sheet can show them.
 
-    The first column has the name of the row (th).
+    The first column, which contains the name of the row (th), is skipped.
     """
     names = iter(head[1:])
     return Markup(re.sub("<td", lambda _: f'<td data-name="{escape(next(names, ""))}"', row))
 
 
-def _written(scenario: Scenario) -> str:
-    """Return a scenario as YAML, cut if too long to be shown."""
+def _scenario_yaml(scenario: Scenario) -> str:
+    """Return a scenario as YAML, truncated if it is too long."""
     data = scenario.model_dump(mode="json", exclude_defaults=True, by_alias=True)
     data |= {"classes": dict(scenario.classes)} if scenario.classes else {}  # JSON has no numbers
     text = yaml.safe_dump(
@@ -259,23 +296,27 @@ def _written(scenario: Scenario) -> str:
     return text if data else ""
 
 
-def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
-    """Return the names and values of fields of a dataclass that differ from their defaults."""
+def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
+    """Return the names and values of the fields that differ from the defaults of a dataclass."""
     usual = declared(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
 
 
 def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
-    """Lay out the tasks of a run, as far as there are records, and return None if no task ran.
+    """Lay out a timeline of the recorded tasks of a run.
 
-    The template gets groups of rows on a common axis, which starts with the first task: the stages,
-    then each partition's workers. A row is of one stage, on one worker or on all; its bars are a
-    path of thick lines for SVG, and its detail is a tooltip. Ticks are per cent of the width, and
-    labels.
+    All rows share a time axis that starts with the first task. The first group has one row per
+    stage. It is followed by one group per partition, with one row for each stage on each worker.
+
+    Returns
+    -------
+    Values for the template, or None if no task ran. The bars of a row are an SVG path, and its
+    detail is the text of a tooltip. Each tick is a pair of a position, in percent of the width, and
+    a label.
     """
     if not stages:
         return None
-    stages = in_order(stages)
+    stages = sort_stages(stages)
     start = min(stage.start for stage in stages)
     seconds = max(1e-6, max(stage.stop for stage in stages) - start)
     axis = _TimeAxis(start, seconds)
@@ -296,13 +337,13 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
 
 
 class _TimeAxis(NamedTuple):
-    """Axis of a timeline, seconds."""
+    """Time axis of a timeline, in seconds."""
 
     start: float
     length: float
 
     def bars(self, times: Iterable[TimeSpan]) -> str:
-        """Draw spans of time as a path, wide enough to be visible, with close spans joined."""
+        """Draw time spans as an SVG path, widening short spans and merging adjacent ones."""
         spans = []
         for start, stop in times:
             x_start = min((start - self.start) * WIDTH / self.length, WIDTH - _THIN)
@@ -312,7 +353,7 @@ class _TimeAxis(NamedTuple):
         return "".join(f"M{x_start:.1f} {ROW / 2:g}H{x_stop:.1f}" for x_start, x_stop in joined)
 
     def row(self, label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
-        """Return a row of the template."""
+        """Return the template values of a row."""
         text = f"{label}: {detail}"
         return {"label": label, "detail": text, "stage": stage, "bars": self.bars(times)}
 
@@ -320,19 +361,19 @@ class _TimeAxis(NamedTuple):
 def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[dict[str, Any]]:
     """Return a group of rows for each partition."""
     task_counts = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    # {partition: its tasks}
+    # {partition: recorded tasks}
     drawn: dict[str, WorkerTasks] = defaultdict(lambda: defaultdict(list))
     for record in (record for stage in stages for record in stage.records):
         name = record.partition if not record.misplaced else " + ".join(record.resources)
         drawn[name or "no partition"][record.worker, record.stage].append(record)
     groups = []
     for partition, tasks in sorted(drawn.items()):
-        workers = {worker for worker, _ in tasks}  # workers of tasks that have a record
+        workers = {worker for worker, _ in tasks}  # workers with recorded tasks
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
         count = sum(map(len, tasks.values()))
         total = max(task_counts[partition], count)
         detail = f"{plural(len(workers), 'worker')}, {plural(total, 'task')}"
-        if total > count:  # else gaps would look like idle time
+        if total > count:  # otherwise, gaps would look like idle time
             detail += f", of which {count:,} are drawn, so gaps are not always idle time"
         if len(tasks) > MAX_ROWS:
             detail += f"; only the {MAX_ROWS} busiest of {len(tasks):,} rows are shown"
@@ -341,7 +382,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
 
 
 def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
-    """Return rows for the busiest pairs of a worker and a stage of a partition."""
+    """Return rows for the busiest combinations of a worker and a stage in a partition."""
     busy_s = {key: sum(task.seconds for task in records) for key, records in tasks.items()}
     rows = []
     for worker, stage in sorted(
@@ -356,9 +397,10 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
 
 
 def sentence(note: str, names: Iterable[str] = ()) -> str:
-    """Return a note that begins with a capital, unless it begins with a name: wall.obj, rosbag2.
+    """Capitalize the first letter of a note, unless the note begins with a name.
 
-    `names` are names that look like words.
+    A first word that is not entirely lowercase letters, such as ``wall.obj``, is considered a name.
+    `names` lists names that look like ordinary words.
 
     Examples
     --------
@@ -371,26 +413,30 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters, such as those that reverse a line."""
+    """Replace unprintable characters, such as those that reverse the text direction."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
 
 
 def markdown(text: str) -> str:
-    """Return text of a user as a line of Markdown, escaped."""
+    """Escape text for Markdown, and join it to a single line."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
 
 
 def code(text: str) -> Markup:
-    """Return a name as code of Markdown, or as text if letters would end code or a cell."""
+    """Format a name as a Markdown code span.
+
+    Names that contain characters with a special meaning in code spans or tables are escaped
+    instead.
+    """
     is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
     return Markup(f"`{text}`" if is_plain else markdown(text))
 
 
 def duration(seconds: float) -> str:
-    """Return a time in a unit that gives few digits."""
+    """Format a duration with a suitable unit."""
     if 0 < seconds < 0.001:
         return f"{1e6 * seconds:.0f} µs"
     if 0 < seconds < 0.9995:
@@ -404,12 +450,12 @@ def duration(seconds: float) -> str:
 
 
 def rate(number: float, seconds: float) -> str:
-    """Return a rate per second, or a dash if the time is unknown."""
+    """Format a rate per second, or return a dash if the time is unknown."""
     return f"{large(number / seconds)}/s" if seconds > 0 else "–"
 
 
 def large(number: float) -> str:
-    """Return a number with three digits, and k, M or G for large numbers."""
+    """Format a number with three significant digits, using k, M or G for large numbers."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
         if number >= size:
             scaled = number / (1e3 if letter == "k" else size)
@@ -418,19 +464,23 @@ def large(number: float) -> str:
 
 
 def share(part: float, total: float) -> str:
-    """Return a part in per cent."""
+    """Format a part of a total as a percentage."""
     return f"{100 * part / total:.1f}%" if total else "–"
 
 
 def excess(fraction: float) -> str:
-    """Return an excess in per cent: «+0.12%»."""
+    """Format an excess as a signed percentage, for example "+0.12%"."""
     if 0 < fraction < 1e-4:
         return "< 0.01%"
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
 def formatted(value: Any) -> str:
-    """Return numbers with four digits or a decimal, integers with all digits, text unchanged."""
+    """Format a value for display.
+
+    Floating-point numbers are rounded to four significant digits, or to one decimal place if they
+    are large. Integers keep all digits, and text is unchanged.
+    """
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
@@ -442,12 +492,12 @@ def formatted(value: Any) -> str:
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Return coordinates in meters, to the millimeter."""
+    """Format coordinates in meters, rounded to millimeters."""
     return ", ".join(f"{round(value, 3) + 0.0:,.10g}" for value in values).replace("-", MINUS)
 
 
 def millimeters(value: float | None) -> str:
-    """Return a length in meters or millimeters, or "unknown" for None."""
+    """Format a length in meters or millimeters, or return "unknown" for None."""
     if value is None:
         return "unknown"
     text = f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
@@ -455,5 +505,5 @@ def millimeters(value: float | None) -> str:
 
 
 def ratio(value: float | None) -> str:
-    """Return a share from 0 to 1, or "undefined" for None."""
+    """Format a ratio from 0 to 1, or return "undefined" for None."""
     return "undefined" if value is None else f"{value:.3f}"

@@ -20,7 +20,7 @@ from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from lidarsim.words import rounded
 
-from ...columns.parts import deletable_files, mark_name, scans_of
+from ...columns.parts import deletable_files, mark_name, parse_part_name
 from ...datasets.job_table import JobRow
 from ...identity.field_words import describe_changes
 from ...identity.fingerprint import fingerprint
@@ -239,7 +239,7 @@ class RunStore:
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {job: names of parts that a run has left}
         for name in self._sizes:
-            if resume and (scans := scans_of(name, self.db.meta["mark"])) is not None:
+            if resume and (scans := parse_part_name(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if self.db.used:
             self._check_same(self.db.meta)

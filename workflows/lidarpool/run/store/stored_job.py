@@ -15,7 +15,7 @@ from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...columns.parts import StoredCloud, read_part, read_tally, unpack
+from ...columns.parts import StoredCloud, read_hit_counts, read_part, unpack
 from ...plan import Trial
 from ...scenario.job import Job
 from ..pipeline.committed_results import CommittedParts, CommittedResults
@@ -179,7 +179,7 @@ class StoredJob:
         """
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
-            counters, hits = read_tally(self.storage, part.name)
+            counters, hits = read_hit_counts(self.storage, part.name)
             counts[counters] += hits
         return counts
 
