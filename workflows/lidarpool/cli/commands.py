@@ -367,7 +367,7 @@ def run(
         )
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        settings["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        settings["scenario_source"] = {"path": str(paths[0].absolute()), "options": of_mesh}
         run_scenario(scenario, out, terminal, options, backend, extent=extent, **settings)
 
 

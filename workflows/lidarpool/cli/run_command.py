@@ -53,12 +53,12 @@ def run_scenario(
     *,
     extent: str | None = None,
     shard: Shard | None = None,
-    made_of: Mapping[str, Any] = MappingProxyType({}),
+    scenario_source: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    With a `shard`, the run stays, and stores `made_of` with it. LidarError if the run fails; notes
-    of the error say what was kept.
+    A `shard` is kept as an unfinished run, together with `scenario_source`. Raise LidarError if the
+    run fails. The notes of the error state which results were kept.
     """
     options = options.with_pool(scenario.pool, {"backend": backend})
     for output_format in scenario.output.write:  # before reading the scene, which may take long
@@ -74,9 +74,15 @@ def run_scenario(
         _run_survey(prepared, out, options, terminal, extent)
         return
     jobs = OneJob(prepared.job, shard, title=scenario.title)
-    made_of = {**made_of, "extent": extent or "page", "scans": prepared.survey.scan_count}
+    scenario_source = {
+        **scenario_source,
+        "extent": extent or "page",
+        "scans": prepared.survey.scan_count,
+    }
     with result_folder(out), page_of(jobs, options.live) as page:
-        result = cast_to_store(jobs, options, terminal, page, made_of=made_of, target=out)
+        result = cast_to_store(
+            jobs, options, terminal, page, scenario_source=scenario_source, target=out
+        )
     points = len(result.points)
     line = (
         f"{describe_shard(str(shard))} in {out}: {plural(points, 'point')}. To combine the shards, "

@@ -143,7 +143,7 @@ def merge(
     _check_apart(Storage.at(target), shard_storages)
     is_survey_shard = False
     with suppress(LidarError):  # the result would have the place of the shard's points
-        is_survey_shard = "made_of" in _read_folder(Storage.at(target)).record
+        is_survey_shard = "scenario_source" in _read_folder(Storage.at(target)).record
     if is_survey_shard:
         raise LidarError(
             f"{target} contains a shard of a survey. Specify another folder with `--out`."
@@ -157,7 +157,7 @@ def merge(
         mistakes.lines = ["There are no shards to merge. Specify the folders of the shards."]
     if not (partial and shard_folders):
         mistakes.tell()
-    if "made_of" in shard_folders[0].record:
+    if "scenario_source" in shard_folders[0].record:
         return _merge_survey(shard_folders, target, partial, scenario, screen)
     with result_folder(target), screen.status("merging the data set"):
         return _merge_dataset(shard_folders, Storage.at(target), partial, screen)
@@ -230,10 +230,10 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
         try:
             with closing(RunDatabase(path, durable=False)) as db:
                 meta = {"casting": "{}", "fields": "{}"} | db.meta
-                texts = ("identity", "fields", "casting", "made_of")
+                texts = ("identity", "fields", "casting", "scenario_source")
                 record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
                 shard = Shard.parse(record["identity"].pop("shard"))
-                scan_count = record["made_of"]["scans"]
+                scan_count = record["scenario_source"]["scans"]
                 job = CommittedResults(0, shard.scans(scan_count))
                 db.read(job)
                 if job.missing_count:
@@ -471,15 +471,15 @@ def _merge_survey(
     _check_same_run(shard_folders)
     notes = _notes(shard_folders, partial=partial)
     record = shard_folders[0].record
-    made_of = record["made_of"]
-    path = Path(scenario or made_of["path"])
+    scenario_source = record["scenario_source"]
+    path = Path(scenario or scenario_source["path"])
     if not path.exists():
         raise MissingFileError(
             f"{path}, the scenario of these shards, does not exist. Specify its new path with "
             "`--scenario`."
         )
     with screen.status("reading the scene"):
-        prepared = prepare(Scenario.load(path, made_of["options"]))
+        prepared = prepare(Scenario.load(path, scenario_source["options"]))
         job = prepared.job
         jobs = OneJob(job)
         identity = jobs.identity
@@ -490,7 +490,9 @@ def _merge_survey(
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
             "with `--scenario`."
         )
-    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], prepared.scenario)
+    output = SurveyOutput(
+        out, job.survey, job.outputs, scenario_source["extent"], prepared.scenario
+    )
     options = RunOptions(folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     with output.lock() as folder:
         if not options.continues_run:

@@ -47,7 +47,7 @@ class WriteRequest(NamedTuple):
     row: JobRow
     cloud: StoredCloud
     sweeps: Sweeps
-    made_of: Sequence[Sequence[str]]
+    input_files: Sequence[Sequence[str]]
 
 
 JobOutcome = JobRow | LidarError
