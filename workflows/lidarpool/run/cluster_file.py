@@ -210,7 +210,7 @@ class ClusterFile(BaseModel):
 
 @contextmanager
 def _listening(lines: list[str]) -> Iterator[None]:
-    """Append the output of processes that are started over SSH, which Dask only logs, to `lines`."""
+    """Append the output of processes that are started over SSH to `lines`. Dask only logs it."""
 
     def info(line: str, *arguments: object) -> None:
         lines.append(line)
