@@ -86,7 +86,7 @@ class Pacer:
         now_s = time.monotonic()
         if self._last is not None:
             last_ns, last_s = self._last
-            # Time restarts with each sensor, because its scans follow all scans of the previous one.
+            # The scans of each sensor follow those of the previous sensor, and their time restarts.
             due_s = last_s + max(time_ns - last_ns, 0.0) / self._ns_per_s
             if due_s > now_s:
                 time.sleep(due_s - now_s)
