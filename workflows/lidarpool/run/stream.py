@@ -186,7 +186,7 @@ class _Casting:
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _StreamedSweeps] = {}  # {job number: sweeps}
-        self._next: _StreamedSweeps | None = None  # sweeps of the job that is begun next
+        self._next: _StreamedSweeps | None = None  # job with sweeps that have not been begun yet
         self._in_flight = deque[tuple[_StreamedSweeps, int]]()  # sweeps that are being cast
         self._warned = False  # True after a warning about a job without points
 
