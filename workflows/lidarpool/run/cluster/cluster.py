@@ -184,7 +184,7 @@ class Cluster:
             self.backend = self._workers.backend
             self.software = self._workers.software
             only_job = store.only_job
-            if only_job is not None:  # data sets of campaigns do not use formats of plug-ins
+            if only_job is not None:  # data sets of campaigns only use built-in formats
                 check_formats(client, self._workers.pool, first.outputs)
             store.cast_with(self.backend, self.software)
             if only_job is not None:  # the jobs of a campaign are checked when they begin

@@ -46,7 +46,7 @@ class CommittedParts:
         raise KeyError(scan)
 
     def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Return the ranges of uncommitted scans in a range, all without their stop."""
+        """Return the uncommitted scans from `first` to `stop` as half-open ranges."""
         absent: list[tuple[int, int]] = []
         index = self._index(first)
         while first < stop and index < len(self.ordered):
