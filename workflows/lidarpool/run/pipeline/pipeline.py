@@ -190,7 +190,10 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages. The caller must always call `finish`, and before it `stop` on failure."""
+        """Start the stages.
+
+        The caller must always call `finish` at the end, and `stop` before it on failure.
+        """
         self.stages.open()
         self._refresh(scans_to_come=0)
 
