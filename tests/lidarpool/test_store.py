@@ -20,7 +20,7 @@ from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
@@ -38,7 +38,7 @@ def add(store, first, stop, job=None):
 
 def opened(place=None, parts=None, *, job=JOB, backend="auto", resume=False):
     """Store of a survey."""
-    return RunStore(OneJob(job), backend, place, parts, resume=resume)
+    return RunStore(SingleJob(job), backend, place, parts, resume=resume)
 
 
 def names(folder):

@@ -418,13 +418,13 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     """  # noqa: D301 - click wants the character, not its name
     from poolpart import Pool
 
-    from ..run.cluster.connection import connected
+    from ..run.cluster.connection import connect_client
     from .doctor import advice_in_words, examine, find_cluster_fault, in_words
 
     found: Iterable[WorkerInfo] = ()
     fault = ""
     if scheduler is not None:
-        with connected(scheduler, files) as client:
+        with connect_client(scheduler, files) as client:
             pool = Pool.from_client(client)
             found = pool.workers
             fault = find_cluster_fault(pool)

@@ -29,7 +29,7 @@ from ..report.campaign_output import CAMPAIGN_FILE, check_same, failures, verify
 from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import CLOUD, SurveyOutput, run_survey
 from ..report.report import summary
-from ..run.job_source import OneJob
+from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
@@ -73,7 +73,7 @@ def run_scenario(
     if shard is None:
         _run_survey(prepared, out, options, terminal, extent)
         return
-    jobs = OneJob(prepared.job, shard, title=scenario.title)
+    jobs = SingleJob(prepared.job, shard, title=scenario.title)
     scenario_source = {
         **scenario_source,
         "extent": extent or "page",
@@ -107,7 +107,7 @@ def _run_survey(
     job = prepared.job
     for note in advice(prepared):
         terminal.tell(note)
-    jobs = OneJob(job, title=prepared.scenario.title)
+    jobs = SingleJob(job, title=prepared.scenario.title)
     output = SurveyOutput(out, job.survey, job.outputs, extent or "page", prepared.scenario)
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)

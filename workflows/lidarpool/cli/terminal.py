@@ -19,7 +19,7 @@ from lidarsim.words import plural
 
 from ..processes.logs import set_logs
 from ..processes.streams import TolerantStream
-from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
+from ..run.progress import Progress, ProgressRate, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED
 
 # Plain lines follow after a tenth of the elapsed time, within these bounds, so that a survey of
@@ -147,7 +147,11 @@ class PlainLines:
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
-        self._paces = {"survey": Pace(), "planning": Pace(), "campaign": Pace()}
+        self._paces = {
+            "survey": ProgressRate(),
+            "planning": ProgressRate(),
+            "campaign": ProgressRate(),
+        }
         self._completed: set[str] = set()
         self._standing_still = ""  # the last line about it
 

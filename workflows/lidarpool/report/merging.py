@@ -27,8 +27,8 @@ from ..identity.shard import ALL, Shard
 from ..identity.software import software
 from ..open3d_access.open3d_module import load_open3d
 from ..plan import Trial
-from ..run.committed import Committed
-from ..run.job_source import OneJob
+from ..run.committed import CommittedRun
+from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.committed_results import CommittedResults
 from ..run.pipeline.stage_messages import Receipt
@@ -37,7 +37,7 @@ from ..run.run_result import CampaignRun
 from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
-from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
+from ..run.store.run_store import RUN_FOLDER, RunStore, add_sensors, parts_of, remove_run
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
@@ -383,7 +383,7 @@ def _merged_record(shard_folders: Sequence[_ShardFolder], fallback: _ShardFolder
     """
     sensors = dict[str, str]()
     for folder in shard_folders:
-        sensors = with_sensors(sensors, folder.record["sensors"].items())
+        sensors = add_sensors(sensors, folder.record["sensors"].items())
     cast = next((folder for folder in shard_folders if folder.record["casting"]), fallback)
     campaign = max(shard_folders, key=lambda folder: folder.run_size).record["campaign"]
     return {**cast.record, "sensors": sensors, "campaign": campaign}
@@ -481,7 +481,7 @@ def _merge_survey(
     with screen.status("reading the scene"):
         prepared = prepare(Scenario.load(path, scenario_source["options"]))
         job = prepared.job
-        jobs = OneJob(job)
+        jobs = SingleJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         changed = describe_changes(record["fields"], jobs.fields)
@@ -500,7 +500,7 @@ def _merge_survey(
         with open_store(jobs, options, screen) as store:
             _take_points(store, shard_folders, notes)
             load_open3d()
-            result = Committed(store).result(screen)
+            result = CommittedRun(store).result(screen)
             return output.publish(folder, result, store, screen)[1]
 
 
@@ -544,5 +544,5 @@ def _take_points(
     if damaged:
         raise LidarError(_missing_or_damaged(damaged))
     # Without trials, the first shard, which plans, is missing.
-    store.take_over(only.job if only.trials else replace(only.job, planning=None))
+    store.reassign_points(only.job if only.trials else replace(only.job, planning=None))
     store.notes = [*notes]

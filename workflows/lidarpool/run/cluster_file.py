@@ -54,7 +54,7 @@ class WorkerGroup(BaseModel):
     def __str__(self) -> str:
         return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
-    def mistake(self) -> str:
+    def describe_mistake(self) -> str:
         """Return an error message if the number of workers is invalid, or an empty string."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s requires adapt, such as `adapt: [0, 8]`."
@@ -103,9 +103,9 @@ class ClusterFile(BaseModel):
                     f"{did_you_mean(name, (GPU, LIDAR, OTHER))} The partitions of a survey are "
                     f"{GPU}, {LIDAR} and {OTHER}."
                 )
-            if mistake := workers.mistake():
+            if mistake := workers.describe_mistake():
                 raise LidarError(f"{path}: partitions.{name}.{mistake}")
-        file._factory()
+        file._import_class()
         return file
 
     @property
@@ -132,7 +132,7 @@ class ClusterFile(BaseModel):
         return f"{self.cluster.rpartition('.')[2]}: {total}, {partitions}"
 
     @contextmanager
-    def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
+    def start(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
         """Start the cluster and its workers, and stop them when the context exits.
 
         Workers may still be waiting in the queue of a batch system when the body starts.
@@ -149,7 +149,7 @@ class ClusterFile(BaseModel):
         """
         arguments = dict(self.arguments)
         partitions = self.model_dump(exclude_unset=True)["partitions"]
-        factory = self._factory()
+        factory = self._import_class()
         ssh_lines: list[str] = []
         try:
             if factory is SSHCluster:
@@ -161,7 +161,7 @@ class ClusterFile(BaseModel):
                     ("connect_options", "connect_timeout", _CONNECT_TIMEOUT),
                 ):
                     arguments[option] = {key: value} | arguments.get(option, {})
-            with _listening(ssh_lines):
+            with _capture_ssh_output(ssh_lines):
                 cluster = factory(**arguments)
                 try:
                     start_partitions(cluster, partitions, tell)
@@ -181,7 +181,7 @@ class ClusterFile(BaseModel):
         with cluster:
             yield cluster
 
-    def _factory(self) -> Any:
+    def _import_class(self) -> Any:
         """Import the class of the cluster. Raise LidarError if it is not a supported cluster."""
         package, _, name = self.cluster.rpartition(".")
         try:
@@ -209,7 +209,7 @@ class ClusterFile(BaseModel):
 
 
 @contextmanager
-def _listening(lines: list[str]) -> Iterator[None]:
+def _capture_ssh_output(lines: list[str]) -> Iterator[None]:
     """Append the output of processes that are started over SSH to `lines`. Dask only logs it."""
 
     def info(line: str, *arguments: object) -> None:

@@ -14,7 +14,7 @@ from .store.run_store import RunStore
 
 
 @dataclass(frozen=True)
-class Committed:
+class CommittedRun:
     """Run whose jobs have all been committed to its store.
 
     Attributes

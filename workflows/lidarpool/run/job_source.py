@@ -36,7 +36,7 @@ STOP_S = 10.0  # time limit for a job that is still being created when the run e
 CONTENT = ("scene", "survey", "planning")  # fields of a job that determine its result
 
 
-def identity_of(job: Job) -> dict[str, str]:
+def input_fingerprints(job: Job) -> dict[str, str]:
     """Return the fingerprints of a job's scene, survey and planning.
 
     Jobs with the same fingerprints produce the same bytes.
@@ -52,7 +52,7 @@ def identity_of(job: Job) -> dict[str, str]:
         raise JobError(str(error)) from error
 
 
-def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
+def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
     """Describe the fields that a result depends on, by their path in a scenario.
 
     Positions are in the local coordinates of the scene.
@@ -79,7 +79,7 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
 
 
 @dataclass(frozen=True, eq=False)
-class OneJob:
+class SingleJob:
     """Survey as the only job of a run, or one shard of a survey."""
 
     survey_job: Job
@@ -98,16 +98,16 @@ class OneJob:
     @cached_property
     def identity(self) -> Mapping[str, str]:
         """Fingerprints of the scene, the survey and the planning."""
-        return identity_of(self.survey_job)
+        return input_fingerprints(self.survey_job)
 
     @cached_property
     def fields(self) -> Mapping[str, str]:
         """Descriptions of the fields of the scene, the survey and the planning."""
         job = self.survey_job
-        return fields_of(job.scene, job.survey, job.planning)
+        return describe_inputs(job.scene, job.survey, job.planning)
 
 
-Jobs = OneJob | CampaignSpec  # source of the jobs in a run
+Jobs = SingleJob | CampaignSpec  # source of the jobs in a run
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
@@ -120,7 +120,7 @@ def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
     return JobRow(number, jobs.name(number), jobs.split(number), dict(values), message)
 
 
-class JobMaker:
+class JobProducer:
     """Thread that creates the jobs of a campaign and their sweeps in advance.
 
     Parameters
@@ -146,7 +146,7 @@ class JobMaker:
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
-    def take(self, *, wait: bool = False) -> Job | JobRow | None:
+    def pop(self, *, wait: bool = False) -> Job | JobRow | None:
         """Remove and return the next job, or the table row of a job that cannot be created.
 
         Return None after the last job or, unless `wait` is True, if no job is ready.
@@ -160,7 +160,7 @@ class JobMaker:
             raise entry
         return entry
 
-    def has(self, jobs: int) -> bool:
+    def has_ready(self, jobs: int) -> bool:
         """Return True if this number of jobs is ready, or if no more jobs can become ready."""
         waits = self._full or not self._thread.is_alive()
         return waits or self._ready.qsize() >= min(jobs, MAX_READY)

@@ -126,7 +126,7 @@ class RunKeywords(TypedDict, total=False):
     pace: float | None
 
 
-def options_of_call(
+def check_keywords(
     call: str, keywords: RunKeywords, without: Collection[str] = ()
 ) -> dict[str, Any]:
     """Validate the keywords of a call, and return those that are not None.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from poolpart.task_locations import PartitionSnapshot
 
 from ..plan import Planning, Trial, run_trial
-from .cluster.tasks import Tasks
+from .cluster.tasks import TaskGroup
 from .pipeline.failures import raise_if_failed, was_killed
 from .pipeline.task_records import recorded
 
@@ -19,7 +19,7 @@ MAX_ROUNDS = 3  # maximum number of times that a trial is submitted if its worke
 LOOK_EVERY_S = 1.0
 
 
-class TrialPump:
+class TrialRunner:
     """Planning trials of a survey, which run on the workers of a partition.
 
     Call `step` repeatedly until `finished` is True. Trials in `earlier_trials`, which an earlier
@@ -27,7 +27,7 @@ class TrialPump:
     """
 
     def __init__(
-        self, tasks: Tasks[int], planning: Planning, earlier_trials: Sequence[Trial] = ()
+        self, tasks: TaskGroup[int], planning: Planning, earlier_trials: Sequence[Trial] = ()
     ) -> None:
         self.tasks = tasks
         self.planning = planning
@@ -38,7 +38,7 @@ class TrialPump:
             n for n in range(planning.trials) if n not in finished_numbers
         )  # numbers
         self._rounds: Counter[int] = Counter()  # {number: times that the trial was submitted}
-        self._look()
+        self._locate_tasks()
 
     @property
     def finished(self) -> bool:
@@ -48,15 +48,15 @@ class TrialPump:
     def step(self) -> None:
         """Collect results and submit more trials. Raise LidarError if a trial has failed."""
         running = self.tasks.running
-        if running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
+        if running and time.monotonic() - self._located_at > LOOK_EVERY_S:
             self._leave_silent_workers()
-        for number, future in self.tasks.take_failed():
+        for number, future in self.tasks.pop_failed():
             # Dask fails a task after several of its workers have died, whatever the cause.
             if was_killed(future) and self._rounds[number] < MAX_ROUNDS:
                 self._waiting.append(number)
             else:
                 raise_if_failed(future, f"Planning trial {number}")
-        self.trials += [trial for _, trial in self.tasks.take_done()]
+        self.trials += [trial for _, trial in self.tasks.pop_finished()]
         for _ in range(min(self._max_running - len(running), len(self._waiting))):
             self._submit(self._waiting.popleft())
 
@@ -76,7 +76,7 @@ class TrialPump:
 
     def _leave_silent_workers(self) -> None:
         """Resubmit trials whose workers do not respond or have left."""
-        locations = self._look()
+        locations = self._locate_tasks()
         running = self.tasks.running
         responding = sorted(locations.members - locations.silent)
         # A trial that is restricted to a worker that has left would wait forever.
@@ -87,9 +87,9 @@ class TrialPump:
         for index, future in enumerate(lost if responding else []):
             self._submit(running.pop(future), responding[index % len(responding)])
 
-    def _look(self) -> PartitionSnapshot:
-        self._looked_at = time.monotonic()
-        locations = self.tasks.look()
+    def _locate_tasks(self) -> PartitionSnapshot:
+        self._located_at = time.monotonic()
+        locations = self.tasks.locate()
         # One pending trial per slot prevents idle slots, causes adaptive partitions to grow, and
         # limits the number of trials that are lost when a worker dies.
         self._max_running = 2 * max(1, locations.max_slots)

@@ -61,12 +61,12 @@ class Progress:
 Show = Callable[[Progress], None]
 
 
-def in_words(rate: float) -> str:
+def format_rate(rate: float) -> str:
     """Format a rate with at least two significant digits, such as 0.25, 3.1, 52 or 1,234."""
     return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
-def time_in_words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration, such as 8 s, 3 min or 2 h 05 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
@@ -74,7 +74,7 @@ def time_in_words(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60:02} min"
 
 
-class Pace:
+class ProgressRate:
     """Rate of a count since its first value, from which the remaining time is estimated."""
 
     def __init__(self) -> None:
@@ -92,13 +92,13 @@ class Pace:
         """
         rate = self.rate(seconds, count)
         sure = rate and (count >= SURE_SHARE * total or seconds >= SURE_S) and count < total
-        return time_in_words((total - count) / rate) if sure else ""
+        return format_duration((total - count) / rate) if sure else ""
 
     def text(self, seconds: float, count: int, total: int) -> str:
         """Format the rate and the remaining time, or return an empty string if the rate is 0."""
         rate = self.rate(seconds, count)
         time_left = self.time_left(seconds, count, total)
-        return f"{in_words(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
+        return f"{format_rate(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
 def waiting_reason(progress: Progress) -> str:
@@ -134,7 +134,7 @@ def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
     """Show progress bars with rates and remaining times, and yield their update function."""
-    paces = {label: Pace() for label, _, _ in STAGES}
+    paces = {label: ProgressRate() for label, _, _ in STAGES}
     with progress_rows(console) as move:
 
         def show(progress: Progress) -> None:
@@ -153,7 +153,7 @@ def bars(console: Console) -> Iterator[Show]:
 
 
 @contextmanager
-def bars_here() -> Iterator[Show]:
+def local_progress_bars() -> Iterator[Show]:
     """Show progress bars in a notebook cell or a terminal, and yield their update function.
 
     The function has no effect if the output is neither a terminal nor a notebook.
@@ -215,7 +215,9 @@ class Screen:
 
         It yields the function that updates the progress.
         """
-        return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
+        return (
+            local_progress_bars() if self._on_progress is None else nullcontext(self._on_progress)
+        )
 
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False

@@ -27,8 +27,8 @@ from ..processes import timeline
 from ..scenario.job import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
-from .committed import Committed
-from .job_source import JobMaker, failed_row
+from .committed import CommittedRun
+from .job_source import JobProducer, failed_row
 from .listener import Listener
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
@@ -37,7 +37,7 @@ from .pipeline.pipeline import Pipeline
 from .pipeline.pipeline_job import PipelineJob
 from .pipeline.stage_messages import Summaries
 from .pipeline.stage_names import GPU, LIDAR, OTHER, SORT
-from .planning_trials import TrialPump
+from .planning_trials import TrialRunner
 from .progress import Progress, Show
 from .store.run_store import RunStore
 from .store.stored_job import StoredJob
@@ -72,7 +72,7 @@ class RunLoop:
         self,
         cluster: Cluster,
         store: RunStore,
-        maker: JobMaker | None,
+        maker: JobProducer | None,
         dataset: DataSet | None,
         listener: Listener,
     ) -> None:
@@ -100,7 +100,7 @@ class RunLoop:
         self._writer: DataSetWriter | None = None
         if dataset is not None:
             self._writer = DataSetWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
-        self._trials: TrialPump | None = None
+        self._trials: TrialRunner | None = None
         # Table rows of jobs that have ended but have not been committed to the run's database.
         self._rows: list[JobRow] = []
         self._jobs: dict[int, PipelineJob] = {}  # {number: job that is being cast or written}
@@ -111,7 +111,7 @@ class RunLoop:
         self._only_committed = False  # True once the only job is committed
         self._times: dict[str, float] = {}  # duration of "survey" and "planning" in seconds
 
-    def run(self, first: Job, show: Show) -> Committed:
+    def run(self, first: Job, show: Show) -> CommittedRun:
         """Run all jobs, starting with `first`, and return the committed results.
 
         The function `show` is called with the progress of the run. If an error occurs, all tasks
@@ -148,7 +148,7 @@ class RunLoop:
                 "data set"
             )
             self._store.notes.append(note)
-        return Committed(
+        return CommittedRun(
             self._store,
             stages=tuple(totals for book in books for totals in book.stages.values()),
             seconds=time.monotonic() - self._store.opened_at,
@@ -178,7 +178,7 @@ class RunLoop:
             if now_s - saved_at >= SAVE_EVERY_S:
                 saved_at = now_s
                 self._save()
-            watch.look()
+            watch.check()
             if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
                 shown_at = now_s
                 self._show_progress(show, now_s - started)
@@ -333,10 +333,10 @@ class RunLoop:
         max_in_flight = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, so that they can share tasks and messages.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
-        if self._maker is None or not self._maker.has(together):
+        if self._maker is None or not self._maker.has_ready(together):
             return
         while self._pipeline.has_room and len(self._store.in_flight) < max_in_flight:
-            if (entry := self._maker.take()) is None:
+            if (entry := self._maker.pop()) is None:
                 break
             if isinstance(entry, JobRow):
                 self._rows.append(entry)
@@ -359,7 +359,7 @@ class RunLoop:
             self._fail(job.number, error)
 
     def _begin_planning(self, planning: Planning, earlier_trials: Sequence[Trial]) -> None:
-        self._trials = TrialPump(self._cluster.tasks(OTHER), planning, earlier_trials)
+        self._trials = TrialRunner(self._cluster.tasks(OTHER), planning, earlier_trials)
         self._trials.step()  # before the survey begins, so that no slot of OTHER is idle
         # Withdraw the initial request for slots, because pending trials now cause an adaptive
         # partition to grow.

@@ -16,7 +16,7 @@ from lidarsim.survey.survey import Survey
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
 from ..plan import Plan, Planning, Trial
-from .job_source import fields_of
+from .job_source import describe_inputs
 from .pipeline.task_book import StageTotals
 from .pipeline.task_records import TaskRecord
 
@@ -95,7 +95,7 @@ class RunResult:
     @property
     def fields(self) -> Mapping[str, str]:
         """Descriptions of the fields of the scene, the survey and the planning."""
-        return fields_of(self.scene, self.survey, self.planning)
+        return describe_inputs(self.scene, self.survey, self.planning)
 
     @cached_property
     def cloud(self) -> Cloud:

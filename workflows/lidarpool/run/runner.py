@@ -14,8 +14,8 @@ from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
-from .committed import Committed
-from .job_source import JobMaker, Jobs
+from .committed import CommittedRun
+from .job_source import JobProducer, Jobs
 from .listener import Listener
 from .options import RunOptions
 from .pipeline.stage_messages import ScanFrame
@@ -95,7 +95,7 @@ def cast(
     connection: ClusterConnection,
     listener: Listener,
     dataset: DataSet | None = None,
-) -> Committed:
+) -> CommittedRun:
     """Cast the scans of a run that have not been committed yet.
 
     Parameters
@@ -116,16 +116,16 @@ def cast(
         If the cluster lacks workers or software, or if a task fails.
     """
     page = listener.page
-    maker: JobMaker | None = None  # only for campaigns
+    maker: JobProducer | None = None  # only for campaigns
     if dataset is not None:
         remaining = (number for number in store.jobs.numbers if not store.db.ended(number))
-        maker = JobMaker(store.jobs, remaining, dataset.columns)
+        maker = JobProducer(store.jobs, remaining, dataset.columns)
     if store.only_job is not None:
         page.begun(store.only_job)
     with nullcontext() if maker is None else closing(maker):
         first = _first_job(store, maker, page)
         if first is None:
-            return Committed(store)
+            return CommittedRun(store)
         cluster = connection.open(first, store)
         page.follow(cluster.partitions, dataset)
         loop = RunLoop(cluster, store, maker, dataset, listener)
@@ -134,7 +134,7 @@ def cast(
     return committed
 
 
-def _first_job(store: RunStore, maker: JobMaker | None, page: RunPage) -> Job | None:
+def _first_job(store: RunStore, maker: JobProducer | None, page: RunPage) -> Job | None:
     """Return the first job to run, or None if the run is already complete.
 
     Jobs that cannot be created are recorded as failed.
@@ -143,7 +143,7 @@ def _first_job(store: RunStore, maker: JobMaker | None, page: RunPage) -> Job | 
         only_job = store.only_job
         assert only_job is not None, "a run without a job maker is a survey"
         return None if only_job.complete else only_job.job
-    while isinstance(entry := maker.take(wait=True), JobRow):
+    while isinstance(entry := maker.pop(wait=True), JobRow):
         store.end([entry])
         page.ended(entry)
     return entry

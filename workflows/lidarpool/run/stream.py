@@ -41,9 +41,9 @@ from ..scenario.campaign_sections import Keep
 from ..scenario.empty_cloud import empty_cloud_reason
 from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
-from .cluster.cluster import client_of
-from .cluster.watch import Waiting, Watch
-from .job_source import JobMaker
+from .cluster.cluster import open_client
+from .cluster.watch import WaitTimer, Watch
+from .job_source import JobProducer
 from .options import RunOptions
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.committed_results import CommittedResults
@@ -90,8 +90,8 @@ class SweepStream:
         screen = Screen()
         if options.starts_workers:
             check_backend_here(options.backend)
-        waiting = Waiting(options.startup_timeout_s, screen.tell)
-        with client_of(options, {GPU: 1}, waiting, screen) as client:
+        waiting = WaitTimer(options.startup_timeout_s, screen.tell)
+        with open_client(options, {GPU: 1}, waiting, screen) as client:
             try:
                 with closing(_Casting(self, client, waiting)) as casting:
                     yield from casting.sweeps()
@@ -171,7 +171,7 @@ class _StreamedSweeps:
 class _Casting:
     """One iteration over a stream, which casts its sweeps."""
 
-    def __init__(self, stream: SweepStream, client: Client, waiting: Waiting) -> None:
+    def __init__(self, stream: SweepStream, client: Client, waiting: WaitTimer) -> None:
         self._stream = stream
         self._client = client
         options = stream.options
@@ -184,7 +184,7 @@ class _Casting:
         self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
         columns = stream.campaign.keep.of_jobs.needs
-        self._maker = JobMaker(stream.campaign, stream.numbers, columns)
+        self._maker = JobProducer(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _StreamedSweeps] = {}  # {job number: sweeps}
         self._next: _StreamedSweeps | None = None  # job with sweeps that have not been begun yet
         self._in_flight = deque[tuple[_StreamedSweeps, int]]()  # sweeps that are being cast
@@ -230,7 +230,7 @@ class _Casting:
         orders = self._dispatcher.assign({_READER: ""})
         self._fetch(orders.get(_READER, ()))
         self._dispatcher.offer()
-        self._watch.look()
+        self._watch.check()
 
     def _begin_sweeps(self) -> None:
         """Begin further sweeps until `ahead` sweeps are in flight."""
@@ -248,7 +248,7 @@ class _Casting:
 
     def _begin_job(self) -> bool:
         """Begin the next job, unless it fails. Return False if no job is ready."""
-        if (entry := self._maker.take()) is None:
+        if (entry := self._maker.pop()) is None:
             return False
         if isinstance(entry, JobRow):
             self._warn_of_failure(entry.name, entry.error)

@@ -26,7 +26,7 @@ from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..identity.software import plugin_versions
 from .cluster.cluster import Cluster
-from .cluster.tasks import Tasks
+from .cluster.tasks import TaskGroup
 from .pipeline.casting_workers import share
 from .pipeline.failures import JobError, raise_if_failed, was_killed
 from .pipeline.stage_names import EXPORT, LIDAR
@@ -123,7 +123,7 @@ class DataSetWriter:
 
     def __init__(
         self,
-        tasks: Tasks[list[WriteRequest]],
+        tasks: TaskGroup[list[WriteRequest]],
         dataset: DataSet,
         store: RunStore,
         parts_probe: tuple[str, bytes],
@@ -183,13 +183,13 @@ class DataSetWriter:
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
         ended: list[tuple[WriteRequest, JobOutcome]] = []
-        for jobs, outcomes in self.tasks.take_done():
+        for jobs, outcomes in self.tasks.pop_finished():
             if outcomes is None:
                 self.hidden = True
                 self._write_here(jobs)
             else:
                 ended += zip(jobs, outcomes, strict=True)
-        for jobs, future in self.tasks.take_failed():
+        for jobs, future in self.tasks.pop_failed():
             if was_killed(future):
                 self._write_here(jobs)
                 continue
@@ -223,7 +223,7 @@ class DataSetWriter:
             self._moved_at = now_s
         elif now_s - self._moved_at > MAX_STALL_S:
             self._moved_at = now_s
-            locations = self.tasks.look()
+            locations = self.tasks.locate()
             if any(
                 location.started and not locations.is_unreachable(key)
                 for key, location in locations.tasks.items()
@@ -291,13 +291,13 @@ class LidarWorkers:
                     self._tasks.submit(span, _write_range, shared.key, span)
                 for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.storage}")
-                finished = self._tasks.take_done()
+                finished = self._tasks.pop_finished()
                 written |= {
                     span: written_range
                     for span, written_range in finished
                     if written_range is not None
                 }
-                watch.look()
+                watch.check()
                 if not finished:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:

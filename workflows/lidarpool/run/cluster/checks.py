@@ -27,7 +27,7 @@ from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
-from .watch import Waiting, queued
+from .watch import WaitTimer, queued_clause
 
 LOOK_EVERY_S = 0.2
 
@@ -56,7 +56,7 @@ def find_workers(
     requested: str,
     advice: str = AUTO_ADVICE,
     earlier: Mapping[str, str] | None = None,
-    waiting: Waiting | None = None,
+    waiting: WaitTimer | None = None,
     *,
     writing: bool = False,
 ) -> SurveyWorkers:
@@ -101,13 +101,13 @@ def find_workers(
             if waiting is None or not waiting.remaining_s(start_s):
                 if coming:
                     error.add_note(
-                        f"{queued(coming)}. If they are only waiting in the queue, increase "
+                        f"{queued_clause(coming)}. If they are only waiting in the queue, increase "
                         "`--startup-timeout`."
                     )
                 raise
             # The advice to start workers is omitted, because the user has already started some.
             shortage = re.split(r"(?i)[:.] start ", str(error), maxsplit=1)[0]
-            waiting.tell("workers", shortage + (f"; {queued(coming)}" if coming else ""))
+            waiting.tell("workers", shortage + (f"; {queued_clause(coming)}" if coming else ""))
         time.sleep(LOOK_EVERY_S)
 
 

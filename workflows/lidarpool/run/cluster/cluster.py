@@ -24,9 +24,15 @@ from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
 from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
-from .connection import StartedAhead, check_starts_workers, connected, local_client, started_client
-from .tasks import Tasks
-from .watch import Waiting, Watch
+from .connection import (
+    BackgroundClient,
+    check_starts_workers,
+    connect_client,
+    local_client,
+    start_client,
+)
+from .tasks import TaskGroup
+from .watch import WaitTimer, Watch
 
 LOST_S = 0.5  # time until a client notices that its scheduler is lost
 
@@ -53,7 +59,7 @@ class ClusterConnection:
         self._jobs = jobs
         self._options = options
         self._stack = ExitStack()
-        self._local: StartedAhead | None = None  # workers on this machine
+        self._local: BackgroundClient | None = None  # workers on this machine
 
     def __enter__(self) -> Self:
         options = self._options
@@ -79,9 +85,9 @@ class ClusterConnection:
         slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(slots)
-        waiting = Waiting(options.startup_timeout_s, self.screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, self.screen.tell)
         client = self._stack.enter_context(
-            client_of(options, slots, waiting, self.screen, self._local)
+            open_client(options, slots, waiting, self.screen, self._local)
         )
         timeline.mark(timeline.WORKERS)
         self.cluster = Cluster(client, first, store, options, self.screen, slots, waiting)
@@ -93,12 +99,12 @@ class ClusterConnection:
         self._stack.close()
 
 
-def client_of(
+def open_client(
     options: RunOptions,
     required_slots: Mapping[str, int],
-    waiting: Waiting,
+    waiting: WaitTimer,
     screen: Screen,
-    local: StartedAhead | None = None,
+    local: BackgroundClient | None = None,
 ) -> AbstractContextManager[Client]:
     """Return a client of an existing cluster, or start a cluster with the required slots.
 
@@ -110,19 +116,19 @@ def client_of(
         with suppress(ValueError):  # raised outside of tasks
             if get_worker().scheduler.address == options.scheduler:
                 return nullcontext(own_client())
-        return connected(options.scheduler, options.files, waiting)
+        return connect_client(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        started = started_client(options.cluster, screen.tell)
+        started = start_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
     local = local or _start_local(options, required_slots)
     return screen.starting(local, "starting the workers", shares_terminal=True)
 
 
-def _start_local(options: RunOptions, slots: Mapping[str, int]) -> StartedAhead:
+def _start_local(options: RunOptions, slots: Mapping[str, int]) -> BackgroundClient:
     """Start the workers of a run on this machine in the background."""
     check_starts_workers()
     workers = options.gpu_workers, options.other_workers
-    return StartedAhead(local_client(slots, *workers, tls=options.tls))
+    return BackgroundClient(local_client(slots, *workers, tls=options.tls))
 
 
 class Cluster:
@@ -159,7 +165,7 @@ class Cluster:
         options: RunOptions,
         screen: Screen,
         required_slots: Mapping[str, int],
-        waiting: Waiting,
+        waiting: WaitTimer,
     ) -> None:
         self.client = client
         self.options = options
@@ -228,9 +234,9 @@ class Cluster:
             "cancelled by a different client. The run ended without a result."
         )
 
-    def tasks(self, name: str) -> Tasks[Any]:
+    def tasks(self, name: str) -> TaskGroup[Any]:
         """Return an empty group of tasks for a partition."""
-        return Tasks(self.partitions[name], self.software["lidarpool"])
+        return TaskGroup(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
         """Start watching the workers of partitions (see `Watch`)."""

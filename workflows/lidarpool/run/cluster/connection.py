@@ -36,7 +36,7 @@ from ...processes.fork_server import start_fork_server
 from ..cluster_file import ClusterFile
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
-from .watch import Waiting
+from .watch import WaitTimer
 
 CONNECT_TIMEOUT_S = 10
 KNOCK_S = 5.0  # time limit of one attempt to connect to a scheduler that may not have started yet
@@ -164,7 +164,7 @@ def local_client(
     return _client_of(started())
 
 
-class StartedAhead(AbstractContextManager[Client]):
+class BackgroundClient(AbstractContextManager[Client]):
     """Context of a client that is entered in a background thread as soon as it is created.
 
     Entering this object waits for the thread. It may be exited without being entered, and more than
@@ -189,7 +189,7 @@ class StartedAhead(AbstractContextManager[Client]):
 
 
 @contextmanager
-def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
+def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
     """Start the cluster that a file describes, yield its client, and stop the cluster afterwards.
 
     Parameters
@@ -205,7 +205,7 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
     LidarError
         If the cluster does not start.
     """
-    with _client_of(file.started(tell)) as client:
+    with _client_of(file.start(tell)) as client:
         tell(f"started {file}")
         try:
             yield client
@@ -234,8 +234,8 @@ def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]
 
 
 @contextmanager
-def connected(
-    scheduler: str, files: TlsFiles | None = None, waiting: Waiting | None = None
+def connect_client(
+    scheduler: str, files: TlsFiles | None = None, waiting: WaitTimer | None = None
 ) -> Iterator[Client]:
     """Connect to an existing cluster and yield its client.
 
@@ -255,7 +255,7 @@ def connected(
     """
     if not scheduler.startswith("inproc"):
         check_address(scheduler)
-    waiting = waiting or Waiting()
+    waiting = waiting or WaitTimer()
     try:
         security = Security()
         if files and any(files):
@@ -280,7 +280,7 @@ def connected(
         yield client
 
 
-async def _reach(address: str, security: Security, waiting: Waiting) -> None:
+async def _reach(address: str, security: Security, waiting: WaitTimer) -> None:
     """Wait until a scheduler responds.
 
     A client would wait forever for a scheduler that accepts connections but does not respond.

@@ -18,7 +18,7 @@ from ..pipeline.task_book import TaskBook
 T = TypeVar("T")
 
 
-class Tasks(Generic[T]):
+class TaskGroup(Generic[T]):
     """Group of tasks on a partition, each of which is submitted for a purpose, such as a job.
 
     Each task returns its result and its record. The records of finished tasks are added to `book`.
@@ -50,7 +50,7 @@ class Tasks(Generic[T]):
         )
         self.running[future] = purpose
 
-    def take_done(self) -> list[tuple[T, Any]]:
+    def pop_finished(self) -> list[tuple[T, Any]]:
         """Remove the finished tasks and return their purposes and results."""
         finished = {future.key: future for future in self.running if future.status == "finished"}
         results: list[tuple[T, Any]] = []
@@ -61,12 +61,12 @@ class Tasks(Generic[T]):
             results.append((self.running.pop(finished[key]), result))
         return results
 
-    def take_failed(self) -> list[tuple[T, Future]]:
+    def pop_failed(self) -> list[tuple[T, Future]]:
         """Remove the failed and cancelled tasks and return them with their purposes."""
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
-    def look(self) -> PartitionSnapshot:
+    def locate(self) -> PartitionSnapshot:
         """Return the locations of the running tasks."""
         keys = [future.key for future in self.running]
         return take_snapshot(self._client, self.partition.name, keys)

@@ -20,7 +20,7 @@ WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # minimum interval between messages, which become less frequent over time
 
 
-class Waiting:
+class WaitTimer:
     """Time limit for waiting, which starts when the object is used for the first time.
 
     Parameters
@@ -63,7 +63,7 @@ class Waiting:
             self._tell(f"waiting for {awaited} {remaining}{f': {reason}' if reason else ''}")
 
 
-def queued(jobs: int) -> str:
+def queued_clause(jobs: int) -> str:
     """Return a clause about jobs that are queued or starting."""
     return f"{plural(jobs, 'job is', 'jobs are')} in the queue or starting"
 
@@ -99,8 +99,8 @@ class Watch:
         self.lasting = frozenset(lasting)
         self._tell = tell
         # Time limit for each partition without workers.
-        self._waits = {name: Waiting(worker_timeout_s, tell) for name in (*names, *self.lasting)}
-        self._looked = float("-inf")
+        self._waits = {name: WaitTimer(worker_timeout_s, tell) for name in (*names, *self.lasting)}
+        self._checked_at = float("-inf")
         self.notes: list[str] = []  # notes for the user about workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
@@ -108,15 +108,15 @@ class Watch:
         for name in names:
             self._waits.pop(name, None)
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Check the workers, unless the last check is recent.
 
         Raise LidarError if workers have been missing for too long.
         """
         now_s = time.monotonic()
-        if now_s - self._looked < WATCH_EVERY_S:
+        if now_s - self._checked_at < WATCH_EVERY_S:
             return
-        self._looked = now_s
+        self._checked_at = now_s
         staffed = set()  # partitions with workers that accept tasks
         paused = set()  # partitions with workers that accept no tasks
         for worker in worker_identities(self.client).values():
@@ -137,7 +137,9 @@ class Watch:
                 waiting.tell(f"paused workers of partition {name}", advice)
             else:
                 coming = take_snapshot(self.client, name).queued_jobs
-                waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
+                waiting.tell(
+                    f"workers of partition {name}", queued_clause(coming) if coming else ""
+                )
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         note = (

@@ -91,7 +91,7 @@ class Dispatcher:
     def max_weight(self) -> int:
         """Maximum weight of the batches in flight (`policies.weight`)."""
         slots = self._workers.slot_count
-        return policies.max_under_way(slots, self._collector_count, self.per_task)
+        return policies.max_weight_in_flight(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
         """Return the weight of the batches that may still be added for a job.
@@ -155,7 +155,9 @@ class Dispatcher:
             *waiting,
             *self.in_states(BatchState.CASTING, BatchState.CAST, BatchState.COLLECTING),
         ]
-        chosen = policies.offers(batches, self._workers.slots, self.max_weight, self.per_task)
+        chosen = policies.choose_offers(
+            batches, self._workers.slots, self.max_weight, self.per_task
+        )
         for task, worker in chosen:
             spans = [(batch.job.number, (batch.first, batch.stop)) for batch in task]
             key = self._workers.submit(spans, worker)
@@ -197,7 +199,7 @@ class Dispatcher:
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
         for batch in [*self.batches.values()]:
-            if outcome := policies.loss(batch, locations, prepared, time.monotonic(), late_s):
+            if outcome := policies.find_loss(batch, locations, prepared, time.monotonic(), late_s):
                 self._offer_again(batch, outcome.value)
 
     def _offer_again(
@@ -297,7 +299,7 @@ class Dispatcher:
         if not (cast := self.in_states(BatchState.CAST)):
             return orders
         batches = [*cast, *self.in_states(BatchState.COLLECTING)]
-        for task, name in policies.handovers(batches, collectors):
+        for task, name in policies.choose_handovers(batches, collectors):
             parts = []
             for batch in task:
                 batch.collector = name

@@ -117,7 +117,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
     return sum(max(1.0, per_task * batch.share) for batch in batches)
 
 
-def max_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
+def max_weight_in_flight(slots: int, collectors: int, per_task: int = 1) -> int:
     """Return the maximum `weight` of the batches in flight.
 
     Parameters
@@ -173,7 +173,7 @@ class TaskOffer(NamedTuple):
     worker: str  # address
 
 
-def offers(
+def choose_offers(
     batches: Sequence[Batch], slots: Mapping[str, int], max_weight: int, per_task: int = 1
 ) -> list[TaskOffer]:
     """Group waiting batches into casting tasks, and choose a worker for each task.
@@ -322,7 +322,7 @@ class Handover(NamedTuple):
     collector: str  # name of the collector
 
 
-def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
+def choose_handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
     """Choose collectors for batches that have been cast.
 
     The batches of a casting task are assigned to the same collector, except for batches with which
@@ -376,7 +376,7 @@ def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
     return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in recent_casts))
 
 
-def loss(
+def find_loss(
     batch: Batch, locations: PartitionSnapshot, prepared_workers: int, now_s: float, late_s: float
 ) -> Outcome | None:
     """Return why a batch should be offered again although its task has not failed.

@@ -27,7 +27,7 @@ from ...identity.fingerprint import fingerprint
 from ...identity.shard import ALL, describe_shard
 from ...identity.software import software
 from ...scenario.job import Job
-from ..job_source import CONTENT, Jobs, identity_of
+from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.failures import storing
 from .database import (
@@ -418,7 +418,7 @@ class RunStore:
         self.in_flight[stored.job.number] = stored
         return stored
 
-    def take_over(self, job: Job) -> None:
+    def reassign_points(self, job: Job) -> None:
         """Assign the committed points to `job`, as if this run had cast all of them."""
         assert self.only_job is not None, "the run is a survey"
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
@@ -436,7 +436,7 @@ class RunStore:
             if row.done
             for mounted in stored.job.survey.carried
         )
-        sensors = with_sensors(self.sensors, named)
+        sensors = add_sensors(self.sensors, named)
         if sensors != self.sensors:
             self.db.set(sensors=json.dumps(sensors))
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
@@ -451,7 +451,7 @@ class RunStore:
             self.db.forget_jobs(forgotten)
             self.resumed = self.db.ended_count
 
-    def adopt(self, rows: Iterable[JobRow], **meta: str) -> None:
+    def add_finished(self, rows: Iterable[JobRow], **meta: str) -> None:
         """Add jobs that are already finished in the data set, and store values of `meta`."""
         if meta:
             self.db.set(**meta)
@@ -534,7 +534,7 @@ class RunStore:
             self._folder.remove([FILE])  # remove it even if the parts storage has failed
 
 
-def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:
+def add_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:
     """Add sensors to descriptions of sensor models.
 
     The result does not depend on the order in which sensors are added.
@@ -565,7 +565,7 @@ def _hash_inputs(job: Job) -> str:
     A job without a hash cannot be resumed.
     """
     try:
-        return fingerprint(identity_of(job))
+        return fingerprint(input_fingerprints(job))
     except LidarError:
         return ""
 
