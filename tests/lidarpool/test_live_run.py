@@ -87,12 +87,12 @@ def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
     )
     passed = Listener(page, pace=0.1)
     parts = [SimpleNamespace(name=name, first=first) for name, first in (("b", 2), ("a", 0))]
-    passed.parts(parts)
+    passed.on_parts(parts)
     assert shown == []
     for scan, time_s in enumerate((0.0, 0.1, 0.2, 0.3, 0.0)):  # the last of a second sensor
         if scan == 3:
             clock.now += 5
-        passed.frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
+        passed.on_frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
     assert shown == [(7, "a"), (7, 0), (8, 1), (9, "b"), (9, 2), (14, 3), (14, 4)]
 
 

@@ -169,7 +169,7 @@ class PlainLines:
             self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
         scans = progress.scans
         scans_done = min(progress.collected, progress.framed)
-        sweeps = f" ({progress.sweeps_in_words})" if progress.sweeps else ""
+        sweeps = f" ({progress.sweeps_text})" if progress.sweeps else ""
         all_sweeps = f" ({plural(progress.sweeps, 'sweep')})" if progress.sweeps else ""
         survey_summary = f"{scans:,} scans{all_sweeps}, {progress.points:,} points"
         survey_unit = f"scans{sweeps}, {progress.points:,} points"

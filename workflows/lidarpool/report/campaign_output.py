@@ -205,12 +205,12 @@ class DataSetOutput:
             store.notes += [earlier.note] * bool(earlier.note)
             self._take_over(store)
         # Some jobs were perhaps taken over.
-        begun = store.begun or bool(store.committed_in_words)
+        begun = store.begun or bool(store.committed_text)
         dataset_files(self.dataset.storage, begun=begun)
         wrong = earlier.wrong
         if not record:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
-        if not store.committed_in_words:
+        if not store.committed_text:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*wrong, *retried])

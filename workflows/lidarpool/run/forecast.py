@@ -248,7 +248,7 @@ def _disk(
     result_bytes += instrument_bytes(survey, exports)
     # Files for remote storage, except for parts, are first written to a temporary folder.
     folder = Path(tempfile.gettempdir()) if isinstance(result, Storage) else result
-    free = shutil.disk_usage(_existing(folder)).free
+    free = shutil.disk_usage(_closest_existing(folder)).free
     return {"parts": run_bytes, "result": result_bytes, "free": free, "folder": str(folder)}
 
 
@@ -353,7 +353,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     }
 
 
-def _existing(folder: Path) -> Path:
+def _closest_existing(folder: Path) -> Path:
     """Return a folder, or its closest parent that exists."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
@@ -362,7 +362,7 @@ def _folder_notes(location: Path | Storage) -> list[str]:
     """Return notes on the output folder. Raise LidarError if it is not writable."""
     if isinstance(location, Storage):
         location.claim()  # leaves no files behind
-    elif not (folder := _existing(location)).is_dir():
+    elif not (folder := _closest_existing(location)).is_dir():
         raise LidarError(f"{folder} is a file. Pass a folder for the results with `--out`.")
     elif not os.access(folder, os.W_OK | os.X_OK):
         raise LidarError(

@@ -40,7 +40,7 @@ class Listener:
         self._pacer = None if pace is None else Pacer(pace)
         self._unshown: list[Receipt] = []  # parts whose frames are not due yet
 
-    def frame(self, frame: ScanFrame) -> None:
+    def on_frame(self, frame: ScanFrame) -> None:
         """Wait until a frame is due, and pass it on."""
         if self._pacer is not None:
             self._pacer.wait(frame.time_ns)
@@ -49,7 +49,7 @@ class Listener:
         if self._on_frame is not None:
             self._on_frame(frame)
 
-    def parts(self, receipts: Sequence[Receipt]) -> None:
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Pass on committed parts."""
         if self._pacer is None:
             self.page.on_parts(receipts)

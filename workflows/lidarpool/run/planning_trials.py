@@ -12,7 +12,7 @@ from poolpart.task_locations import PartitionSnapshot
 from ..plan import Planning, Trial, run_trial
 from .cluster.tasks import TaskGroup
 from .pipeline.failures import raise_if_failed, was_killed
-from .pipeline.task_records import recorded
+from .pipeline.task_records import call_recorded
 
 TRIAL = "trial"
 MAX_ROUNDS = 3  # maximum number of times that a trial is submitted if its workers die
@@ -63,7 +63,7 @@ class TrialRunner:
     def _submit(self, number: int, worker: str | None = None) -> None:
         self.tasks.submit(
             number,
-            recorded,
+            call_recorded,
             TRIAL,
             self.tasks.partition.name,
             run_trial,

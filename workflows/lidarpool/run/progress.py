@@ -53,7 +53,7 @@ class Progress:
     sweeps_done: int = 0  # sweeps whose scans have passed all stages
 
     @property
-    def sweeps_in_words(self) -> str:
+    def sweeps_text(self) -> str:
         """Number of finished sweeps, such as "12 of 100 sweeps". Empty for a campaign."""
         return f"{self.sweeps_done:,} of {plural(self.sweeps, 'sweep')}" if self.sweeps else ""
 
@@ -146,7 +146,7 @@ def bars(console: Console) -> Iterator[Show]:
                     if total_name == "scans" and count < total:
                         pace = waiting_reason(progress) or pace
                     if count_name == "collected":
-                        pace = f"{pace}  {progress.sweeps_in_words}".strip()
+                        pace = f"{pace}  {progress.sweeps_text}".strip()
                     move(label, count, total, total_name, pace)
 
         yield show

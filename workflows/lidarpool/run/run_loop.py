@@ -206,7 +206,7 @@ class RunLoop:
         self._admit()
         news = pipeline.step(self._scans_to_come)
         if self._writer is None and news.parts:
-            self._listener.parts(news.parts)
+            self._listener.on_parts(news.parts)
         for job, summaries in news.frames:
             self._hand_out(job, summaries)
         for job, error in news.ended:
@@ -307,7 +307,7 @@ class RunLoop:
         stored = self._store.in_flight[job.number]
         for frame in stored.frames(summaries):
             job.trace("frame", SORT, [frame.scan])
-            self._cluster.call(self._listener.frame, frame)
+            self._cluster.call(self._listener.on_frame, frame)
             # If the user's callback raises an error, a resumed run delivers the frame again.
             stored.committed.advance_frames(frame.scan + 1)
             job.trace("release", SORT, [frame.scan])

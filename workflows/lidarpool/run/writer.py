@@ -27,7 +27,7 @@ from ..datasets.job_table import JobRow
 from ..identity.software import plugin_versions
 from .cluster.cluster import Cluster
 from .cluster.tasks import TaskGroup
-from .pipeline.casting_workers import share
+from .pipeline.casting_workers import submit_value
 from .pipeline.failures import JobError, raise_if_failed, was_killed
 from .pipeline.stage_names import EXPORT, LIDAR
 from .pipeline.task_records import Recorder, TaskRecord
@@ -199,7 +199,7 @@ class DataSetWriter:
                 ended += [(job, error) for job in jobs]
         for write in [write for write in self._driver_writes if write.done()]:
             ended.append((self._driver_writes.pop(write), write.result()))
-        self._relieve(bool(ended))
+        self._write_stalled_jobs(bool(ended))
         return ended
 
     def _next(self) -> list[WriteRequest]:
@@ -213,7 +213,7 @@ class DataSetWriter:
             jobs.append(self._waiting.popleft())
         return jobs
 
-    def _relieve(self, moved: bool) -> None:
+    def _write_stalled_jobs(self, moved: bool) -> None:
         """Let the driver write jobs if no task has started for a long time.
 
         This happens if all slots of LIDAR are in use by other runs or have left.
@@ -283,7 +283,7 @@ class LidarWorkers:
         watch = self._cluster.watch([LIDAR])
         # Workers fetch the writer from the worker that holds it. If it were an argument of the
         # tasks, Dask would send all tasks to that worker.
-        shared = share(partition, writer, priority=10)
+        shared = submit_value(partition, writer, priority=10)
         try:
             while waiting or running:
                 while waiting and len(running) < max_tasks:

@@ -198,7 +198,7 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
                 f"{driver_version}. Install the same version on both machines."
             )
     driver_sources = software()["lidarpool"]
-    for address, answer in _answers(client, software_query(), workers).items():
+    for address, answer in _query_workers(client, software_query(), workers).items():
         if not answer:
             raise LidarError(
                 f"The worker at {address} does not have lidarpool. Install lidarpool "
@@ -223,7 +223,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
     plugins = [spec.row.plugin for spec in written if spec.row.plugin is not None]
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
-    for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
+    for address, answer in _query_workers(client, software_query(plugins=plugins), writing).items():
         if differs := describe_difference(answer, required):
             raise LidarError(
                 f"The worker at {address} has {differs}. Install the same version on both "
@@ -251,7 +251,9 @@ def common_software(
     used. Workers with different software are refused when they are checked later. Raise LidarError
     if no worker has the earlier software.
     """
-    answers = _answers(client, software_query(backend), [worker.address for worker in workers])
+    answers = _query_workers(
+        client, software_query(backend), [worker.address for worker in workers]
+    )
     if earlier and dict(earlier) not in answers.values():
         address, installed = next(iter(answers.items()))
         raise LidarError(
@@ -265,7 +267,7 @@ def common_software(
     return dict(earlier) if earlier else dict(common)
 
 
-def _answers(
+def _query_workers(
     client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
     """Call a function on workers and return the results by address, or raise the first error."""
@@ -308,7 +310,7 @@ def common_backend(
     LidarError
         If the backend is missing on a worker. The message ends with `advice`.
     """
-    answers = _answers(client, available_backends, [worker.address for worker in workers])
+    answers = _query_workers(client, available_backends, [worker.address for worker in workers])
     if requested == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

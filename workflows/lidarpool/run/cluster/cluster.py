@@ -183,7 +183,7 @@ class Cluster:
                 required_slots,
                 store.backend or options.backend,
                 store.advice,
-                store.casting if store.committed_in_words else {},
+                store.casting if store.committed_text else {},
                 waiting,
                 writing=store.only_job is None,
             )

@@ -265,22 +265,26 @@ def connect_client(
             )
         # The event loop runs in another thread, because an interrupt in one of its callbacks could
         # be lost.
-        LoopRunner().run_sync(_reach, scheduler, security, waiting)
+        LoopRunner().run_sync(_wait_for_scheduler, scheduler, security, waiting)
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except Exception as error:
-        waited = f" within {waiting.seconds:g} s" if waiting.seconds and _absent(error) else ""
+        waited = (
+            f" within {waiting.seconds:g} s"
+            if waiting.seconds and _may_become_reachable(error)
+            else ""
+        )
         raise LidarError(
-            f"No Dask scheduler responded at {scheduler!r}{waited} ({_reason(error)}). Start one "
-            "with `dask scheduler`, and pass its address, such as tcp://host:8786. For a TLS "
-            "cluster, pass tls://host:8786 with `--tls-ca`, `--tls-cert` and `--tls-key`."
+            f"No Dask scheduler responded at {scheduler!r}{waited} ({_describe_error(error)}). "
+            "Start one with `dask scheduler`, and pass its address, such as tcp://host:8786. For a "
+            "TLS cluster, pass tls://host:8786 with `--tls-ca`, `--tls-cert` and `--tls-key`."
         ) from error
     with client:
         yield client
 
 
-async def _reach(address: str, security: Security, waiting: WaitTimer) -> None:
+async def _wait_for_scheduler(address: str, security: Security, waiting: WaitTimer) -> None:
     """Wait until a scheduler responds.
 
     A client would wait forever for a scheduler that accepts connections but does not respond.
@@ -300,28 +304,28 @@ async def _reach(address: str, security: Security, waiting: WaitTimer) -> None:
             comm.abort()
             return
         except Exception as error:
-            if not waiting.remaining_s() or not _absent(error):
+            if not waiting.remaining_s() or not _may_become_reachable(error):
                 raise
-            reason = _reason(error)
+            reason = _describe_error(error)
         await asyncio.sleep(LOOK_EVERY_S)
 
 
-def _root(error: BaseException) -> BaseException:
+def _root_cause(error: BaseException) -> BaseException:
     """Return the root cause of an error."""
     cause = error.__cause__ or error.__context__
     # A timeout is more informative than the canceled operation that it was raised from.
     if cause is None or isinstance(cause, asyncio.CancelledError):
         return error
-    return _root(cause)
+    return _root_cause(cause)
 
 
-def _absent(error: BaseException) -> bool:
+def _may_become_reachable(error: BaseException) -> bool:
     """Return True if the address cannot be resolved or reached yet, so that a retry may help."""
-    root = _root(error)
+    root = _root_cause(error)
     absent = (ConnectionRefusedError, TimeoutError, asyncio.CancelledError, socket.gaierror)
     return isinstance(root, absent) or getattr(root, "errno", None) in _UNREACHABLE
 
 
-def _reason(error: BaseException) -> str:
-    root = _root(error)
+def _describe_error(error: BaseException) -> str:
+    root = _root_cause(error)
     return " ".join(f"{type(root).__name__}: {root}".split())[:200].rstrip(": ")

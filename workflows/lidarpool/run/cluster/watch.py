@@ -131,7 +131,9 @@ class Watch:
             if name in staffed:
                 waiting.restart()
             elif not waiting.remaining_s():
-                raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
+                raise LidarError(
+                    _missing_workers_message(name, name in paused, f"{waiting.seconds:.0f} s")
+                )
             elif name in paused:
                 advice = "their memory is nearly full. Start them with a larger `--memory-limit`"
                 waiting.tell(f"paused workers of partition {name}", advice)
@@ -152,7 +154,7 @@ class Watch:
             self._tell(note)
 
 
-def _lacking(name: str, paused: bool, seconds: str) -> str:
+def _missing_workers_message(name: str, paused: bool, seconds: str) -> str:
     """Return a message about a partition that has no workers, or only paused workers."""
     start = f'start workers with `--resources "{name}=1"` and repeat the run.'
     if paused:

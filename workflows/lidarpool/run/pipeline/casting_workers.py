@@ -431,11 +431,11 @@ class _Payload:
         self.recipients.add(worker)
         if self._small is not None:
             return self._small
-        if self._shared is not None and worker not in self._blind and _is_here(worker):
+        if self._shared is not None and worker not in self._blind and _is_local(worker):
             return self._shared.handle
         if self.future is None or self.future.status in ("lost", "cancelled", "error"):
             self._futures += 1
-            self.future = share(
+            self.future = submit_value(
                 self._partition,
                 Pickled.from_value(self._make()).copy(),
                 key=f"{self.name}-packed-{self._futures}",
@@ -479,12 +479,12 @@ class _Worker:
     unneeded: list[str] = field(default_factory=list)  # rigs and scenes that the worker may drop
 
 
-def _is_here(address: str) -> bool:
+def _is_local(address: str) -> bool:
     """Return True if a worker is probably on this machine."""
     return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 
-def share(partition: Partition, value: Any, **options: Any) -> Future:
+def submit_value(partition: Partition, value: Any, **options: Any) -> Future:
     """Submit a task that returns a value for other tasks, so that Dask can recompute it.
 
     In contrast to scattered data, the value is not lost if the worker that holds it dies.

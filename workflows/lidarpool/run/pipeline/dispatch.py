@@ -22,7 +22,7 @@ from .batches import Batch, BatchState, Outcome
 from .casting_workers import CastingWorkers
 from .failures import JobError
 from .pipeline_job import PipelineJob
-from .stage_messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
+from .stage_messages import CollectOrder, ColumnsLost, Receipt, format_scans
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .task_records import TaskRecord
 
@@ -256,7 +256,7 @@ class Dispatcher:
             partition = GPU if stage == INTERSECT else LIDAR
             batch.job.condemned.append(
                 f"{policies.MAX_KILLS} workers in a row died in stage {stage} while they processed "
-                f"only {scans_in_words(batch.first, batch.stop)}"
+                f"only {format_scans(batch.first, batch.stop)}"
                 f"{self._workers.memory_clause(worker)}. See the logs of the {partition} workers."
             )
             self._remove(batch)
@@ -280,7 +280,7 @@ class Dispatcher:
         batch.order = self._batch_count
         self._batch_count += 1
         if len(killers) >= policies.MAX_KILLS:
-            names = ", ".join(scans_in_words(killer.first, killer.stop) for killer in killers)
+            names = ", ".join(format_scans(killer.first, killer.stop) for killer in killers)
             error = JobError(
                 f"{len(killers)} casting workers in a row died while casting their first batch "
                 f"({names}){self._workers.memory_clause(worker)}. The scene may need more memory "

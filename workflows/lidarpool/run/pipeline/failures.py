@@ -11,7 +11,7 @@ from lidarsim.errors import LidarError, explained
 from lidarsim.io.storage import Storage
 from poolpart.task_context import WorkerLeavingError
 
-from .stage_messages import scans_in_words
+from .stage_messages import format_scans
 
 ASK_S = 10.0  # time limit for fetching an error from the scheduler
 
@@ -49,7 +49,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
     except WorkerLeavingError:
         raise
     except Exception as error:
-        words = scans_in_words(first, stop)
+        words = format_scans(first, stop)
         raise ScanError(f"{words}: {type(error).__name__}: {error}") from error
 
 

@@ -111,7 +111,7 @@ def cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
     trace("intersect.start", **fields, scans=scans)
-    with leaving_with_device(rig), naming_scans(first, stop):
+    with exit_on_lost_device(rig), naming_scans(first, stop):
         batches = list(rig.cast(first, stop))
         trace("intersect.cast", **fields, scans=scans)
         part = replace(
@@ -125,7 +125,7 @@ def cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
 
 
 @contextmanager
-def leaving_with_device(rig: Rig) -> Iterator[None]:
+def exit_on_lost_device(rig: Rig) -> Iterator[None]:
     """Raise DeviceLost and exit the process if the GPU stops responding in the body.
 
     A nanny then restarts the process, for which the GPU works again. Without a nanny, the process
@@ -232,7 +232,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
-        scene_handle, actors, pickled_survey, backend = _unpickled(plan)
+        scene_handle, actors, pickled_survey, backend = _unpickle(plan)
         survey: Survey = pickle.loads(pickled_survey)  # noqa: S301
         now_s = time.monotonic()
         unused = {h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S}
@@ -240,7 +240,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
         if (of_scene := cached_rigs.get(scene_handle)) is not None:
             rig = of_scene.rig.with_survey(of_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
-            static_scene: Scene = _unpickled(scene)
+            static_scene: Scene = _unpickle(scene)
             threads = get_worker().state.nthreads
             device = own_device()
             if device is not None:
@@ -271,7 +271,7 @@ def drop_all(run: str) -> None:
     drop([handle for handle in [*cached_rigs] if handle.partition(".")[0] == run])
 
 
-def _unpickled(data: Packed) -> Any:
+def _unpickle(data: Packed) -> Any:
     """Unpickle a value from the driver. Raise MemoryUnseen if its memory is not accessible."""
     if isinstance(data, SharedHandle):
         try:

@@ -47,12 +47,12 @@ def summary_type(samples: int) -> np.dtype[np.void]:
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
 
-def scans_in_words(first: int, stop: int) -> str:
+def format_scans(first: int, stop: int) -> str:
     """Format a half-open range of scans for messages.
 
     Examples
     --------
-    >>> scans_in_words(3, 4), scans_in_words(3, 6)
+    >>> format_scans(3, 4), format_scans(3, 6)
     ('scan 3', 'scans 3 to 5')
     """
     last = stop - 1

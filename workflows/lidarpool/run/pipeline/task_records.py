@@ -61,7 +61,7 @@ class Recorder:
         )
 
 
-def recorded(
+def call_recorded(
     stage: str, partition: str, function: Callable[..., T], /, *args: Any, **kwargs: Any
 ) -> tuple[T, TaskRecord]:
     """Call a function in a task and return its result and the record of the task."""

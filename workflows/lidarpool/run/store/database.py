@@ -123,7 +123,7 @@ class RunDatabase:
             raise sqlite3.DatabaseError(
                 f"its format is {version}, but this version reads only format {FORMAT}"
             )
-        _checked_location(self.meta)
+        _validate_location(self.meta)
         (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # pages and indices
         if state != "ok":
             raise sqlite3.DatabaseError(" ".join(state.split()))
@@ -428,7 +428,7 @@ def parts_folder(mark: str) -> str:
     return f"run-{mark}"
 
 
-def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
+def _validate_location(meta: Mapping[str, str]) -> tuple[str, str]:
     """Return the mark and the parts location in a `meta` table.
 
     Raise ValueError if they are invalid.
@@ -471,7 +471,7 @@ def read_parts_location(path: Path) -> tuple[str, str] | None:
             rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
             if any(_crc32(name, value) != crc for name, value, crc in rows):
                 return None
-            return _checked_location({name: value for name, value, _ in rows})
+            return _validate_location({name: value for name, value, _ in rows})
     except sqlite3.Error as error:
         if "locked" in str(error):
             raise LidarError(f"Another run is using {path.parent}.") from error

@@ -9,7 +9,7 @@ from operator import attrgetter
 
 from lidarsim.words import listed
 
-from ..pipeline.stage_messages import Receipt, scans_in_words
+from ..pipeline.stage_messages import Receipt, format_scans
 from .database import RunDatabase
 from .stored_job import StoredJob
 
@@ -74,6 +74,6 @@ def _state(job: StoredJob, part: Receipt, sizes: Mapping[str, int]) -> str:
 
 def _note(job: StoredJob, receipts: Sequence[Receipt], state: str) -> str:
     names = listed([part.name for part in receipts])
-    scans = listed([scans_in_words(part.first, part.stop) for part in receipts])
+    scans = listed([format_scans(part.first, part.stop) for part in receipts])
     verb = "was" if len(receipts) == 1 else "were"
     return f"repeated {scans}, because {names} {verb} {state} in {job.storage.url}"

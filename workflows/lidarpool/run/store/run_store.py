@@ -269,7 +269,7 @@ class RunStore:
         """Raise LidarError if the options do not allow the existing run to be continued."""
         if not resume:
             raise LidarError(
-                f"{self.location} contains an unfinished run with {self.committed_in_words}. "
+                f"{self.location} contains an unfinished run with {self.committed_text}. "
                 f"Continue it with {_RESUME}, or remove it with {_DROP}."
             )
         if self.backend and self._requested_backend not in ("auto", self.backend):
@@ -343,16 +343,16 @@ class RunStore:
         return {"identity": identity, "backend": self.backend, "casting": self.casting}
 
     @property
-    def committed_in_words(self) -> str:
+    def committed_text(self) -> str:
         """Number of committed scans, trials or jobs as text, or an empty string for none."""
         if self.only_job is not None:
-            return self.only_job.committed_in_words
+            return self.only_job.committed_text
         return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
 
     @property
     def advice(self) -> str:
         """Advice at the end of a message that the backend is not available."""
-        if not self.committed_in_words:
+        if not self.committed_text:
             return AUTO_ADVICE
         return (
             f"The scans in {self.location} were cast with this backend. Continue the run where "
@@ -375,7 +375,7 @@ class RunStore:
         The note names `target`, the location of the result.
         """
         # Tasks in a job array resume their shards even if the shards have not been started yet.
-        is_explained = self.committed_in_words or self.notes or self.jobs.shard != ALL
+        is_explained = self.committed_text or self.notes or self.jobs.shard != ALL
         if self.only_job is not None and not is_explained:
             self.notes.append(f"{target} contained no unfinished run to resume")
 
@@ -431,7 +431,7 @@ class RunStore:
         """
         ended = [(row, self.in_flight[row.number]) for row in rows if row.number in self.in_flight]
         named = (
-            (mounted.name or "lidar", _kind_in_words(mounted.sensor))
+            (mounted.name or "lidar", _describe_model(mounted.sensor))
             for row, stored in ended
             if row.done
             for mounted in stored.job.survey.carried
@@ -516,7 +516,7 @@ class RunStore:
             if self._remote and self._remote.lost:
                 self.db.close()
                 raise
-            committed = self.committed_in_words
+            committed = self.committed_text
             self.close()
             if committed and self._folder.local(FILE).exists():
                 error.add_note(
@@ -555,7 +555,7 @@ def add_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) ->
     return dict(sorted(merged.items()))
 
 
-def _kind_in_words(sensor: Sensor) -> str:
+def _describe_model(sensor: Sensor) -> str:
     return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
 

@@ -89,7 +89,7 @@ class StoredJob:
             ) from error
 
     @property
-    def committed_in_words(self) -> str:
+    def committed_text(self) -> str:
         """Number of committed scans or trials as text, or an empty string for none."""
         if self.parts.scans_done:
             return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
@@ -139,7 +139,7 @@ class StoredJob:
             sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
         )
 
-    def points_of_scan(self, scan: int) -> Cloud:
+    def read_scan(self, scan: int) -> Cloud:
         """Return the points of a committed scan."""
         part = self.parts.part_of(scan)
         columns = read_part(self.storage, part.name)
@@ -168,7 +168,7 @@ class StoredJob:
                 samples=samples[~np.isnan(samples[:, 0])],
                 _triangles=self.job.scene.triangles,
                 _survey=survey,
-                _read=self.points_of_scan,
+                _read=self.read_scan,
             )
 
     def hit_counts(self) -> Ints:
