@@ -402,8 +402,8 @@ def _explained(path: Path) -> Iterator[None]:
     except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
         # Other operational errors, such as a missing column or invalid UTF-8, indicate damage.
-        of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
-        if not isinstance(error, sqlite3.OperationalError) or not of_disk:
+        is_disk_error = any(phrase in words.lower() for phrase in _DISK_ERRORS)
+        if not isinstance(error, sqlite3.OperationalError) or not is_disk_error:
             raise DamagedError(
                 f"{path} is damaged ({words}). Remove the run with `--restart`, or choose a "
                 "different folder."
